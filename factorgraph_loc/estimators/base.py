@@ -1,0 +1,112 @@
+"""The interface that all estimators share, and what they report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+
+from factorgraph_loc.measurements import Measurement
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+Status = Literal["unlocalized", "ambiguous", "localized"]
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """What is known of the start: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame."""
+
+    t: float
+    pose: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame."""
+
+    t: float
+    pose: Array
+    covariance: Array
+    status: Status
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One Gaussian mode of a belief, in the world's frame."""
+
+    weight: float
+    pose: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an estimator believes now: weighted Gaussian modes, and particles (N, 3) with weights (N,) where it has them."""
+
+    modes: tuple[Mode, ...]
+    particles: Array | None = None
+    weights: Array | None = None
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Constants that an estimator has estimated on the way: name to (value, standard deviation), SI units."""
+
+    values: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass
+class Diagnostics:
+    """Counts and consistency figures of a run.
+
+    ``nis``: by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``:
+    counts by reason. ``events``: (t, what happened), for example a rebuilt graph.
+    """
+
+    nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    ignored: dict[str, int] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    late: dict[str, int] = field(default_factory=dict)
+    events: list[tuple[float, str]] = field(default_factory=list)
+
+    def ignore(self, reason: str, count: int = 1) -> None:
+        self.ignored[reason] = self.ignored.get(reason, 0) + count
+
+    def reject(self, reason: str, count: int = 1) -> None:
+        self.rejected[reason] = self.rejected.get(reason, 0) + count
+
+    def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
+        self.nis.setdefault(sensor, []).append((t, nis, dof))
+
+
+class Estimator(Protocol):
+    """An estimator. It is given measurements in the order of arrival and can be asked at any time."""
+
+    diagnostics: Diagnostics
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian; before that every estimate is ``unlocalized``."""
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement; one that is late by more than ``max_delay`` is counted and dropped."""
+
+    def estimate(self) -> PoseEstimate:
+        """The pose at the newest time seen, from the measurements so far."""
+
+    def belief(self) -> Belief:
+        """The whole belief behind :meth:`estimate`."""
+
+    def learnt(self) -> Learnt:
+        """Constants estimated on the way."""
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
+
+
+def gaussian_belief(estimate: PoseEstimate) -> Belief:
+    """The belief of an estimator that has one Gaussian."""
+    return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))

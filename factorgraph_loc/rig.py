@@ -1,0 +1,138 @@
+"""What the robot carries, and what we believe about it, read from and written to ``NAME.rig.toml``.
+
+Every number has its unit in the description; the bounds are there to catch wrong units (degrees for radians, mm for m).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
+from factors.bearing_range import BearingRangeModel
+from factors.odometry import Growth, OdometryModel
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Scale = Annotated[float, Field(ge=0.2, le=5.0, description="true over reported")]
+Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
+Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
+Noise = Annotated[float, Field(ge=0.0, le=5.0)]
+
+
+class GrowthSettings(FileModel):
+    """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) passed."""
+
+    per_distance: Noise = 0.0
+    per_rotation: Noise = 0.0
+    per_time: Noise = 0.0
+
+    def model(self) -> Growth:
+        return Growth(self.per_distance, self.per_rotation, self.per_time)
+
+
+class OdometryNoise(FileModel):
+    """How the error grows: along the track [m], across it [m], in heading [rad]."""
+
+    along: GrowthSettings = GrowthSettings(per_distance=0.05)
+    lateral: GrowthSettings = GrowthSettings(per_distance=0.02)
+    heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05)
+
+
+class OdometrySettings(FileModel):
+    """Wheel odometry. See :class:`factors.odometry.OdometryModel` for the model."""
+
+    time_offset: Seconds = 0.0
+    scale_distance: Scale = 1.0
+    scale_rotation: Scale = 1.0
+    heading_rate_bias: Rate = 0.0
+    heading_rate_bias_sigma: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s; above 0 it is estimated")] = 0.0
+    direction: Angle = 0.0
+    delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
+    lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
+    max_hold: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.5
+    unknown_distance: Noise = 0.2
+    unknown_rotation: Noise = 0.2
+    noise: OdometryNoise = OdometryNoise()
+
+
+class ImuSettings(FileModel):
+    """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``."""
+
+    time_offset: Seconds = 0.0
+    bias: Rate = 0.0
+    heading: GrowthSettings = GrowthSettings(per_time=0.005)
+
+
+class BearingRangeSettings(FileModel):
+    """A sensor of identified landmarks. See :class:`factors.bearing_range.BearingRangeModel` for the model."""
+
+    time_offset: Seconds = 0.0
+    x: Offset = 0.0
+    y: Offset = 0.0
+    heading: Angle = 0.0
+    bearing_bias: Angle = 0.0
+    range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported over true")] = 1.0
+    range_sigma: Annotated[float, Field(gt=0.0, le=10.0, description="m")]
+    range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
+    bearing_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad, not degrees")] = 0.05
+    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of the Cauchy loss, in sigmas")] = 1.0
+
+    def model(self) -> BearingRangeModel:
+        return BearingRangeModel(
+            mounting=(self.x, self.y, self.heading),
+            bearing_bias=self.bearing_bias,
+            range_scale=self.range_scale,
+            range_sigma=self.range_sigma,
+            range_sigma_relative=self.range_sigma_relative,
+            bearing_sigma=self.bearing_sigma,
+            robust=self.robust,
+        )
+
+
+class Rig(FileModel):
+    """A robot: the sensors that estimators use by default, and the settings of each."""
+
+    name: str = "rig"
+    sensors: tuple[str, ...] = ("odometry", "bearing_range")
+    odometry: OdometrySettings = OdometrySettings()
+    imu: ImuSettings | None = None
+    bearing_range: BearingRangeSettings | None = None
+
+    def odometry_model(self, *, use_gyro: bool = False) -> OdometryModel:
+        """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro."""
+        s = self.odometry
+        imu = self.imu or ImuSettings()
+        return OdometryModel(
+            scale_distance=s.scale_distance,
+            scale_rotation=s.scale_rotation,
+            heading_rate_bias=s.heading_rate_bias,
+            direction=s.direction,
+            delay=s.delay,
+            lag=s.lag,
+            gyro_bias=imu.bias,
+            max_hold=s.max_hold,
+            unknown_distance=s.unknown_distance,
+            unknown_rotation=s.unknown_rotation,
+            along=s.noise.along.model(),
+            lateral=s.noise.lateral.model(),
+            heading=imu.heading.model() if use_gyro else s.noise.heading.model(),
+        )
+
+    def time_offset(self, sensor: str) -> float:
+        """Seconds to add to the stamps of a sensor's stream."""
+        settings = getattr(self, sensor, None)
+        return 0.0 if settings is None else float(settings.time_offset)
+
+
+def read_rig(path: Path) -> Rig:
+    """Read ``NAME.rig.toml``; InputError names file, key and what is expected."""
+    return parse_model(Rig, read_toml(path), path)
+
+
+def write_rig(rig: Rig, path: Path) -> None:
+    """Write ``NAME.rig.toml``."""
+    write_toml(path, rig.model_dump(mode="json", exclude_none=True))

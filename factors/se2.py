@@ -1,0 +1,149 @@
+"""The group SE(2) of planar poses, on arrays.
+
+A pose is ``(x, y, heading)``: metres, metres, radians counter-clockwise. A tangent vector ``xi`` is a body-frame twist
+``(rho_x, rho_y, phi)``, applied on the right: ``pose * exp(xi)``. This is also GTSAM's convention for ``Pose2``.
+Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A (eqs. 153 to 166).
+
+All functions broadcast over leading axes, ``(..., 3)``.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL_ANGLE = 1e-4
+
+
+def wrap(angle: Array) -> Array:
+    """Angles in radians, brought into (-pi, pi]."""
+    return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
+
+
+def wrap_scalar(angle: float) -> float:
+    """One angle in radians, brought into (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+def compose(a: Array, b: Array) -> Array:
+    """The pose ``a * b``: ``b``, given in the frame of ``a``, expressed in the frame of ``a``'s parent."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        (
+            a[..., 0] + c * b[..., 0] - s * b[..., 1],
+            a[..., 1] + s * b[..., 0] + c * b[..., 1],
+            wrap(a[..., 2] + b[..., 2]),
+        ),
+        axis=-1,
+    )
+
+
+def inverse(a: Array) -> Array:
+    """The pose ``a^-1``."""
+    a = np.asarray(a, dtype=float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack((-c * a[..., 0] - s * a[..., 1], s * a[..., 0] - c * a[..., 1], wrap(-a[..., 2])), axis=-1)
+
+
+def between(a: Array, b: Array) -> Array:
+    """The pose of ``b`` in the frame of ``a``: ``a^-1 * b``."""
+    return compose(inverse(a), b)
+
+
+def exp(xi: Array) -> Array:
+    """The pose reached by following the twist ``xi`` for unit time: an arc of a circle."""
+    xi = np.asarray(xi, dtype=float)
+    a, b = _arc_coefficients(xi[..., 2])
+    return np.stack(
+        (a * xi[..., 0] - b * xi[..., 1], b * xi[..., 0] + a * xi[..., 1], wrap(xi[..., 2])),
+        axis=-1,
+    )
+
+
+def log(pose: Array) -> Array:
+    """The twist that leads from the origin to ``pose`` in unit time; the inverse of :func:`exp` for |heading| < pi."""
+    pose = np.asarray(pose, dtype=float)
+    phi = wrap(pose[..., 2])
+    a, b = _arc_coefficients(phi)
+    det = a * a + b * b
+    return np.stack(
+        ((a * pose[..., 0] + b * pose[..., 1]) / det, (-b * pose[..., 0] + a * pose[..., 1]) / det, phi), axis=-1
+    )
+
+
+def adjoint(pose: Array) -> Array:
+    """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
+    pose = np.asarray(pose, dtype=float)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    out = np.zeros((*pose.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = c, -s, pose[..., 1]
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = s, c, -pose[..., 0]
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def right_jacobian(xi: Array) -> Array:
+    """Right Jacobian ``(..., 3, 3)`` of :func:`exp`: ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
+    xi = np.asarray(xi, dtype=float)
+    phi = xi[..., 2]
+    a, b = _arc_coefficients(phi)
+    small = np.abs(phi) < _SMALL_ANGLE
+    safe = np.where(small, 1.0, phi)
+    # (1 - a) / phi and b / phi, with their series at zero
+    c = np.where(small, phi / 6.0, (1.0 - a) / safe)
+    d = np.where(small, 0.5 - phi**2 / 24.0, b / safe)
+    out = np.zeros((*xi.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1] = a, b
+    out[..., 1, 0], out[..., 1, 1] = -b, a
+    out[..., 0, 2] = c * xi[..., 0] - d * xi[..., 1]
+    out[..., 1, 2] = d * xi[..., 0] + c * xi[..., 1]
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def transform_to(pose: Array, points: Array) -> Array:
+    """Points ``(..., 2)`` of the parent frame, expressed in the frame of ``pose``."""
+    pose, points = np.asarray(pose, dtype=float), np.asarray(points, dtype=float)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    dx, dy = points[..., 0] - pose[..., 0], points[..., 1] - pose[..., 1]
+    return np.stack((c * dx + s * dy, -s * dx + c * dy), axis=-1)
+
+
+def body_to_world(pose: Array, covariance: Array) -> Array:
+    """A covariance ``(..., 3, 3)`` of the body-frame perturbation, as that of ``(x, y, heading)`` in the world."""
+    rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
+    return rotation @ covariance @ np.swapaxes(rotation, -1, -2)
+
+
+def world_to_body(pose: Array, covariance: Array) -> Array:
+    """A covariance ``(..., 3, 3)`` of ``(x, y, heading)`` in the world, as that of the body-frame perturbation."""
+    rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
+    return np.swapaxes(rotation, -1, -2) @ covariance @ rotation
+
+
+def arc_coefficients(phi: float) -> tuple[float, float]:
+    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle."""
+    if abs(phi) < _SMALL_ANGLE:
+        return 1.0 - phi * phi / 6.0, phi / 2.0
+    return math.sin(phi) / phi, (1.0 - math.cos(phi)) / phi
+
+
+def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
+    """The same of arrays."""
+    small = np.abs(phi) < _SMALL_ANGLE
+    safe = np.where(small, 1.0, phi)
+    a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, phi / 2.0, (1.0 - np.cos(safe)) / safe)
+    return a, b
+
+
+def _rotation3(heading: Array) -> Array:
+    c, s = np.cos(heading), np.sin(heading)
+    out = np.zeros((*np.shape(heading), 3, 3))
+    out[..., 0, 0], out[..., 0, 1] = c, -s
+    out[..., 1, 0], out[..., 1, 1] = s, c
+    out[..., 2, 2] = 1.0
+    return out
