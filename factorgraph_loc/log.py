@@ -74,7 +74,7 @@ class BearingRangeStream:
     bearing: Array
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        starts = np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0)
+        starts = np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
         for i, j in zip(starts, [*starts[1:], len(self.t)], strict=True):
             yield BearingRange(float(self.t[i]) + offset, tuple(self.landmark[i:j]), self.range[i:j], self.bearing[i:j])
 

@@ -48,7 +48,7 @@ def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Ar
     (..., 2, 5): mounting x, y, heading, bearing bias, range scale.
     """
     poses = np.asarray(poses, dtype=float)
-    mx, my, mh = model.mounting
+    mx, my, _ = model.mounting
     robot = se2.transform_to(poses, points)  # the point in the robot's frame
     dx, dy = robot[..., 0] - mx, robot[..., 1] - my
     distance = np.maximum(np.hypot(dx, dy), 1e-6)

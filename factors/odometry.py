@@ -183,7 +183,8 @@ class OdometryChain:
             return ChainState(t, 0.0, 0.0, 0.0, 0.0, 0.0, t)
         i = bisect.bisect_right(self._times, t) - 1
         if i >= 0:
-            return self._advance(self._knots[i], t).state()
+            knot = self._knots[i]
+            return knot.after(t - knot.t, self.model.lag, self.model.max_hold).state()
         first = self._knots[0]
         return ChainState(t, first.x, first.y, first.heading, first.path, first.turn, first.unknown - (first.t - t))
 

@@ -1,0 +1,61 @@
+"""The estimators by name, and how one is made for a run."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Estimator
+from factorgraph_loc.files import FileModel, nearest, parse_model
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import World
+
+# name: (module, class of the estimator, class of its settings); imported when asked for
+ESTIMATORS = {
+    "dead_reckoning": ("dead_reckoning", "DeadReckoning", "DeadReckoningSettings"),
+    "ekf": ("ekf", "Ekf", "EkfSettings"),
+    "particle_filter": ("particle_filter", "ParticleFilter", "ParticleFilterSettings"),
+    "smoother": ("smoother", "Smoother", "SmootherSettings"),
+    "batch": ("batch", "Batch", "BatchSettings"),
+}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every estimator is made from: robot, map, the sensors it may use, and its own random generator."""
+
+    rig: Rig
+    world: World
+    sensors: tuple[str, ...]
+    rng: np.random.Generator
+
+
+def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
+    """The frozen settings of an estimator; ``overrides`` by dotted key without the estimator's name.
+
+    Raises InputError for an unknown estimator, an unknown key or a value out of bounds.
+    """
+    return parse_model(_load(name, 2), overrides, f"settings of {name}")
+
+
+def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
+    """An estimator by name."""
+    return cast(Estimator, _load(name, 1)(setup, settings))
+
+
+def check_names(names: Sequence[str]) -> None:
+    """InputError for the first name that is no estimator, with the nearest that is."""
+    for name in names:
+        if name not in ESTIMATORS:
+            raise InputError(f"no estimator is called {name!r}{nearest(name, list(ESTIMATORS))}")
+
+
+def _load(name: str, which: int) -> Any:
+    check_names([name])
+    entry = ESTIMATORS[name]
+    return getattr(importlib.import_module(f"factorgraph_loc.estimators.{entry[0]}"), entry[which])
