@@ -6,14 +6,17 @@ Every number has its unit in the description; the bounds are there to catch wron
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
 from factors.bearing_range import BearingRangeModel
-from factors.odometry import Growth, OdometryModel
+from factors.odometry import PARAMETERS, Growth, OdometryModel
+from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
@@ -93,6 +96,20 @@ class BearingRangeSettings(FileModel):
         )
 
 
+@dataclass(frozen=True)
+class EstimatedParameters:
+    """The odometry's constants that an estimator learns: positions in ``factors.odometry.PARAMETERS``, prior sigmas (P,)."""
+
+    indices: tuple[int, ...]
+    sigmas: Array
+
+    def full(self, values: Array) -> Array:
+        """All constants (3,), zero where not estimated."""
+        out = np.zeros(len(PARAMETERS))
+        out[list(self.indices)] = values
+        return out
+
+
 class Rig(FileModel):
     """A robot: the sensors that estimators use by default, and the settings of each."""
 
@@ -121,6 +138,12 @@ class Rig(FileModel):
             lateral=s.noise.lateral.model(),
             heading=imu.heading.model() if use_gyro else s.noise.heading.model(),
         )
+
+    def estimated_parameters(self) -> EstimatedParameters:
+        """Which constants of the odometry are estimated on the way, as changes from the rig's values."""
+        sigmas = np.array((0.0, 0.0, self.odometry.heading_rate_bias_sigma))
+        indices = np.flatnonzero(sigmas)
+        return EstimatedParameters(tuple(indices.tolist()), sigmas[indices])
 
     def time_offset(self, sensor: str) -> float:
         """Seconds to add to the stamps of a sensor's stream."""

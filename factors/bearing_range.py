@@ -1,8 +1,8 @@
 """Identified landmarks seen as bearing and range, or as range alone (ranging beacons).
 
 A sensor sits on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and
-``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40).
-The noise is Gaussian in its core with the heavy tails of a Cauchy loss, joint over range and bearing of one landmark.
+``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic
+Robotics", 2005, eq. 6.40). The noise is Gaussian in its core with the heavy tails of a Cauchy loss, joint over range and bearing of one landmark.
 """
 
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
     error = np.stack(
         ((expected_range - ranges) / sigma[:, 0], se2.wrap(expected_bearing - bearings) / sigma[:, 1]), axis=-1
     )
-    return np.nan_to_num(error, nan=0.0)
+    return np.asarray(np.nan_to_num(error, nan=0.0))
 
 
 def cauchy_weight(squared: Array, scale: float) -> Array:
@@ -130,16 +130,17 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, 3) by the pose ``values[0]`` (3,)."""
-        error, jacobian = self._whitened(values[0])
+        error, jacobian = self.whitened(values[0])
         weight = np.sqrt(cauchy_weight(np.sum(error**2, axis=-1), self.model.robust))
         return (weight[:, None] * error).ravel(), [(weight[:, None, None] * jacobian).reshape(-1, 3)]
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss at the pose ``values[0]``."""
-        error, _ = self._whitened(values[0])
+        error, _ = self.whitened(values[0])
         return float(np.sum(cauchy_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
-    def _whitened(self, pose: Array) -> tuple[Array, Array]:
+    def whitened(self, pose: Array) -> tuple[Array, Array]:
+        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, 3), without the robust weight."""
         at = pose if self.offset is None else se2.compose(pose, self.offset)
         error = residuals(self.model, at, self.points, self.ranges, self.bearings)
         sigma = sigmas(self.model, self.ranges)

@@ -10,6 +10,7 @@ result does not depend on how finely a path is cut into pieces.
 
 import bisect
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -43,7 +44,8 @@ class OdometryModel:
     """What we believe about wheel odometry (and about the gyro that may replace its rotation).
 
     ``scale_distance``, ``scale_rotation``: true over reported motion. ``heading_rate_bias`` [rad/s] is added to the true
-    rate in the report, whether the robot moves or not (``gyro_bias`` likewise). ``direction`` [rad]: direction of travel in the robot's frame.
+    rate in the report, whether the robot moves or not (``gyro_bias`` likewise). ``direction`` [rad]: that of travel, in the
+    robot's frame.
     ``delay`` and ``lag`` [s] belong to commanded velocities. A velocity is held for at most ``max_hold`` seconds; after
     that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
     """
@@ -99,7 +101,7 @@ class _Row:
 class _Knot:
     """State at the time of a row, and the motion that follows until the next one."""
 
-    __slots__ = ("heading", "path", "t", "turn", "unknown", "ux", "uy", "uw", "vx", "vy", "w", "x", "y")
+    __slots__ = ("heading", "path", "t", "turn", "unknown", "uw", "ux", "uy", "vx", "vy", "w", "x", "y")
 
     def __init__(self, t: float) -> None:
         self.t = t
@@ -287,6 +289,10 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     return Increment(delta, covariance, duration)
 
 
+# the constants that recalibrated() changes
+PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias")
+
+
 def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]:
     """The increment under changed parameters, and its Jacobian.
 
@@ -302,6 +308,43 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
 
 
 def between_factor(from_key: int, to_key: int, increment: Increment) -> gtsam.NonlinearFactor:
-    """The increment as a factor between two ``Pose2`` variables."""
+    """The increment as GTSAM's factor between two ``Pose2`` variables."""
     noise = gtsam.noiseModel.Gaussian.Covariance(increment.covariance)
     return gtsam.BetweenFactorPose2(from_key, to_key, gtsam.Pose2(*increment.delta), noise)
+
+
+class OdometryFactor:
+    """The increment between two poses, with constants of the odometry as a third variable.
+
+    ``estimated``: positions in :data:`PARAMETERS` of the P constants that the variable holds. The values of the factor are the two
+    poses (3,) and the constants (P,), or the poses alone where P is zero.
+    """
+
+    def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
+        self._increment = increment
+        self._estimated = list(estimated)
+        self._whitener = np.linalg.inv(np.linalg.cholesky(increment.covariance))
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
+        delta, by_parameter = self._delta(values)
+        relative = se2.between(values[0], values[1])
+        error = se2.log(se2.between(delta, relative))
+        inverse = self._whitener @ np.linalg.inv(se2.right_jacobian(error))
+        blocks = [-inverse @ se2.adjoint(se2.inverse(relative)), inverse]
+        if self._estimated:
+            blocks.append(-self._whitener @ np.linalg.inv(se2.right_jacobian(-error)) @ by_parameter)
+        return self._whitener @ error, blocks
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        error = self._whitener @ se2.log(se2.between(self._delta(values)[0], se2.between(values[0], values[1])))
+        return 0.5 * float(error @ error)
+
+    def _delta(self, values: Sequence[Array]) -> tuple[Array, Array]:
+        if not self._estimated:
+            return self._increment.delta, np.zeros((3, 0))
+        parameters = np.zeros(len(PARAMETERS))
+        parameters[self._estimated] = values[2]
+        delta, jacobian = recalibrated(self._increment, parameters)
+        return delta, jacobian[:, self._estimated]

@@ -40,7 +40,8 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 
     Raises InputError for an unknown estimator, an unknown key or a value out of bounds.
     """
-    return parse_model(_load(name, 2), overrides, f"settings of {name}")
+    kind = cast(type[FileModel], _load(name, 2))
+    return parse_model(kind, overrides, f"settings of {name}")
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:

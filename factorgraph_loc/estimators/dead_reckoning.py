@@ -1,0 +1,57 @@
+"""Odometry alone: what every other estimator has to beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import PoseEstimate, PosePrior
+from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
+from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.odometry import Increment
+from factors.se2 import Array
+
+
+class DeadReckoningSettings(FilterSettings):
+    """Dead reckoning has nothing of its own to set."""
+
+
+@dataclass(frozen=True)
+class _State:
+    pose: Array
+    covariance: Array  # body frame
+
+
+class DeadReckoning(Filter):
+    """Composes the odometry, with the covariance that grows on the way; landmarks are counted as ignored."""
+
+    _state: _State
+
+    def trajectory(self) -> Trajectory:
+        """The same as the causal estimates: there is nothing to smooth."""
+        return at_ticks(
+            self._ticks,
+            np.array([t for t, _ in self._records]),
+            np.array([s.pose for _, s in self._records]),
+            np.array([s.covariance for _, s in self._records]),
+        )
+
+    def _start(self, prior: PosePrior) -> _State:
+        return _State(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
+
+    def _predict(self, increment: Increment) -> None:
+        s = self._state
+        self._state = _State(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
+
+    def _update(self, m: BearingRange) -> None:
+        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+
+    def _estimate(self) -> PoseEstimate:
+        return world_estimate(self._t, self._state.pose, self._state.covariance)
+
+    def _record(self) -> tuple[float, _State]:
+        return self._t, self._state

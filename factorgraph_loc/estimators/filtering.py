@@ -1,0 +1,154 @@
+"""What the filters have in common: time, odometry, late measurements, the record of the run."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEstimate, PosePrior, gaussian_belief
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.files import FileModel
+from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.odometry import ChainState, Increment
+from factors.se2 import Array
+
+
+class FilterSettings(FileModel):
+    """Settings of every filter. ``max_delay`` [s]: how late a measurement may come. ``smooth``: final differs from causal."""
+
+    max_delay: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
+    smooth: bool = True
+
+
+class Filter(ABC):
+    """A recursive estimator: predicts along the odometry to each measurement's time, then updates.
+
+    The state is replaced, never changed in place, so that a checkpoint costs nothing: a late measurement goes back to the
+    checkpoint before its time and takes the events since then once more.
+    """
+
+    deterministic = True
+    supports_unknown_start = False
+
+    def __init__(self, setup: Setup, settings: FilterSettings) -> None:
+        self.diagnostics = Diagnostics()
+        self._setup = setup
+        self._max_delay = settings.max_delay
+        self._smooth = settings.smooth
+        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
+        self._state: Any = None
+        self._t = -math.inf
+        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._ticks: list[float] = []
+        self._records: list[Any] = []
+        self._events: deque[tuple[BearingRange | Tick, tuple[Any, ...]]] = deque()
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian."""
+        self._t = prior.t
+        self._odometry = self._motion.state(prior.t)
+        self._state = self._start(prior)
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if not isinstance(measurement, BearingRange | Tick):
+            self._motion.add(measurement)
+        elif self._state is None:
+            self.diagnostics.ignore("before the start")
+        elif measurement.t >= self._t:
+            self._take(measurement)
+        elif measurement.t < self._t - self._max_delay or not self._events:
+            self.diagnostics.drop_late(type(measurement).__name__)
+        else:
+            self._take_late(measurement)
+
+    def estimate(self) -> PoseEstimate:
+        """The pose at the time of the newest measurement or tick."""
+        if self._state is None:
+            return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        return self._estimate()
+
+    def belief(self) -> Belief:
+        """The belief behind :meth:`estimate`."""
+        return gaussian_belief(self.estimate())
+
+    def learnt(self) -> Learnt:
+        """Nothing, unless the filter says otherwise."""
+        return Learnt()
+
+    @abstractmethod
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past at the stamps of the ticks."""
+
+    @abstractmethod
+    def _start(self, prior: PosePrior) -> Any:
+        """The state that stands for the prior."""
+
+    @abstractmethod
+    def _predict(self, increment: Increment) -> None:
+        """Move the state along."""
+
+    @abstractmethod
+    def _update(self, m: BearingRange) -> None:
+        """Take a measurement at the state's time."""
+
+    @abstractmethod
+    def _estimate(self) -> PoseEstimate:
+        """Mean and covariance of the state."""
+
+    @abstractmethod
+    def _record(self) -> Any:
+        """What :meth:`trajectory` needs of this time, with its time as ``t``."""
+
+    def _take(self, m: BearingRange | Tick) -> None:
+        checkpoint = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+        self._events.append((m, checkpoint))
+        while self._events[0][0].t < m.t - self._max_delay:
+            self._events.popleft()
+        if m.t > self._t:
+            odometry = self._motion.state(m.t)
+            self._predict(self._motion.relative(self._odometry, odometry))
+            self._t, self._odometry = m.t, odometry
+        if isinstance(m, BearingRange):
+            self._update(m)
+        else:
+            self._ticks.append(m.t)
+        self._records.append(self._record())
+
+    def _take_late(self, late: BearingRange | Tick) -> None:
+        again: list[BearingRange | Tick] = []
+        while self._events and self._t > late.t:
+            m, checkpoint = self._events.pop()
+            again.append(m)
+            self._go_back(checkpoint)
+        if self._t > late.t:
+            self.diagnostics.drop_late(type(late).__name__)
+        else:
+            again.append(late)
+        for m in sorted(again, key=lambda m: m.t):
+            self._take(m)
+
+    def _go_back(self, checkpoint: tuple[Any, ...]) -> None:
+        self._state, self._t, self._odometry, records, ticks = checkpoint
+        del self._records[records:], self._ticks[ticks:]
+
+
+def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
+    """The trajectory at the stamps ``ticks``, of records at times ``t`` (N,): the last record of each stamp counts."""
+    rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
+    covariances = se2.body_to_world(poses[rows], body_covariances[rows])
+    return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
+
+
+def world_estimate(t: float, pose: Array, body_covariance: Array) -> PoseEstimate:
+    """A localized estimate from a body-frame covariance."""
+    return PoseEstimate(t, pose, se2.body_to_world(pose, body_covariance), "localized")

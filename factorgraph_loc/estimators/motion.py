@@ -1,0 +1,49 @@
+"""The odometry of a run, as all estimators take it in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.measurements import IncrementOdometry, Odometry, VelocityOdometry, YawRate
+from factorgraph_loc.rig import Rig
+from factors import se2
+from factors.odometry import ChainState, Increment, OdometryChain
+from factors.se2 import Array
+
+
+class Motion:
+    """Odometry rows in, relative motion between any two recent times out."""
+
+    def __init__(self, rig: Rig, sensors: tuple[str, ...], diagnostics: Diagnostics) -> None:
+        self._use_gyro = "imu" in sensors and rig.imu is not None
+        self._use_wheels = "odometry" in sensors
+        self._chain = OdometryChain(rig.odometry_model(use_gyro=self._use_gyro), use_gyro=self._use_gyro)
+        self._diagnostics = diagnostics
+
+    def add(self, m: Odometry) -> None:
+        """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
+        if isinstance(m, YawRate) and not self._use_gyro:
+            self._diagnostics.ignore("yaw rate")
+        elif not isinstance(m, YawRate) and not self._use_wheels:
+            self._diagnostics.ignore("odometry")
+        elif m.t < self._chain.oldest:
+            self._diagnostics.drop_late("odometry")
+        elif isinstance(m, VelocityOdometry):
+            self._chain.add_velocity(m.t, m.v, m.w)
+        elif isinstance(m, IncrementOdometry):
+            self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
+        else:
+            self._chain.add_yaw_rate(m.t, m.w)
+
+    def state(self, t: float) -> ChainState:
+        return self._chain.state(t)
+
+    def relative(self, start: ChainState, end: ChainState) -> Increment:
+        return self._chain.relative(start, end)
+
+
+def propagate(covariance: Array, increment: Increment) -> Array:
+    """A body-frame covariance (3, 3) carried along an increment."""
+    transition = se2.adjoint(se2.inverse(increment.delta))
+    return np.asarray(transition @ covariance @ transition.T + increment.covariance)

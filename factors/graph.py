@@ -1,0 +1,82 @@
+"""From our factors to GTSAM's.
+
+A factor of this package has ``linearize(values)``, with the values of its variables as arrays: poses (3,), vectors (P,). It
+returns the whitened, robustly weighted residual and one Jacobian a variable, by body-frame perturbation. The functions here wrap it
+so that it can neither crash nor corrupt a solver: GTSAM takes a Jacobian of wrong shape without a word, and an exception inside
+a callback leaves iSAM2 half updated.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from factors.se2 import Array
+
+
+class Factor(Protocol):
+    """What :func:`custom_factor` and :func:`jacobian_factor` take."""
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, weighted residual (m,) and a Jacobian (m, d) for each variable."""
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The loss, robust where the factor is."""
+
+
+def pose_array(pose: gtsam.Pose2) -> Array:
+    """A ``gtsam.Pose2`` as (x, y, heading)."""
+    return np.array((pose.x(), pose.y(), pose.theta()))
+
+
+def read_pose(values: gtsam.Values, key: int) -> Array:
+    """The pose (3,) of a variable."""
+    return pose_array(values.atPose2(key))
+
+
+def read_vector(values: gtsam.Values, key: int) -> Array:
+    """The vector of a variable."""
+    return np.asarray(values.atVector(key), dtype=float)
+
+
+def custom_factor(
+    factor: Factor,
+    keys: Sequence[int],
+    readers: Sequence[Callable[[gtsam.Values, int], Array]],
+    dimensions: Sequence[int],
+    rows: int,
+    on_failure: Callable[[str], None],
+) -> gtsam.NonlinearFactor:
+    """``factor`` on the variables ``keys``, read by ``readers``, with tangent ``dimensions`` and ``rows`` residuals.
+
+    A residual or Jacobian that is not finite or has a wrong shape is replaced by zeros, and ``on_failure`` is told.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Array:
+        try:
+            residual, blocks = factor.linearize([read(values, key) for read, key in zip(readers, keys, strict=True)])
+            _check(residual, blocks, rows, dimensions)
+        except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
+            on_failure(str(failure))
+            residual, blocks = np.zeros(rows), [np.zeros((rows, d)) for d in dimensions]
+        if jacobians is not None:
+            for i, block in enumerate(blocks):
+                jacobians[i] = block
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), list(keys), error)
+
+
+def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.JacobianFactor:
+    """``factor`` linearised at ``values``."""
+    residual, blocks = factor.linearize(values)
+    pairs = [part for pair in zip(keys, blocks, strict=True) for part in pair]
+    return gtsam.JacobianFactor(*pairs, -residual, gtsam.noiseModel.Unit.Create(len(residual)))
+
+
+def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:
+    if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, d) for d in dimensions]:
+        raise ValueError(f"shapes {residual.shape}, {[b.shape for b in blocks]}, expected {rows} rows")
+    if not np.all(np.isfinite(residual)) or not all(np.all(np.isfinite(b)) for b in blocks):
+        raise ValueError("a residual or Jacobian is not finite")
