@@ -1,0 +1,43 @@
+# Sourced by the other scripts: makes .venv, installs the project into it with the pinned versions, and activates it.
+# Usage: source environment.sh EXTRA   (EXTRA is "" or "[test]")
+
+find_python() {
+    local candidate
+    for candidate in "${PYTHON:-python3}" python3.13 python3.12 python3.11; do
+        if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+            echo "$candidate"
+            return
+        fi
+    done
+    echo "Python 3.11 or newer is needed, but $(python3 --version 2>&1 || echo 'no python3 at all') was found." \
+        "Install it, or name it: PYTHON=/path/to/python3.11 $0" >&2
+    return 1
+}
+
+make_venv() {
+    local python
+    python=$(find_python) || return 1
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        echo "$python cannot make virtual environments. On Debian and Ubuntu: sudo apt install" \
+            "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv" >&2
+        return 1
+    fi
+    echo "Making a virtual environment in .venv ..."
+    "$python" -m venv .venv
+}
+
+prepare() {
+    local extra=$1 stamp wanted
+    [ -x .venv/bin/pip ] || make_venv || return 1
+    # what is installed is named by a hash of what asks for it; a test environment serves the demo too
+    wanted="$(cat pyproject.toml constraints.txt | sha256sum | cut -d' ' -f1)"
+    stamp=.venv/installed
+    if ! grep -qx "$wanted$extra" "$stamp" 2>/dev/null && ! grep -qxF "$wanted[test]" "$stamp" 2>/dev/null; then
+        echo "Installing the project and its dependencies into .venv (a few minutes the first time) ..."
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
+        echo "$wanted$extra" >"$stamp"
+    fi
+    export PATH="$PWD/.venv/bin:$PATH"
+}
+
+prepare "$1"
