@@ -6,7 +6,7 @@ Robotics", 2005, eq. 6.40). The noise is Gaussian in its core with the heavy tai
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,18 +54,15 @@ def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Ar
     distance = np.maximum(np.hypot(dx, dy), 1e-6)
     ux, uy = dx / distance, dy / distance
     # by the point in the robot's frame
-    local = np.stack(
-        (
-            np.stack((model.range_scale * ux, model.range_scale * uy), axis=-1),
-            np.stack((-uy / distance, ux / distance), axis=-1),
-        ),
-        axis=-2,
-    )
+    local = np.empty((*np.shape(distance), 2, 2))
+    local[..., 0, 0], local[..., 0, 1] = model.range_scale * ux, model.range_scale * uy
+    local[..., 1, 0], local[..., 1, 1] = -uy / distance, ux / distance
     by_pose = np.zeros((*local.shape[:-1], 3))
     by_pose[..., :2] = -local
     by_pose[..., 2] = local[..., 0] * robot[..., 1, None] - local[..., 1] * robot[..., 0, None]
     c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    to_robot = np.stack((np.stack((c, s), axis=-1), np.stack((-s, c), axis=-1)), axis=-2)
+    to_robot = np.empty((*np.shape(c), 2, 2))
+    to_robot[..., 0, 0], to_robot[..., 0, 1], to_robot[..., 1, 0], to_robot[..., 1, 1] = c, s, -s, c
     by_point = local @ to_robot
     by_sensor = np.zeros((*local.shape[:-1], 5))
     by_sensor[..., :2] = -local
@@ -77,7 +74,7 @@ def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Ar
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
     """Standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,); a missing range has the near one's."""
-    ranges = np.nan_to_num(ranges)
+    ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
     out[:, 1] = model.bearing_sigma
@@ -91,10 +88,11 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
     """
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
-    error = np.stack(
-        ((expected_range - ranges) / sigma[:, 0], se2.wrap(expected_bearing - bearings) / sigma[:, 1]), axis=-1
-    )
-    return np.asarray(np.nan_to_num(error, nan=0.0))
+    error = np.empty((*np.shape(expected_range), 2))
+    error[..., 0] = (expected_range - ranges) / sigma[:, 0]
+    error[..., 1] = se2.wrap(expected_bearing - bearings) / sigma[:, 1]
+    error[np.isnan(error)] = 0.0
+    return error
 
 
 def cauchy_weight(squared: Array, scale: float) -> Array:
@@ -110,7 +108,8 @@ def cauchy_loss(squared: Array, scale: float) -> Array:
 def log_likelihood(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
     """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3)."""
     error = residuals(model, poses[:, None, :], points, ranges, bearings)
-    return -np.sum(cauchy_loss(np.sum(error**2, axis=-1), model.robust), axis=-1)
+    loss: Array = np.sum(cauchy_loss(np.sum(error**2, axis=-1), model.robust), axis=-1)
+    return -loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +137,10 @@ class BearingRangeFactor:
         """The robust loss at the pose ``values[0]``."""
         error, _ = self.whitened(values[0])
         return float(np.sum(cauchy_loss(np.sum(error**2, axis=-1), self.model.robust)))
+
+    def widened(self, width: float) -> "BearingRangeFactor":
+        """The same with a robust loss that is ``width`` times as wide."""
+        return replace(self, model=replace(self.model, robust=width * self.model.robust))
 
     def whitened(self, pose: Array) -> tuple[Array, Array]:
         """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, 3), without the robust weight."""

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
+from factors import se2
 from factors.se2 import Array
 
 
@@ -71,8 +72,27 @@ def custom_factor(
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.JacobianFactor:
     """``factor`` linearised at ``values``."""
     residual, blocks = factor.linearize(values)
-    pairs = [part for pair in zip(keys, blocks, strict=True) for part in pair]
-    return gtsam.JacobianFactor(*pairs, -residual, gtsam.noiseModel.Unit.Create(len(residual)))
+    pairs: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
+    linear: gtsam.JacobianFactor = gtsam.JacobianFactor(*pairs, -residual, gtsam.noiseModel.Unit.Create(len(residual)))
+    return linear
+
+
+class PriorFactor:
+    """A Gaussian on one pose: ``mean`` (3,) and the ``covariance`` (3, 3) of its body-frame perturbation."""
+
+    def __init__(self, mean: Array, covariance: Array) -> None:
+        self._mean = mean
+        self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(mean^-1 * pose)`` and its Jacobian."""
+        error = se2.log(se2.between(self._mean, values[0]))
+        return self._whitener @ error, [self._whitener @ np.linalg.inv(se2.right_jacobian(error))]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        error = self._whitener @ se2.log(se2.between(self._mean, values[0]))
+        return 0.5 * float(error @ error)
 
 
 def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:

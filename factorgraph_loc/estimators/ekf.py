@@ -15,7 +15,7 @@ from pydantic import Field
 
 from factorgraph_loc.estimators.base import Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.estimators.landmarks import KnownLandmarks
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.trajectory import Trajectory
@@ -119,40 +119,9 @@ class Ekf(Filter):
         prior = self._state
         if self._predicted is None:
             self._predicted = prior
-        delta = np.zeros(len(prior.covariance))
-        covariance = prior.covariance
-        for iteration in range(self._iterations):
-            at = prior.plus(delta, covariance)
-            residual, jacobian = seen.whitened(at.pose)
-            h = np.zeros((residual.size, len(delta)))
-            h[:, :3] = jacobian.reshape(-1, 3)
-            # the innovation at the prior mean, linearised here
-            innovation = -residual.ravel() + h @ delta
-            if iteration == 0:
-                self._landmarks.report(m.t, seen, innovation, h[:, :3], covariance[:3, :3])
-            noise = self._widened(seen.model.robust, residual, h, prior.covariance, first=iteration == 0)
-            s = h @ prior.covariance @ h.T + np.diag(noise)
-            gain = np.linalg.solve(s, h @ prior.covariance).T
-            step = gain @ innovation
-            converged = np.abs(step - delta).max() < 1e-6
-            delta = step
-            if converged:
-                break
-        keep = np.eye(len(delta)) - gain @ h
-        covariance = keep @ prior.covariance @ keep.T + gain @ np.diag(noise) @ gain.T
-        self._state = prior.plus(delta, (covariance + covariance.T) / 2.0)
-
-    @staticmethod
-    def _widened(scale: float, residual: Array, h: Array, covariance: Array, *, first: bool) -> Array:
-        """Noise variances (2K,) of whitened residuals (K, 2): one, over the Cauchy weight of each landmark's residual."""
-        spread = np.ones(len(residual))
-        if first:  # the prediction's own uncertainty is no reason to doubt a landmark
-            blocks = h.reshape(len(residual), 2, -1)
-            s = blocks @ covariance @ np.swapaxes(blocks, -1, -2) + np.eye(2)
-            squared = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(s), residual)
-        else:
-            squared = np.sum(residual**2, axis=-1)
-        return np.repeat(spread * (1.0 + squared / scale**2), 2)
+        delta, covariance, innovation = robust_update(seen, prior.pose, prior.covariance, self._iterations)
+        self._landmarks.report(m.t, seen, innovation)
+        self._state = prior.plus(delta, covariance)
 
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance[:3, :3])

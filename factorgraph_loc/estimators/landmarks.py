@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
-from factors.bearing_range import BearingRangeFactor
+from factors import se2
+from factors.bearing_range import BearingRangeFactor, cauchy_weight
 from factors.odometry import Increment
 from factors.se2 import Array
+
+CONVERGED = 1e-6  # of an iterated update, m and rad
 
 
 class KnownLandmarks:
@@ -37,12 +42,63 @@ class KnownLandmarks:
             return BearingRangeFactor(self._model, points, ranges, bearings)
         return BearingRangeFactor(self._model, points, ranges, bearings, offset.delta, offset.covariance)
 
-    def report(self, t: float, factor: BearingRangeFactor, innovation: Array, h: Array, covariance: Array) -> None:
-        """Record the normalised innovation squared of whitened innovations (2K,) with Jacobian ``h`` (2K, 3)."""
-        used = np.stack((~np.isnan(factor.ranges), ~np.isnan(factor.bearings)), axis=-1).ravel()
-        e, j = innovation[used], h[used]
-        s = j @ covariance @ j.T + np.eye(len(e))
+    def report(self, t: float, factor: BearingRangeFactor, innovation: Innovation) -> None:
+        """Record the normalised innovation squared, over the values that were measured."""
+        used = np.column_stack((~np.isnan(factor.ranges), ~np.isnan(factor.bearings))).ravel()
+        e, s = innovation.error[used], innovation.covariance[np.ix_(used, used)]
         self._diagnostics.innovation("bearing_range", t, float(e @ np.linalg.solve(s, e)), len(e))
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """Whitened measurement less prediction (2K,), and its covariance (2K, 2K) under prediction and noise."""
+
+    error: Array
+    covariance: Array
+
+
+def robust_update(
+    factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int
+) -> tuple[Array, Array, Innovation]:
+    """Kalman update of ``pose`` (3,) and further states, robust and iterated.
+
+    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. A landmark's
+    noise is widened by the inverse of its Cauchy weight: at first by the normalised innovation, as the prediction's own
+    uncertainty is no reason to doubt a landmark; then by the residual at the updated pose (iteratively reweighted least squares).
+    Returns the correction (S,), the updated covariance and the innovation at the prediction.
+    """
+    size = len(covariance)
+    delta = np.zeros(size)
+    for iteration in range(iterations):
+        residual, jacobian = factor.whitened(pose if iteration == 0 else se2.compose(pose, se2.exp(delta[:3])))
+        h = np.zeros((residual.size, size))
+        h[:, :3] = jacobian.reshape(-1, 3)
+        spread = h @ covariance @ h.T
+        error = h @ delta - residual.ravel()
+        if iteration == 0:
+            first = Innovation(error, spread + np.eye(len(error)))
+            squared = _per_landmark(first)
+        else:
+            squared = np.sum(residual**2, axis=-1)
+        noise = np.repeat(1.0 / cauchy_weight(squared, factor.model.robust), 2)
+        gain = np.linalg.solve(spread + np.diag(noise), h @ covariance).T
+        step = gain @ error
+        settled = np.abs(step - delta).max() < CONVERGED
+        delta = step
+        if settled:
+            break
+    keep = np.eye(size) - gain @ h
+    updated = keep @ covariance @ keep.T + (gain * noise) @ gain.T
+    return delta, (updated + updated.T) / 2.0, first
+
+
+def _per_landmark(innovation: Innovation) -> Array:
+    """Normalised innovation squared (K,) of each landmark by itself."""
+    count = len(innovation.error) // 2
+    i = np.arange(count)
+    blocks = innovation.covariance.reshape(count, 2, count, 2)[i, :, i, :]
+    e = innovation.error.reshape(count, 2)
+    return np.asarray(np.sum(e * np.linalg.solve(blocks, e[:, :, None])[:, :, 0], axis=-1))
 
 
 def _has_value(m: BearingRange, i: int) -> bool:

@@ -1,0 +1,80 @@
+"""The offline optimum: the whole log in one robust least-squares problem, solved when all is known.
+
+While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates are never
+``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins wide and narrows to its
+own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Cauchy loss).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.estimators.base import PoseEstimate
+from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
+from factorgraph_loc.estimators.landmarks import robust_update
+from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.bearing_range import BearingRangeFactor
+from factors.se2 import Array
+
+
+class BatchSettings(GraphSettings):
+    """``widest_loss``: how many times wider than its own scale the robust loss begins; 1 for a plain robust start."""
+
+    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+
+
+class Batch(GraphEstimator):
+    """The batch estimator; see the module."""
+
+    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
+        super().__init__(setup, settings)
+        self._widest = settings.widest_loss
+        self._guesses: list[Array] = []
+
+    def estimate(self) -> PoseEstimate:
+        """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
+        return replace(super().estimate(), status="unlocalized")
+
+    def trajectory(self) -> Trajectory:
+        """The optimum over the whole log."""
+        poses, parameters = np.array(self._guesses), np.zeros(len(self._estimated.indices))
+        width = self._widest
+        while width > 1.0:
+            wide = self._problem(width).solve(poses, parameters)
+            poses, parameters = wide.poses, wide.parameters
+            width = max(1.0, width / 2.0)
+        problem = self._problem(1.0)
+        best = problem.solve(poses, parameters)
+        if self._widest > 1.0:  # the graduated way may end in a worse optimum than the direct one
+            direct = problem.solve(np.array(self._guesses), np.zeros(len(parameters)))
+            best = min(best, direct, key=lambda s: s.cost)
+        self._parameters = best.parameters
+        covariances, self._parameter_covariance = problem.covariances(best.poses, best.parameters)
+        return self._between(best.poses, covariances)
+
+    def _begin(self, first: Keyframe) -> None:
+        self._guesses.append(self._pose)
+
+    def _extend(self, keyframe: Keyframe, guess: Array) -> None:
+        assert keyframe.from_previous is not None
+        self._pose = se2.compose(self._pose, keyframe.from_previous.delta)
+        self._covariance = propagate(self._covariance, keyframe.from_previous)
+        for factor in keyframe.factors:
+            self._update_guess(factor)
+        self._guesses.append(self._pose)
+
+    def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
+        if keyframe.index == len(self._guesses) - 1:
+            self._update_guess(factor)
+            self._guesses[-1] = self._pose
+
+    def _update_guess(self, factor: BearingRangeFactor) -> None:
+        delta, self._covariance, _ = robust_update(factor, self._pose, self._covariance, iterations=5)
+        self._pose = se2.compose(self._pose, se2.exp(delta))
