@@ -34,7 +34,7 @@ prepare() {
     stamp=.venv/installed
     if ! grep -qx "$wanted$extra" "$stamp" 2>/dev/null && ! grep -qxF "$wanted[test]" "$stamp" 2>/dev/null; then
         echo "Installing the project and its dependencies into .venv (a few minutes the first time) ..."
-        .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
+        .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
         echo "$wanted$extra" >"$stamp"
     fi
     export PATH="$PWD/.venv/bin:$PATH"

@@ -1,0 +1,138 @@
+"""``fgloc datasets``, ``fgloc info`` and ``fgloc convert``: what there is, before anything is run."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import (
+    DataRoot,
+    Json,
+    LogName,
+    LogOptions,
+    Reader,
+    ReaderOption,
+    RigFile,
+    WorldFile,
+)
+
+if TYPE_CHECKING:
+    from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
+    from factorgraph_loc.log import Log
+
+
+class Format(StrEnum):
+    """Of the tables of a native log."""
+
+    csv = "csv"
+    parquet = "parquet"
+
+
+def datasets(data_root: DataRoot = None, json: Json = False) -> None:
+    """List the logs that are known by name, and whether their files are there."""
+    from factorgraph_loc.readers import describe
+
+    known = [asdict(dataset) for dataset in describe(data_root)]
+    if json:
+        show.document(known)
+        return
+    rows = [(d["name"], d["reader"], "yes" if d["present"] else "no", d["title"]) for d in known]
+    show.table(("name", "reader", "present", "title"), rows)
+
+
+def info(
+    log: LogName,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+    json: Json = False,
+) -> None:
+    """Show what a log holds, and what looks wrong with it."""
+    from factorgraph_loc.evaluation.inspect import inspect
+
+    logs = LogOptions(reader, reader_option, data_root, rig, world).load([log])
+    inspections = [inspect(loaded) for loaded in logs]
+    if json:
+        documents = [_document(loaded, found) for loaded, found in zip(logs, inspections, strict=True)]
+        show.document(documents[0] if len(documents) == 1 else documents)
+        return
+    for i, (loaded, found) in enumerate(zip(logs, inspections, strict=True)):
+        if i:
+            typer.echo()
+        _print(loaded, found)
+
+
+def convert(
+    log: LogName,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
+    format: Annotated[Format, typer.Option(help="Of the tables.")] = Format.csv,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+) -> None:
+    """Write a log in the native format: a folder of tables that any program can read."""
+    from factorgraph_loc.readers import write_native
+
+    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
+    for warning in loaded.warnings:
+        show.note(f"warning: {warning}")
+    write_native(loaded, out, format=format.value)
+    typer.echo(f"wrote {out}")
+
+
+def _print(log: Log, found: Inspection) -> None:
+    first, last = log.span()
+    about = {
+        "log": log.name,
+        "span": f"{last - first:.1f} s",
+        "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors)}",
+        "world": f"{log.world.name}, {len(log.world.landmarks)} landmarks",
+        "start": "stated by the log" if log.start is not None else "not stated",
+    }
+    if log.reference is None:
+        about["reference"] = "none: runs cannot be scored"
+    elif not log.reference.has_heading:
+        about["reference"] = "positions only, headings are not scored"
+    show.fields(about | dict(log.metadata))
+    typer.echo()
+    streams = found.streams | ({"reference": found.reference} if found.reference is not None else {})
+    show.table(
+        ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps"), [_row(*item) for item in streams.items()]
+    )
+    typer.echo()
+    if not found.problems:
+        typer.echo("nothing looks wrong")
+    for problem in found.problems:
+        typer.echo(f"! {problem}")
+
+
+def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
+    numbers = (show.number(stream.rate, 1), show.number(stream.first, 1), show.number(stream.last, 1))
+    return (name, str(stream.rows), *numbers, str(len(stream.gaps)))
+
+
+def _document(log: Log, found: Inspection) -> dict[str, Any]:
+    first, last = log.span()
+    return {
+        "log": log.name,
+        "metadata": dict(log.metadata),
+        "span": last - first,
+        "rig": log.rig.model_dump(mode="json", exclude_none=True),
+        "world": {"name": log.world.name, "landmarks": len(log.world.landmarks)},
+        "start": None if log.start is None else {"t": log.start.t, "pose": log.start.pose.tolist()},
+        "streams": {name: asdict(stream) for name, stream in found.streams.items()},
+        "reference": None if found.reference is None else asdict(found.reference),
+        "unseen": found.unseen,
+        "unknown": dict(found.unknown),
+        "suspects": [asdict(suspect) | {"offset": suspect.offset.tolist()} for suspect in found.suspects],
+        "problems": found.problems,
+    }

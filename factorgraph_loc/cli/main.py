@@ -1,0 +1,73 @@
+"""The command ``fgloc``. The command line only parses and prints; numerical libraries are imported inside the commands."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from factorgraph_loc import __version__
+from factorgraph_loc.cli import inspecting, running
+from factorgraph_loc.errors import FglocError
+from factorgraph_loc.experiments.threads import use_one_thread
+
+DEBUG = "--debug"
+
+
+class Commands(TyperGroup):
+    """The one place where an error that a user can cause becomes a line on stderr and exit code 2."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """``--debug`` is taken wherever it stands on the line."""
+        if DEBUG in args:
+            args = [DEBUG, *(arg for arg in args if arg != DEBUG)]
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except FglocError as error:
+            if ctx.params.get("debug"):
+                raise
+            typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+            raise typer.Exit(2) from error
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input.",
+)
+app.command()(inspecting.datasets)
+app.command()(inspecting.info)
+app.command()(inspecting.convert)
+app.command()(running.run)
+app.command()(running.compare)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fgloc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def fgloc(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option(DEBUG, help="Show the traceback of an error. May stand anywhere on the line.")
+    ] = False,
+) -> None:
+    """Localize a robot from logged runs: look at a log, run an estimator on it, compare estimators."""
+
+
+def main() -> None:
+    """The entry point of ``fgloc``."""
+    use_one_thread()
+    app()

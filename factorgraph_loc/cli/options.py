@@ -1,0 +1,141 @@
+"""The options that commands share, and what their texts mean."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.log import Log
+
+LogName = Annotated[
+    str,
+    typer.Argument(
+        metavar="LOG",
+        help="A name that `fgloc datasets` lists, a manifest, a folder in the native format, or any path with --reader.",
+    ),
+]
+LogNames = Annotated[
+    list[str], typer.Argument(metavar="LOG...", help="Names that `fgloc datasets` lists, manifests, folders.")
+]
+DataRoot = Annotated[
+    Path | None, typer.Option(help="Folder that the manifests' paths start from; else the environment's FGLOC_DATA.")
+]
+Reader = Annotated[str | None, typer.Option(help="Reader of LOG, where LOG is neither a manifest nor a native folder.")]
+ReaderOption = Annotated[
+    list[str] | None, typer.Option(metavar="KEY=VALUE", help="Option of the reader; may be repeated.")
+]
+RigFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml in place of the log's own rig.")]
+WorldFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .world.toml in place of the log's own map.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results that are there already.")]
+Sensors = Annotated[
+    str | None, typer.Option(metavar="A,B", help="Sensors that the estimators may use; else those of the rig.")
+]
+Prior = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PRIOR",
+        help="Where a run starts: reference, log, unknown or X,Y,HEADING [m, m, rad]; else the log's start, else the reference.",
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME.KEY=VALUE", help="Setting of an estimator, e.g. smoother.lag=10; may be repeated."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """How logs are to be read."""
+
+    reader: str | None
+    reader_option: Sequence[str] | None
+    data_root: Path | None
+    rig: Path | None
+    world: Path | None
+
+    def load(self, names: Sequence[str]) -> list[Log]:
+        """The logs of several names; a name may stand for several logs."""
+        from factorgraph_loc.readers import load
+
+        options = dict(_key_and_value(text, "--reader-option") for text in self.reader_option or ())
+        return [
+            log
+            for name in names
+            for log in load(
+                name, data_root=self.data_root, reader=self.reader, options=options, rig=self.rig, world=self.world
+            )
+        ]
+
+    def load_one(self, name: str) -> Log:
+        """The log of a name that must stand for one log."""
+        logs = self.load([name])
+        if len(logs) > 1:
+            raise InputError(f"{name} stands for {len(logs)} logs, expected one: {', '.join(log.name for log in logs)}")
+        return logs[0]
+
+
+def parse_list(text: str) -> tuple[str, ...]:
+    """``a,b`` as ("a", "b")."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def parse_seeds(text: str) -> range:
+    """``0:10`` as the seeds 0 to 9, ``3`` as the seed 3 alone."""
+    first, colon, end = text.partition(":")
+    try:
+        seeds = range(int(first), int(end) if colon else int(first) + 1)
+    except ValueError:
+        seeds = range(0)
+    if not seeds or seeds[0] < 0:
+        raise InputError(f"--seeds is {text!r}, expected a number such as 3, or a range such as 0:10")
+    return seeds
+
+
+def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run."""
+    from factorgraph_loc.estimators.registry import check_names
+
+    settings: dict[str, dict[str, Any]] = {name: {} for name in estimators}
+    for text in texts:
+        name, value = _key_and_value(text, "--set")
+        estimator, *keys = name.split(".")
+        if not keys or not all(keys):
+            raise InputError(f"--set is {text!r}, expected NAME.key=value, such as smoother.lag=10")
+        check_names([estimator])
+        if estimator not in settings:
+            raise InputError(f"--set is {text!r}, but {estimator} is not run here; run: {', '.join(estimators)}")
+        table = settings[estimator]
+        for key in keys[:-1]:
+            table = table.setdefault(key, {})
+            if not isinstance(table, dict):
+                raise InputError(f"--set is {text!r}, but {key} is set to {table!r} already")
+        table[keys[-1]] = value
+    return settings
+
+
+def _key_and_value(text: str, option: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip() or not value.strip():
+        raise InputError(f"{option} is {text!r}, expected KEY=VALUE")
+    return key.strip(), _scalar(value.strip())
+
+
+def _scalar(text: str) -> Any:
+    """A value as TOML has it; a word that is not TOML is itself."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return table["value"] if len(table) == 1 else text

@@ -1,0 +1,77 @@
+"""How results look on the terminal: plain tables that nothing cuts off, also in a pipe."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+
+def note(text: str) -> None:
+    """A line for people, on stderr: where results are, what is doubtful."""
+    typer.echo(text, err=True)
+
+
+def document(content: Any) -> None:
+    """One JSON document on stdout; what JSON cannot say (NaN, infinity) is null."""
+    typer.echo(json.dumps(_plain(content), indent=2, ensure_ascii=False))
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table on stdout: the first column to the left, numbers to the right."""
+    from rich.console import Console
+    from rich.table import Table
+
+    out = Table(box=None, pad_edge=False, header_style="bold")
+    for i, name in enumerate(header):
+        numeric = i > 0 and all(_is_number(row[i]) for row in rows)
+        out.add_column(name, justify="right" if numeric else "left", overflow="fold", no_wrap=i == 0)
+    for row in rows:
+        out.add_row(*row)
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1000
+    Console(width=width, markup=False, highlight=False).print(out)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on stderr while the block lasts, to be told how many are done of how many; silent where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def fields(content: Mapping[str, str]) -> None:
+    """Names and values, one pair a line."""
+    width = max(map(len, content))
+    for name, value in content.items():
+        typer.echo(f"{name:<{width}}  {value}")
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number for a table, a dash where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _is_number(text: str) -> bool:
+    return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

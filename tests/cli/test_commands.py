@@ -1,0 +1,160 @@
+"""Every command of `fgloc`, from the arguments to the files."""
+
+import json
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from factorgraph_loc import __version__
+from factorgraph_loc.trajectory import read_tum
+
+RUN_FILES = {"final.tum", "causal.tum", "estimates.parquet", "metrics.json", "config.toml"}
+
+
+def test_version_and_help(fgloc):
+    assert fgloc("--version").stdout == f"fgloc {__version__}\n"
+    text = fgloc("--help").stdout
+    for command in ("datasets", "info", "convert", "run", "compare"):
+        assert command in text
+        assert fgloc(command, "--help").exit_code == 0
+
+
+@pytest.mark.parametrize("args", [["--help"], ["--version"], ["run", "--help"]])
+def test_help_does_not_load_numerical_libraries(args):
+    code = (
+        "import sys, factorgraph_loc.cli.main as m\n"
+        f"sys.argv[1:] = {args!r}\n"
+        "try: m.main()\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'gtsam', 'matplotlib', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.endswith("[]\n")
+
+
+def test_datasets(fgloc):
+    result = fgloc("datasets")
+    assert result.exit_code == 0
+    for name in ("plaza2", "mrclam6-robot1", "woods-r3"):
+        assert name in result.stdout
+    names = [entry["name"] for entry in json.loads(fgloc("datasets", "--json").stdout)]
+    assert "plaza2" in names
+
+
+def test_info(fgloc, short_log):
+    result = fgloc("info", short_log)
+    assert result.exit_code == 0
+    for word in ("odometry", "bearing_range", "reference", "landmarks"):
+        assert word in result.stdout
+    content = json.loads(fgloc("info", short_log, "--json").stdout)
+    assert content["streams"]["odometry"]["rows"] > 100
+    assert content["suspects"] == []
+
+
+def test_info_names_landmarks_that_are_swapped(fgloc, data_root, tmp_path):
+    root = tmp_path / "root"
+    shutil.copytree(data_root / "mrclam6", root / "mrclam6")
+    path = root / "mrclam6" / "Landmark_Groundtruth.dat"
+    lines = path.read_text().splitlines()
+    rows = {line.split()[0]: i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")}
+    a, b = rows["6"], rows["15"]
+    lines[a], lines[b] = (
+        " ".join(["6", *lines[b].split()[1:]]),
+        " ".join(["15", *lines[a].split()[1:]]),
+    )
+    path.write_text("\n".join(lines) + "\n")
+    content = json.loads(
+        fgloc("info", root / "mrclam6", "--reader", "mrclam", "--reader-option", "robot=3", "--json").stdout
+    )
+    assert {(s["landmark"], s["swapped_with"]) for s in content["suspects"]} == {("6", "15"), ("15", "6")}
+
+
+@pytest.mark.parametrize("robot", [1, 3, 5])
+def test_info_suspects_no_landmark_of_a_right_map(fgloc, data_root, robot):
+    content = json.loads(fgloc("info", f"mrclam6-robot{robot}", "--data-root", data_root, "--json").stdout)
+    assert content["suspects"] == []
+    assert content["unseen"] == []
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_convert(fgloc, short_log, tmp_path, kind):
+    out = tmp_path / "copy"
+    result = fgloc("convert", short_log, out, "--format", kind)
+    assert result.exit_code == 0
+    assert str(out) in result.stdout
+    assert (out / f"odometry.{kind}").is_file()
+    one, other = (json.loads(fgloc("info", log, "--json").stdout) for log in (short_log, out))
+    assert one["streams"] == other["streams"]
+
+
+def test_run_writes_its_files_and_says_where(fgloc, short_log, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc("run", short_log, "-e", "ekf", "-o", out, "--seed", 3)
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in out.iterdir()} == RUN_FILES
+    assert str(out) in result.stdout
+    assert "causal" in result.stdout
+    assert "final" in result.stdout
+    assert tomllib.loads((out / "config.toml").read_text())["seed"] == 3
+    assert len(read_tum(out / "final.tum")) > 500
+    assert set(pl.read_parquet(out / "estimates.parquet")["kind"]) == {"causal", "final"}
+
+
+def test_run_prints_json_alone(fgloc, short_log, tmp_path):
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
+    content = json.loads(result.stdout)
+    assert content["causal.position_rmse"] == pytest.approx(
+        json.loads((tmp_path / "out/metrics.json").read_text())["causal.position_rmse"]
+    )
+
+
+def test_run_takes_settings_sensors_and_a_start(fgloc, short_log, tmp_path):
+    options = ["--set", "ekf.max_delay=0.25", "--sensors", "odometry", "--prior", "0,0,0.5"]
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", *options)
+    assert result.exit_code == 0, result.output
+    config = tomllib.loads((tmp_path / "out/config.toml").read_text())
+    assert config["settings"]["max_delay"] == 0.25
+    assert config["sensors"] == ["odometry"]
+
+
+def test_run_refuses_to_overwrite_unless_told(fgloc, short_log, tmp_path):
+    first = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    again = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    told = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out", "--overwrite")
+    assert (first.exit_code, again.exit_code, told.exit_code) == (0, 2, 0)
+    assert "--overwrite" in again.stderr
+
+
+def test_compare(fgloc, short_log, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc("compare", short_log, "-e", "dead_reckoning,ekf", "-o", out, "--seeds", "0:2", "--jobs", 2)
+    assert result.exit_code == 0, result.output
+    assert "dead_reckoning" in result.stdout
+    assert str(out) in result.stdout
+    table = pl.read_csv(out / "results.csv")
+    assert set(table["estimator"]) == {"dead_reckoning", "ekf"}
+    assert (out / "results.parquet").is_file()
+    assert list(out.rglob("*.png"))
+    again = fgloc("compare", short_log, "-e", "ekf", "-o", out)
+    assert again.exit_code == 2
+    assert "--overwrite" in again.stderr
+
+
+def test_compare_prints_json_alone(fgloc, short_log, tmp_path):
+    result = fgloc("compare", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)
+
+
+def test_a_pipe_gets_plain_text(short_log, tmp_path):
+    command = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+    arguments = ["compare", str(short_log), "-e", "dead_reckoning,ekf", "-o", str(tmp_path / "out")]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=True)
+    assert "\x1b" not in done.stdout + done.stderr
+    assert done.stderr == ""
+    assert Path(tmp_path / "out/results.csv").is_file()

@@ -1,0 +1,15 @@
+"""What several tests share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """The folder of recorded data; the test is skipped where it is absent."""
+    folder = os.environ.get("FGLOC_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("FGLOC_DATA names no folder of recorded data")
+    return Path(folder)
