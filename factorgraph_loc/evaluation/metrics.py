@@ -1,0 +1,232 @@
+"""How far a trajectory is from the reference, and whether its covariances say so.
+
+No alignment: the map's frame is known. The reference is taken at the estimates' stamps; where its neighbours lie more than 0.1 s
+apart there is a gap, and nothing is scored. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
+Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
+systems", 2012, section IV.A, taken over path length instead of time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.se2 import Array
+
+MAX_REFERENCE_GAP = 0.1  # s
+RPE_DISTANCE = 1.0  # m
+CONFIDENCE = 0.95
+
+_ACCURACY = (
+    *(f"{what}_{how}" for what in ("position", "heading") for how in ("rmse", "median", "p95", "max")),
+    "rpe_position_per_m",
+    "rpe_heading_per_m",
+    "anees",
+    "nees_bounds",
+    "coverage_95",
+    "invalid_covariances",
+    "scored",
+)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the N poses of a trajectory; NaN where the reference has a gap.
+
+    ``difference`` (N, 3): estimate minus reference in x, y [m, world's frame] and heading [rad, wrapped]. ``position`` (N,):
+    Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the reference has no heading. ``nees`` (N,): squared error in units of
+    the stated covariance, of x, y and heading, or of x and y if the reference has no heading (``dof`` 3 or 2).
+    ``nees_position`` (N,): that of x and y alone. Both are NaN where the covariance is missing or not positive definite;
+    ``invalid`` (N,) marks the latter.
+    """
+
+    reference: Array
+    difference: Array
+    position: Array
+    heading: Array
+    nees: Array
+    nees_position: Array
+    dof: int
+    invalid: NDArray[np.bool_]
+
+
+def errors(trajectory: Trajectory, reference: Trajectory) -> Errors:
+    """The errors of each pose of ``trajectory`` against ``reference``, without alignment."""
+    truth = reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)
+    difference = trajectory.poses - truth
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    if not reference.has_heading:
+        difference[:, 2] = np.nan
+    dof = 3 if reference.has_heading else 2
+    n = len(trajectory)
+    nees, nees_position = np.full(n, np.nan), np.full(n, np.nan)
+    invalid = np.zeros(n, dtype=bool)
+    if trajectory.covariances is not None:
+        invalid = ~_positive_definite(trajectory.covariances)
+        good = ~invalid & np.isfinite(difference[:, 0])
+        nees[good] = _squared(difference[good, :dof], trajectory.covariances[good, :dof, :dof])
+        nees_position[good] = _squared(difference[good, :2], trajectory.covariances[good, :2, :2])
+    return Errors(
+        reference=truth,
+        difference=difference,
+        position=np.hypot(difference[:, 0], difference[:, 1]),
+        heading=np.abs(difference[:, 2]),
+        nees=nees,
+        nees_position=nees_position,
+        dof=dof,
+        invalid=invalid,
+    )
+
+
+def score(result: RunResult, log: Log) -> dict[str, Any]:
+    """All figures of a run, by dotted key; metres, radians, None where there is nothing to say.
+
+    ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
+    a reference. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
+    ``time_to_localized`` [s] counts from the first tick. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
+    ``timing.*`` are always there.
+    """
+    causal = result.causal()
+    final = result.final
+    if causal is not None:
+        final = _from(final, float(causal.t[0]))
+    scores: dict[str, Any] = {}
+    for kind, trajectory in (("causal", causal), ("final", final)):
+        figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference)
+        scores |= {f"{kind}.{name}": value for name, value in figures.items()}
+    scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
+    return scores | _counts(result.diagnostics) | _timing(result.timings)
+
+
+def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, Any]:
+    """The figures of one trajectory against the reference; all None without one.
+
+    ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
+    :func:`relative_errors`. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading). ``nees_bounds``: between these
+    an average of as many *independent* NEES lies with 95 %; errors along a trajectory are correlated, so a consistent estimator
+    leaves them more often. ``coverage_95``: share of the times at which the true (x, y) lies in the 95 % ellipse.
+    ``invalid_covariances``: how many covariances were not positive definite, and are in none of these three. ``scored``: how
+    many poses have a reference.
+    """
+    figures: dict[str, Any] = dict.fromkeys(_ACCURACY)
+    if reference is None:
+        return figures
+    e = errors(trajectory, reference)
+    for name, values in (("position", e.position), ("heading", e.heading)):
+        figures |= {f"{name}_{how}": value for how, value in _spread(values).items()}
+    if reference.has_heading:
+        position, heading = relative_errors(trajectory.poses, e.reference)
+        figures["rpe_position_per_m"] = _rms(position)
+        figures["rpe_heading_per_m"] = _rms(heading)
+    nees = e.nees[np.isfinite(e.nees)]
+    if len(nees):
+        tail = (1.0 - CONFIDENCE) / 2.0
+        figures["anees"] = float(np.mean(nees))
+        figures["nees_bounds"] = [float(chi2.ppf(p, len(nees) * e.dof) / len(nees)) for p in (tail, 1.0 - tail)]
+        inside = e.nees_position[np.isfinite(e.nees_position)] <= chi2.ppf(CONFIDENCE, 2)
+        figures["coverage_95"] = float(np.mean(inside))
+    figures["invalid_covariances"] = int(np.sum(e.invalid))
+    figures["scored"] = int(np.sum(np.isfinite(e.position)))
+    return figures
+
+
+def relative_errors(poses: Array, reference: Array) -> tuple[Array, Array]:
+    """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
+
+    ``poses`` and ``reference`` (N, 3) at the same times, NaN in gaps of the reference. A piece begins at the first pose, or at
+    the end of the piece before, and ends at the first pose for which the path of the reference since then is 1 m or more; a gap
+    ends a piece unused. With Q and P the motion of reference and estimate over a piece, the error is the translation and rotation
+    of ``Q^-1 P``; it is not divided by the length. Without gaps this is evo's RPE with ``delta=1``, ``delta_unit=meters``,
+    ``all_pairs=False``, ``pairs_from_reference=True``.
+    """
+    pairs: list[tuple[int, int]] = []
+    for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0])):
+        steps = np.linalg.norm(np.diff(reference[start:stop, :2], axis=0), axis=1)
+        begin, path = start, 0.0
+        for i, step in enumerate(steps.tolist(), start=start + 1):
+            path += step
+            if path >= RPE_DISTANCE:
+                pairs.append((begin, i))
+                begin, path = i, 0.0
+    begins, ends = np.array(pairs, dtype=int).reshape(-1, 2).T
+    error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
+    return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+
+
+def _unbroken(valid: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """The half-open ranges of indices in which ``valid`` holds throughout."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _from(trajectory: Trajectory, t: float) -> Trajectory:
+    keep = trajectory.t >= t - 1e-9
+    covariances = None if trajectory.covariances is None else trajectory.covariances[keep]
+    return Trajectory(trajectory.t[keep], trajectory.poses[keep], covariances, trajectory.has_heading)
+
+
+def _positive_definite(covariances: Array) -> NDArray[np.bool_]:
+    finite: NDArray[np.bool_] = np.all(np.isfinite(covariances), axis=(1, 2))
+    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, np.eye(3)))[:, 0]
+    return np.asarray(finite & (smallest > 0.0))
+
+
+def _squared(difference: Array, covariances: Array) -> Array:
+    whitened = np.linalg.solve(covariances, difference[..., None])[..., 0]
+    return np.asarray(np.sum(difference * whitened, axis=1))
+
+
+def _spread(values: Array) -> dict[str, float | None]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return dict.fromkeys(("rmse", "median", "p95", "max"))
+    return {
+        "rmse": _rms(values),
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(np.max(values)),
+    }
+
+
+def _rms(values: Array) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
+    """NIS by sensor (total NIS over total degrees of freedom, ideally 1; share beyond the 95 % bound), and what was left out."""
+    figures: dict[str, Any] = {}
+    for sensor, rows in sorted(diagnostics.nis.items()):
+        if rows:
+            _, nis, dof = np.array(rows, dtype=float).T
+            figures[f"nis.{sensor}.mean_per_dof"] = float(nis.sum() / dof.sum())
+            figures[f"nis.{sensor}.beyond_95"] = float(np.mean(nis > chi2.ppf(CONFIDENCE, dof)))
+        figures[f"nis.{sensor}.count"] = len(rows)
+    for kind in ("ignored", "rejected", "late"):
+        counts: dict[str, int] = getattr(diagnostics, kind)
+        figures[f"{kind}.total"] = sum(counts.values())
+        figures |= {f"{kind}.{reason}": count for reason, count in sorted(counts.items())}
+    figures["events"] = len(diagnostics.events)
+    return figures
+
+
+def _timing(timings: Timings) -> dict[str, Any]:
+    ms = timings.update_ms
+    return {
+        "timing.updates": len(ms),
+        "timing.update_ms_median": float(np.median(ms)) if len(ms) else None,
+        "timing.update_ms_p99": float(np.percentile(ms, 99)) if len(ms) else None,
+        "timing.update_ms_max": float(np.max(ms)) if len(ms) else None,
+        "timing.causal_seconds": timings.causal_seconds,
+        "timing.real_time_factor": timings.real_time_factor,
+        "timing.final_seconds": timings.final_seconds,
+        "timing.peak_memory_mb": timings.peak_memory_mb,
+    }

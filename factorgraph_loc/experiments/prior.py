@@ -1,0 +1,75 @@
+"""Where a run starts: what the user says, what the log says, or where the reference is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.log import Log
+
+POSITION_SIGMA = 0.05  # m
+HEADING_SIGMA = 0.05  # rad
+VAGUE_HEADING_SIGMA = 0.1  # rad, where the reference's heading is no measurement
+
+EXPECTED = "reference, log, unknown or X,Y,HEADING"
+
+
+def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
+    """The Gaussian that a run starts from, and the name of its source.
+
+    ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.05 m and 0.05 rad), ``log`` (the start
+    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``unknown``, or None: the
+    log's start, else the reference, else unknown. An unknown start is returned as None.
+
+    Raises InputError if the log lacks what is asked for, or ``prior`` is none of these.
+    """
+    if prior is None:
+        prior = "log" if log.start is not None else "reference" if log.reference is not None else "unknown"
+    if prior == "unknown":
+        return None, prior
+    if prior == "log":
+        if log.start is None:
+            raise InputError(f"{log.name}: states no start, expected a prior {EXPECTED}")
+        return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
+    if prior == "reference":
+        return _from_reference(log), prior
+    pose = np.array(_parse(prior))
+    return PosePrior(first_odometry(log), pose, _covariance(HEADING_SIGMA)), prior
+
+
+def first_odometry(log: Log) -> float:
+    """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
+    stream = log.streams.get("odometry")
+    if stream is None or len(stream.t) == 0:
+        return log.span()[0]
+    return float(stream.t.min()) + log.rig.time_offset("odometry")
+
+
+def _from_reference(log: Log) -> PosePrior:
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference to start from, expected a prior {EXPECTED}")
+    start = first_odometry(log)
+    after = int(np.searchsorted(log.reference.t, start))
+    if after == len(log.reference):
+        raise InputError(
+            f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
+        )
+    sigma = HEADING_SIGMA if log.reference.has_heading else VAGUE_HEADING_SIGMA
+    return PosePrior(float(log.reference.t[after]), np.array(log.reference.poses[after]), _covariance(sigma))
+
+
+def _covariance(heading_sigma: float) -> np.typing.NDArray[np.float64]:
+    return np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, heading_sigma)))
+
+
+def _parse(prior: str) -> tuple[float, float, float]:
+    try:
+        x, y, heading = (float(part) for part in prior.split(","))
+    except ValueError:
+        raise InputError(f"prior is {prior!r}, expected {EXPECTED}") from None
+    if not all(map(math.isfinite, (x, y, heading))) or abs(heading) > 2.0 * math.pi:
+        raise InputError(f"prior is {prior!r}, expected finite metres and a heading in radians")
+    return x, y, heading

@@ -1,0 +1,245 @@
+"""One log run by one estimator: feed the measurements in the order of arrival, keep what it says, and time it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import platform
+import resource
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc import __version__
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior
+from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
+from factorgraph_loc.files import nearest
+from factorgraph_loc.log import Log
+from factorgraph_loc.measurements import IncrementOdometry, Measurement, Tick, VelocityOdometry, YawRate
+from factors.se2 import Array
+
+TICK_RATE = 10  # Hz, the grid on which trajectories are written and scored
+_ODOMETRY = (VelocityOdometry, IncrementOdometry, YawRate)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What is run on a log.
+
+    ``estimator``: its name in the registry; ``settings``: overrides of its settings. ``sensors``: names of the streams that it
+    may use, None for those of the rig. ``prior``: see :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
+    ``seed``: of the estimator's random generator.
+    """
+
+    estimator: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    sensors: tuple[str, ...] | None = None
+    prior: str | None = None
+    seed: int = 0
+
+
+def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = None) -> RunResult:
+    """Run an estimator on a log.
+
+    The grid of ticks has 10 Hz and starts at the prior's time. A tick comes after all measurements that arrived up to its time;
+    the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
+    its velocity holds on; other measurements older than the prior are counted as ignored. ``progress`` is given the share done.
+
+    Raises InputError if the configuration does not fit the log, FglocError if the estimator gives a pose that is not finite.
+    Whatever the estimator itself raises is passed on.
+    """
+    sensors = _sensors(log, config.sensors)
+    settings = registry.settings_of(config.estimator, config.settings)
+    prior, prior_source = resolve_prior(log, config.prior)
+    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
+    estimator = registry.create(config.estimator, setup, settings)
+    if prior is None and not getattr(estimator, "supports_unknown_start", False):
+        raise InputError(
+            f"{config.estimator} cannot start from an unknown pose on {log.name}, expected a prior {EXPECTED}"
+        )
+
+    loop = _Loop(estimator, log, sensors, prior, progress or (lambda _: None))
+    loop.run()
+    started = perf_counter()
+    final = estimator.trajectory()
+    final_seconds = perf_counter() - started
+    if not np.all(np.isfinite(final.poses)):
+        raise FglocError(f"{config.estimator} on {log.name}: the final trajectory holds poses that are not finite")
+
+    versions = _versions()
+    effective = {
+        "log": log.name,
+        "estimator": config.estimator,
+        "settings": settings.model_dump(mode="json", exclude_none=True),
+        "sensors": list(sensors),
+        "prior": prior_source,
+        "seed": config.seed,
+        "rig": log.rig.model_dump(mode="json", exclude_none=True),
+        "versions": versions,
+    }
+    return RunResult(
+        log=log.name,
+        config=effective,
+        t=np.array([e.t for e in loop.estimates]),
+        poses=np.array([e.pose for e in loop.estimates]).reshape(-1, 3),
+        covariances=np.array([e.covariance for e in loop.estimates]).reshape(-1, 3, 3),
+        status=tuple(e.status for e in loop.estimates),
+        final=final,
+        diagnostics=estimator.diagnostics,
+        learnt=estimator.learnt(),
+        timings=loop.timings(final_seconds),
+        versions=versions,
+        warnings=(*log.warnings, *_doubts(log, sensors)),
+    )
+
+
+class _Loop:
+    """The causal part of a run."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        log: Log,
+        sensors: tuple[str, ...],
+        prior: PosePrior | None,
+        progress: Callable[[float], None],
+    ) -> None:
+        self._estimator = estimator
+        self._log = log
+        self._sensors = sensors
+        self._prior = prior
+        self._progress = progress
+        first, last = _span(log, sensors)
+        self._start = first if prior is None else prior.t
+        if self._start > last:
+            raise InputError(
+                f"{log.name}: the prior's time {self._start:.3f} s lies after the last measurement at {last:.3f} s"
+            )
+        self._span = last - self._start
+        self._ticks = self._start + np.arange(math.floor(self._span * TICK_RATE + 1e-6) + 1) / TICK_RATE
+        self._update_t: list[float] = []
+        self._update_s: list[float] = []
+        self._seconds = 0.0
+        self.estimates: list[PoseEstimate] = []
+
+    def run(self) -> None:
+        """Feed everything, ticks included."""
+        started = perf_counter()
+        initialized = self._prior is None
+        fired = 0
+        reported = 0.0
+        for (t, is_odometry), group in groupby(self._measurements(), lambda m: (m.t, isinstance(m, _ODOMETRY))):
+            if not initialized and t > self._start:
+                self._initialize()
+                initialized = True
+            while initialized and fired < len(self._ticks) and self._ticks[fired] < t:
+                self._tick(float(self._ticks[fired]))
+                fired += 1
+                if fired >= reported * len(self._ticks):
+                    self._progress(fired / len(self._ticks))
+                    reported = fired / len(self._ticks) + 0.01
+            if is_odometry:
+                for m in group:
+                    self._estimator.process(m)
+            elif t < self._start:
+                self._estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
+            else:
+                if not initialized:
+                    self._initialize()
+                    initialized = True
+                self._update(t, group)
+        if not initialized:
+            self._initialize()
+        for tick in self._ticks[fired:]:
+            self._tick(float(tick))
+        self._seconds = perf_counter() - started
+        self._progress(1.0)
+
+    def timings(self, final_seconds: float) -> Timings:
+        """The times of the loop, with that of the final trajectory."""
+        return Timings(
+            update_t=np.array(self._update_t),
+            update_ms=np.array(self._update_s) * 1e3,
+            causal_seconds=self._seconds,
+            real_time_factor=self._span / self._seconds,
+            final_seconds=final_seconds,
+            peak_memory_mb=_peak_memory_mb(),
+        )
+
+    def _measurements(self) -> Iterator[Measurement]:
+        return self._log.measurements(self._sensors)
+
+    def _initialize(self) -> None:
+        assert self._prior is not None
+        self._estimator.initialize(self._prior)
+
+    def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
+        started = perf_counter()
+        for m in measurements:
+            self._estimator.process(m)
+        self._estimator.estimate()
+        self._update_s.append(perf_counter() - started)
+        self._update_t.append(t)
+
+    def _tick(self, t: float) -> None:
+        self._estimator.process(Tick(t))
+        e = self._estimator.estimate()
+        if e.status != "unlocalized" and not np.all(np.isfinite(e.pose)):
+            name = type(self._estimator).__name__
+            raise FglocError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")
+        # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
+        self.estimates.append(
+            PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status)
+        )
+
+
+def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
+    stamps: list[Array] = [log.streams[s].t + log.rig.time_offset(s) for s in sensors if len(log.streams[s].t)]
+    if not stamps:
+        raise InputError(f"{log.name}: has no measurements of {', '.join(sensors)}")
+    return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+
+
+def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The streams to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
+    if asked is not None:
+        for sensor in asked:
+            if sensor not in log.streams:
+                raise InputError(f"{log.name}: has no sensor {sensor!r}{nearest(sensor, list(log.streams))}")
+    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in log.streams)
+    if not sensors:
+        raise InputError(
+            f"{log.name}: has none of the rig's sensors {', '.join(log.rig.sensors)}{nearest('', list(log.streams))}"
+        )
+    return sensors
+
+
+def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
+    missing = [s for s in log.rig.sensors if s not in log.streams]
+    doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in missing]
+    if "odometry" not in sensors:
+        doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
+    return tuple(doubts)
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "factorgraph-loc": __version__,
+        "gtsam": importlib.metadata.version("gtsam"),
+        "numpy": importlib.metadata.version("numpy"),
+        "python": platform.python_version(),
+    }
+
+
+def _peak_memory_mb() -> float:
+    # Linux reports kibibytes, macOS bytes
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
