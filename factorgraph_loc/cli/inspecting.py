@@ -104,10 +104,11 @@ def _print(log: Log, found: Inspection) -> None:
         about["reference"] = "positions only, headings are not scored"
     show.fields(about | dict(log.metadata))
     typer.echo()
-    streams = found.streams | ({"reference": found.reference} if found.reference is not None else {})
-    show.table(
-        ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps"), [_row(*item) for item in streams.items()]
-    )
+    streams = dict(found.streams)
+    if found.reference is not None:
+        streams["reference"] = found.reference
+    header = ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps")
+    show.table(header, [_row(name, stream) for name, stream in streams.items()])
     typer.echo()
     if not found.problems:
         typer.echo("nothing looks wrong")
