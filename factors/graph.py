@@ -72,9 +72,9 @@ def custom_factor(
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.JacobianFactor:
     """``factor`` linearised at ``values``."""
     residual, blocks = factor.linearize(values)
-    pairs: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
-    linear: gtsam.JacobianFactor = gtsam.JacobianFactor(*pairs, -residual, gtsam.noiseModel.Unit.Create(len(residual)))
-    return linear
+    arguments: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
+    arguments += [-residual, gtsam.noiseModel.Unit.Create(len(residual))]
+    return gtsam.JacobianFactor(*arguments)
 
 
 class PriorFactor:

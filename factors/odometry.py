@@ -296,14 +296,13 @@ PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias")
 def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]:
     """The increment under changed parameters, and its Jacobian.
 
-    ``parameters`` (3,): relative change of the distance scale, relative change of the rotation scale, additional
-    heading-rate bias [rad/s]. Returns ``delta`` (3,) and the Jacobian (3, 3) of its body-frame perturbation with respect to the
+    ``parameters`` (..., 3): relative change of the distance scale, relative change of the rotation scale, additional
+    heading-rate bias [rad/s]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 3) of its body-frame perturbation by the
     parameters. The increment is taken as one arc, exact at constant curvature.
     """
-    twist = se2.log(increment.delta)
-    changed = twist * np.array((1.0 + parameters[0], 1.0 + parameters[0], 1.0 + parameters[1]))
-    changed[2] -= parameters[2] * increment.duration
-    by_parameter = np.array([[twist[0], 0.0, 0.0], [twist[1], 0.0, 0.0], [0.0, twist[2], -increment.duration]])
+    x, y, phi = se2.log(increment.delta).tolist()
+    by_parameter = np.array([[x, 0.0, 0.0], [y, 0.0, 0.0], [0.0, phi, -increment.duration]])
+    changed = np.array((x, y, phi)) + np.asarray(parameters) @ by_parameter.T
     return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
 
 

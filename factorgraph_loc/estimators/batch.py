@@ -1,7 +1,7 @@
 """The offline optimum: the whole log in one robust least-squares problem, solved when all is known.
 
-While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates are never
-``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins wide and narrows to its
+While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
+are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins wide and narrows to its
 own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Cauchy loss).
 """
 
@@ -24,6 +24,9 @@ from factors.bearing_range import BearingRangeFactor
 from factors.se2 import Array
 
 
+ITERATIONS_PER_WIDTH = 5
+
+
 class BatchSettings(GraphSettings):
     """``widest_loss``: how many times wider than its own scale the robust loss begins; 1 for a plain robust start."""
 
@@ -44,22 +47,22 @@ class Batch(GraphEstimator):
 
     def trajectory(self) -> Trajectory:
         """The optimum over the whole log."""
-        poses, parameters = np.array(self._guesses), np.zeros(len(self._estimated.indices))
+        problem = self._problem()
+        start = np.array(self._guesses), np.zeros(len(self._estimated.indices))
+        best = problem.solve(*start)
         width = self._widest
-        while width > 1.0:
-            wide = self._problem(width).solve(poses, parameters)
-            poses, parameters = wide.poses, wide.parameters
-            width = max(1.0, width / 2.0)
-        problem = self._problem(1.0)
-        best = problem.solve(poses, parameters)
-        if self._widest > 1.0:  # the graduated way may end in a worse optimum than the direct one
-            direct = problem.solve(np.array(self._guesses), np.zeros(len(parameters)))
-            best = min(best, direct, key=lambda s: s.cost)
+        if width > 1.0:
+            poses, parameters = start
+            while width > 1.0:
+                wide = self._problem(width).solve(poses, parameters, ITERATIONS_PER_WIDTH)
+                poses, parameters, width = wide.poses, wide.parameters, width / 2.0
+            # either way may end in the worse optimum
+            best = min(best, problem.solve(poses, parameters), key=lambda s: s.cost)
         self._parameters = best.parameters
         covariances, self._parameter_covariance = problem.covariances(best.poses, best.parameters)
         return self._between(best.poses, covariances)
 
-    def _begin(self, first: Keyframe) -> None:
+    def _begin(self, first: Keyframe) -> None:  # noqa: ARG002
         self._guesses.append(self._pose)
 
     def _extend(self, keyframe: Keyframe, guess: Array) -> None:

@@ -20,9 +20,10 @@ from factors.se2 import Array
 PARAMETERS_KEY = gtsam.symbol("c", 0)
 
 MAX_ITERATIONS = 100
-CONVERGED_STEP = 1e-5  # m, rad
+CONVERGED_GAIN = 1e-6  # of the cost
 INITIAL_DAMPING = 1e-4
 MAX_DAMPING = 1e8
+UNIT3 = gtsam.noiseModel.Unit.Create(3)
 
 
 def pose_key(index: int) -> int:
@@ -63,14 +64,16 @@ class Problem:
         self._parameter_sigmas = parameter_sigmas
         self._first_binary, self._after_binary = 1, 1 + len(odometry)
 
-    def solve(self, poses: Array, parameters: Array) -> Solution:
-        """The optimum found from a guess."""
+    def solve(self, poses: Array, parameters: Array, max_iterations: int = MAX_ITERATIONS) -> Solution:
+        """The optimum found from a guess, or where ``max_iterations`` lead."""
         damping, cost = INITIAL_DAMPING, self.cost(poses, parameters)
         iteration = 0
-        while iteration < MAX_ITERATIONS and damping < MAX_DAMPING:
+        while iteration < max_iterations and damping < MAX_DAMPING:
             iteration += 1
             graph = self.linearize(poses, parameters)
-            step = self._damped(graph, damping).optimize()
+            for i in range(self._count):
+                graph.add(gtsam.JacobianFactor(pose_key(i), np.sqrt(damping) * np.eye(3), np.zeros(3), UNIT3))
+            step = graph.optimize()
             d_poses = np.array([step.at(pose_key(i)) for i in range(self._count)])
             d_parameters = step.at(PARAMETERS_KEY) if self._has_parameters else np.zeros(0)
             new_poses, new_parameters = se2.compose(poses, se2.exp(d_poses)), parameters + d_parameters
@@ -78,8 +81,9 @@ class Problem:
             if new_cost > cost:
                 damping *= 10.0
                 continue
+            gained = cost - new_cost
             poses, parameters, cost, damping = new_poses, new_parameters, new_cost, damping / 10.0
-            if np.abs(d_poses).max() < CONVERGED_STEP:
+            if gained < CONVERGED_GAIN * cost:
                 break
         return Solution(poses, parameters, cost, iteration)
 
@@ -122,12 +126,3 @@ class Problem:
     def _values(self, factor: int, where: tuple[int, ...], poses: Array, parameters: Array) -> list[Array]:
         values = [poses[index] for index in where]
         return [*values, parameters] if self._takes_parameters(factor) else values
-
-    def _damped(self, graph: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
-        damped = gtsam.GaussianFactorGraph(graph)
-        for i in range(self._count):
-            damped.add(gtsam.JacobianFactor(pose_key(i), np.sqrt(damping) * np.eye(3), np.zeros(3), UNIT3))
-        return damped
-
-
-UNIT3 = gtsam.noiseModel.Unit.Create(3)

@@ -34,8 +34,8 @@ class SmootherSettings(GraphSettings):
     checked. ``smooth`` off: the final trajectory repeats the causal one."""
 
     lag: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
-    relinearize_threshold: Annotated[float, Field(gt=0.0, le=1.0)] = 0.02
-    relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 1
+    relinearize_threshold: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
+    relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
     factorization: Literal["QR", "CHOLESKY"] = "QR"
     smooth: bool = True
 
