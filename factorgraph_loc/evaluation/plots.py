@@ -1,0 +1,237 @@
+"""Plots of one log run by several estimators, as PNG files 1600 px wide.
+
+Colours: Okabe and Ito, "Color Universal Design", 2008, which colour-blind readers can tell apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from factorgraph_loc.evaluation.metrics import MAX_REFERENCE_GAP, Errors, errors
+from factorgraph_loc.files import replacing
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
+_WIDTH, _DPI = 16.0, 100
+
+
+@dataclass(frozen=True)
+class Track:
+    """What is plotted of one run: ``causal`` (None if it never was localized), ``final``, and ``update_ms`` (M,) of each update."""
+
+    causal: Trajectory | None
+    final: Trajectory
+    update_ms: Array
+
+    def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
+        return ("causal", self.causal), ("final", self.final)
+
+
+def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
+    """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
+
+    ``NAME-trajectories.png``, ``NAME-update-time.png``; with a reference also ``NAME-error-distribution.png`` and
+    ``NAME-errors-ESTIMATOR.png`` for each estimator.
+    """
+    figures = {"trajectories": trajectories(log, tracks), "update-time": update_times(log, tracks)}
+    if log.reference is not None:
+        figures["error-distribution"] = error_distribution(log, log.reference, tracks)
+        for estimator, track in tracks.items():
+            figures[f"errors-{estimator}"] = error_bands(log, log.reference, estimator, track)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for what, figure in figures.items():
+        path = folder / f"{name}-{what}.png"
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=_DPI)
+        paths.append(path)
+    return paths
+
+
+def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
+    """Causal and final trajectories over landmarks and reference; the view is that of the map and the reference."""
+    figure, axes = _figure(1, 2, 8.5, f"{log.name}: trajectories")
+    landmarks = log.world.positions()
+    for i, axis in enumerate(axes[0]):
+        if log.reference is not None:
+            line = _with_gaps(log.reference.t, log.reference.poses)
+            axis.plot(line[:, 0], line[:, 1], color="0.75", linewidth=4.0, label="reference", zorder=1)
+        if len(landmarks):
+            axis.plot(*landmarks.T, "k^", markersize=7, markerfacecolor="none", label="landmarks", zorder=4)
+        for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+            kind, trajectory = track.kinds()[i]
+            if trajectory is not None:
+                axis.plot(*trajectory.poses[:, :2].T, label=estimator, linewidth=1.2, zorder=3, **style)
+                axis.plot(*trajectory.poses[0, :2], "o", color=style["color"], markersize=5, zorder=4)
+            axis.set_title(f"{kind} (dot: start)")
+        axis.set_aspect("equal", adjustable="box")
+        axis.set_xlabel("x [m]")
+        axis.set_ylabel("y [m]")
+        _show(axis, landmarks, log.reference)
+    _legend(figure, axes[0])
+    return figure
+
+
+def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
+    """Signed errors in x, y and heading over time, causal and final, with bands of two stated standard deviations."""
+    rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
+    figure, axes = _figure(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
+    found = [None if trajectory is None else errors(trajectory, reference) for _, trajectory in track.kinds()]
+    for column, (kind, trajectory) in enumerate(track.kinds()):
+        axes[0, column].set_title(kind)
+        axes[-1, column].set_xlabel("time [s]")
+        e = found[column]
+        if trajectory is None or e is None:
+            for axis in axes[:, column]:
+                axis.text(0.5, 0.5, "no causal estimate", ha="center", transform=axis.transAxes, color="0.4")
+            continue
+        for row in range(len(rows)):
+            _band(axes[row, column], trajectory, e, row)
+    for row, (what, unit) in enumerate(rows):
+        limit = max(
+            (_extent(e, t, row) for e, (_, t) in zip(found, track.kinds(), strict=True) if e and t), default=1.0
+        )
+        for axis in axes[row]:
+            axis.set_ylim(-limit, limit)
+            axis.set_ylabel(f"error in {what} [{unit}]")
+    _legend(figure, axes[0])
+    return figure
+
+
+def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Track]) -> Figure:
+    """Cumulative distribution of position and heading errors, causal and final, on a logarithmic axis."""
+    rows = (("position", "m"), ("heading", "rad"))[: 2 if reference.has_heading else 1]
+    figure, axes = _figure(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
+    for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+        for column, (kind, trajectory) in enumerate(track.kinds()):
+            axes[0, column].set_title(kind)
+            if trajectory is None:
+                continue
+            e = errors(trajectory, reference)
+            for row, (what, _) in enumerate(rows):
+                _distribution(axes[row, column], getattr(e, what), label=estimator, **style)
+    for row, (what, unit) in enumerate(rows):
+        for axis in axes[row]:
+            axis.set_xlabel(f"{what} error [{unit}]")
+            axis.set_ylabel("share of times below")
+        _same_range(axes[row])
+    _legend(figure, axes[0])
+    return figure
+
+
+def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
+    """Cumulative distribution of the time per update on a logarithmic axis."""
+    figure, axes = _figure(1, 1, 6.0, f"{log.name}: time per update")
+    axis = axes[0, 0]
+    for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+        if track.causal is None:  # nothing is estimated while the log runs: its updates only collect
+            axis.plot([], [], label=f"{estimator} (offline)", **style)
+        else:
+            _distribution(axis, track.update_ms, label=estimator, **style)
+    axis.set_xlabel("time per update [ms]")
+    axis.set_ylabel("share of updates below")
+    _legend(figure, axes[0])
+    return figure
+
+
+def _figure(rows: int, columns: int, height: float, title: str) -> tuple[Figure, Any]:
+    # Figure without pyplot: no global state, no display, and matplotlib is loaded only where something is plotted
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=16)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.grid(color="0.9")
+        axis.set_axisbelow(True)
+        axis.tick_params(labelsize=12)
+        axis.xaxis.label.set_size(13)
+        axis.yaxis.label.set_size(13)
+        axis.title.set_size(14)
+    return figure, axes
+
+
+def _styles() -> Iterator[dict[str, Any]]:
+    i = 0
+    while True:
+        yield {"color": COLOURS[i % len(COLOURS)], "linestyle": _STYLES[i % len(_STYLES)]}
+        i += 1
+
+
+def _legend(figure: Figure, axes: Any) -> None:
+    """One legend below the axes, of all that is drawn in any of them."""
+    entries: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if entries:
+        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), fontsize=13)
+
+
+def _with_gaps(t: Array, poses: Array) -> Array:
+    """Poses with a row of NaN in each gap of the reference, so that no line is drawn across it."""
+    gaps = np.flatnonzero(np.diff(t) > MAX_REFERENCE_GAP + 1e-9) + 1
+    return np.insert(poses, gaps, np.nan, axis=0)
+
+
+def _show(axis: Axes, landmarks: Array, reference: Trajectory | None) -> None:
+    """Limit the view to map and reference: dead reckoning may run far away."""
+    if reference is None or not len(reference):
+        return
+    points = np.concatenate((landmarks, reference.poses[:, :2]))
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.08 * max(*(high - low), 1.0)
+    axis.set_xlim(low[0] - margin, high[0] + margin)
+    axis.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
+    t, error = trajectory.t, e.difference[:, row]
+    axis.axhline(0.0, color="0.5", linewidth=0.8)
+    if trajectory.covariances is not None:
+        sigma = np.sqrt(trajectory.covariances[:, row, row])
+        axis.fill_between(t, -2.0 * sigma, 2.0 * sigma, color=COLOURS[5], alpha=0.45, linewidth=0.0, label="2 sigma")
+    axis.plot(t, error, color=COLOURS[0], linewidth=1.0, label="error (gaps: no reference)")
+    axis.set_xlim(t[0], max(t[-1], t[0] + 1e-3))
+
+
+def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
+    """Half the height of a panel: all but the most extreme half percent of errors and bands is in view."""
+    values = np.abs(e.difference[:, row])
+    if trajectory.covariances is not None:
+        values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))
+    values = values[np.isfinite(values)]
+    return 1.15 * float(np.percentile(values, 99.5)) + 1e-6 if len(values) else 1.0
+
+
+def _distribution(axis: Axes, values: Array, **style: Any) -> None:
+    values = np.sort(values[np.isfinite(values)])
+    axis.set_xscale("log")
+    axis.set_ylim(0.0, 1.0)
+    if len(values):
+        # an error of exactly 0 has no place on a logarithmic axis
+        axis.plot(np.maximum(values, 1e-6), np.arange(1, len(values) + 1) / len(values), linewidth=2.0, **style)
+
+
+def _same_range(axes: Any) -> None:
+    """The same x axis for causal and final, from the smallest hundredth on: how small the smallest are says nothing."""
+    drawn = [line.get_xdata() for axis in axes for line in axis.lines]
+    if drawn:
+        low = min(float(np.percentile(x, 1.0)) for x in drawn)
+        high = max(float(np.max(x)) for x in drawn)
+        for axis in axes:
+            axis.set_xlim(low, max(high * 1.1, low * 1.1))

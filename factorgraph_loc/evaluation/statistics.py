@@ -1,0 +1,105 @@
+"""Pooled figures, and differences between estimators with intervals.
+
+Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap that draws logs and, within each, seeds
+(Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from factors.se2 import Array
+
+COMPARED = tuple(f"{kind}.{what}_rmse" for kind in ("causal", "final") for what in ("position", "heading"))
+ENOUGH_LOGS = 6  # with fewer, a bootstrap over logs says nothing
+DRAWS = 4000
+CONFIDENCE = 0.95
+_SEED = 0  # of the bootstrap: the same results give the same intervals
+
+# the columns of a difference; with their types, because there may be none
+DIFFERENCES: dict[str, type] = {
+    **dict.fromkeys(("metric", "a", "b", "log"), str),
+    **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
+    **dict.fromkeys(("pairs", "left_out"), int),
+}
+
+Row = Mapping[str, Any]
+
+
+def pooled_rms(values: Sequence[float]) -> float:
+    """Root of the mean of the squares: RMSEs of several logs or seeds, each counted once whatever its length."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: below 0, ``a`` is the better.
+
+    ``rows`` are runs with log, estimator, seed and scores; an estimator that ran with one seed is paired with each seed of the
+    other. For each log: RMSE pooled over the pairs. With 6 logs or more also ``log`` = "(all)": RMSE pooled over logs and seeds,
+    with ``low`` and ``high`` of the 95 % interval. ``pairs``: how many (log, seed) are compared; ``left_out``: how many are not,
+    because a run failed or has no such score. Without any pair the values are None.
+    """
+    logs = list(dict.fromkeys(row["log"] for row in rows))
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    found: list[dict[str, Any]] = []
+    for metric in COMPARED:
+        for a, b in combinations(names, 2):
+            pairs = {log: _pairs(rows, log, a, b, metric) for log in logs}
+            head = {"metric": metric, "a": a, "b": b}
+            for log, (scores, missing) in pairs.items():
+                counts = {"pairs": len(scores), "left_out": missing}
+                found.append(head | {"log": log} | _difference(scores[None]) | counts)
+            used = [scores for scores, _ in pairs.values() if len(scores)]
+            if len(used) >= ENOUGH_LOGS:
+                low, high = _interval(used)
+                per_log = np.sqrt([np.mean(np.square(scores), axis=0) for scores in used])
+                counts = {"pairs": sum(map(len, used)), "left_out": sum(missing for _, missing in pairs.values())}
+                total = _difference(per_log[:, None]) | {"low": low, "high": high}
+                found.append(head | {"log": "(all)"} | total | counts)
+    return found
+
+
+def _pairs(rows: Sequence[Row], log: str, a: str, b: str, metric: str) -> tuple[Array, int]:
+    """Scores (K, 2) of ``a`` and ``b`` by common seed, and how many pairs are missing."""
+    by_seed = [
+        {r["seed"]: r.get(metric) for r in rows if r["log"] == log and r["estimator"] == name} for name in (a, b)
+    ]
+    seeds = sorted(set().union(*by_seed))
+    both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
+    if any(
+        len(s) == 1 for s in by_seed
+    ):  # paired with each seed of the other; its own seed is one of these only by chance
+        longer = max(by_seed, key=len)
+        both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
+    complete = [pair for pair in both if None not in pair]
+    return np.array(complete, dtype=float).reshape(-1, 2), len(both) - len(complete)
+
+
+def _difference(scores: Array) -> dict[str, Any]:
+    """``scores`` (L, K, 2) of L logs and K seeds."""
+    if not scores.size:
+        return dict.fromkeys(("value_a", "value_b", "difference", "low", "high"))
+    a, b = np.sqrt(np.mean(np.square(scores), axis=(0, 1))).tolist()
+    return {"value_a": a, "value_b": b, "difference": a - b, "low": None, "high": None}
+
+
+def _interval(clusters: Sequence[Array]) -> tuple[float, float]:
+    """95 % interval of the pooled difference; ``clusters``: for each log, paired scores (K, 2)."""
+    rng = np.random.default_rng(_SEED)
+    sizes = np.array([len(c) for c in clusters])
+    squares = np.zeros((len(clusters), sizes.max(), 2))
+    for i, cluster in enumerate(clusters):
+        squares[i, : len(cluster)] = np.square(cluster)
+    logs = rng.integers(len(clusters), size=(DRAWS, len(clusters)))
+    size = sizes[logs][..., None]
+    seeds = (rng.random((*logs.shape, sizes.max())) * size).astype(int)
+    drawn = np.arange(sizes.max()) < size  # a log with fewer seeds draws fewer
+    means = np.sum(squares[logs[..., None], seeds] * drawn[..., None], axis=2) / size
+    pooled = np.sqrt(np.mean(means, axis=1))
+    tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
+    low, high = np.percentile(pooled[:, 0] - pooled[:, 1], (tail, 100.0 - tail))
+    return float(low), float(high)

@@ -1,0 +1,108 @@
+"""The table of a comparison: a line for each log and estimator, then each estimator over all logs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from factorgraph_loc.evaluation.statistics import pooled_rms
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+# column: figure of the scores, digits, whether RMSEs are pooled (else the mean is taken)
+COLUMNS = {
+    "causal pos [m]": ("causal.position_rmse", 3, True),
+    "causal head [rad]": ("causal.heading_rmse", 4, True),
+    "causal ANEES": ("causal.anees", 2, False),
+    "final pos [m]": ("final.position_rmse", 3, True),
+    "final head [rad]": ("final.heading_rmse", 4, True),
+    "final ANEES": ("final.anees", 2, False),
+    "update [ms]": ("timing.update_ms_median", 2, False),
+    "x real time": ("timing.real_time_factor", 0, False),
+}
+ALL = "(all logs)"
+
+Row = Mapping[str, Any]
+
+
+def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Header and lines of the table, from the rows of a comparison.
+
+    RMSEs are pooled over seeds (root of the mean square), the rest is averaged; with several seeds the standard deviation over them
+    follows after ±. The last lines pool each estimator over the logs, each log counted once; ``runs`` says how many of
+    the runs went well, and a pooled line with fewer than all says nothing about the others.
+    """
+    logs = list(dict.fromkeys(row["log"] for row in rows))
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    lines = []
+    for log in logs:
+        for name in names:
+            runs = [r for r in rows if r["log"] == log and r["estimator"] == name]
+            if runs:
+                cells = [_cell([_figure(r, key) for r in runs], digits, rms) for key, digits, rms in COLUMNS.values()]
+                lines.append([log, name, *cells, _went_well(runs)])
+    if len(logs) > 1:
+        for name in names:
+            runs = [r for r in rows if r["estimator"] == name]
+            by_log = [[r for r in runs if r["log"] == log] for log in logs]
+            cells = [_pooled(key, digits, rms, by_log) for key, digits, rms in COLUMNS.values()]
+            lines.append([ALL, name, *cells, _went_well(runs)])
+    return ["log", "estimator", *COLUMNS, "runs"], lines
+
+
+def comparison_table(rows: Sequence[Row]) -> Table:
+    """The same as a table for the terminal."""
+    from rich import box  # noqa: PLC0415 - only a terminal needs it
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    header, lines = comparison_cells(rows)
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold")
+    for i, name in enumerate(header):
+        table.add_column(Text(name), justify="left" if i < 2 else "right", no_wrap=i < 2)
+    for line, after in zip(lines, [*lines[1:], None], strict=True):
+        table.add_row(*line, end_section=after is None or after[0] != line[0])
+    return table
+
+
+def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table that also reads well as plain text."""
+    texts = [list(header), *map(list, lines)]
+    widths = [max(len(text[i]) for text in texts) for i in range(len(header))]
+    padded = [
+        [cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(text, widths, strict=True))]
+        for text in texts
+    ]
+    rule = ["-" * w if i < 2 else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (padded[0], rule, *padded[1:]))
+
+
+def _figure(row: Row, key: str) -> float | None:
+    # an estimator that waits for the end of the log (never localized before) only collects: its update times mean nothing
+    offline = row.get("time_to_localized") is None
+    return None if offline and key.startswith("timing.") else row.get(key)
+
+
+def _cell(values: Sequence[float | None], digits: int, rms: bool) -> str:
+    known = [v for v in values if v is not None]
+    if not known:
+        return "-"
+    text = f"{_average(known, rms):.{digits}f}"
+    return text if len(known) == 1 else f"{text} ±{np.std(known, ddof=1):.{digits}f}"
+
+
+def _pooled(key: str, digits: int, rms: bool, by_log: Sequence[Sequence[Row]]) -> str:
+    known = [[v for v in (_figure(r, key) for r in runs) if v is not None] for runs in by_log]
+    averages = [_average(values, rms) for values in known if values]
+    return f"{_average(averages, rms):.{digits}f}" if averages else "-"
+
+
+def _average(values: Sequence[float], rms: bool) -> float:
+    return pooled_rms(values) if rms else float(np.mean(values))
+
+
+def _went_well(runs: Sequence[Row]) -> str:
+    return f"{sum(r['status'] == 'ok' for r in runs)}/{len(runs)}"

@@ -1,0 +1,181 @@
+"""Several estimators on several logs: every pair in a process of its own, one table, the differences, and plots."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.evaluation.plots import Track, plot_log
+from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
+from factorgraph_loc.evaluation.tables import comparison_cells, markdown
+from factorgraph_loc.experiments.output import FILES, remove_run, write_run
+from factorgraph_loc.experiments.processes import run_each
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.files import replacing, write_text
+from factorgraph_loc.log import Log
+
+_ERROR = "error.txt"
+_TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came out. ``rows``: one a run, all with the same keys: log, estimator, seed, status (ok, failed), reason, and the scalar
+    scores (None in a failed run). ``failures``: one line a failed run."""
+
+    rows: list[dict[str, Any]]
+    failures: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Job:
+    log: Log
+    config: RunConfig
+    folder: Path
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    scores: dict[str, Any]
+    track: Track
+
+
+def compare(
+    logs: Sequence[Log],
+    configs: Sequence[RunConfig],
+    out: Path,
+    *,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Run every configuration on every log, in ``jobs`` parallel processes (None: one per core).
+
+    An estimator that uses no randomness runs with the first of its seeds only. A run that fails, or whose process dies, becomes a
+    row with its reason; the others go on. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows),
+    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``plots/*.png`` and
+    ``runs/LOG/ESTIMATOR/seedK/`` with the files of each run, or ``error.txt`` with the traceback.
+    ``progress`` is given the number of runs done and of all.
+
+    Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
+    estimator and seed, bad settings, or an ``out`` that holds results while ``overwrite`` is off.
+    """
+    configs = _without_needless_seeds(configs)
+    _check(logs, configs)
+    _prepare(out, overwrite)
+    work = [_Job(log, config, _folder(out, log.name, config)) for log in logs for config in configs]
+    outcomes: dict[int, _Outcome | Exception] = {}
+    for i, outcome in run_each(_execute, work, jobs or os.cpu_count() or 1):
+        outcomes[i] = outcome
+        if progress is not None:
+            progress(len(outcomes), len(work))
+    rows = [_row(job, outcomes[i]) for i, job in enumerate(work)]
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    rows = [{key: row.get(key) for key in keys} for row in rows]
+    _write_tables(rows, out)
+    for log in logs:
+        tracks: dict[str, Track] = {}
+        for i, job in enumerate(work):
+            outcome = outcomes[i]
+            if job.log is log and isinstance(outcome, _Outcome):
+                tracks.setdefault(job.config.estimator, outcome.track)  # the first seed stands for all
+        if tracks:
+            plot_log(log, tracks, out / "plots", file_name(log.name))
+    failed = [row for row in rows if row["status"] == "failed"]
+    return Comparison(rows, [f"{r['log']}, {r['estimator']}, seed {r['seed']}: {r['reason']}" for r in failed])
+
+
+def file_name(text: str) -> str:
+    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore."""
+    return re.sub(r"[^\w.-]", "_", text).lstrip(".") or "_"
+
+
+def _execute(job: _Job) -> _Outcome:
+    result = run(job.log, job.config)
+    scores = write_run(result, job.log, job.folder)
+    return _Outcome(scores, Track(result.causal(), result.final, result.timings.update_ms))
+
+
+def _without_needless_seeds(configs: Sequence[RunConfig]) -> list[RunConfig]:
+    kept: list[RunConfig] = []
+    for config in configs:
+        same = [k for k in kept if replace(k, seed=config.seed) == config]
+        if not (same and _is_deterministic(config.estimator)):
+            kept.append(config)
+    return kept
+
+
+def _is_deterministic(estimator: str) -> bool:
+    registry.check_names([estimator])
+    module, kind, _ = registry.ESTIMATORS[estimator]
+    return bool(getattr(importlib.import_module(f"factorgraph_loc.estimators.{module}"), kind).deterministic)
+
+
+def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
+    if not logs or not configs:
+        raise InputError("there is nothing to compare, expected at least one log and one estimator")
+    for config in configs:
+        registry.settings_of(config.estimator, config.settings)
+    names = [file_name(log.name) for log in logs]
+    for log, name in zip(logs, names, strict=True):
+        if names.count(name) > 1:
+            raise InputError(f"two logs are called {log.name}, expected different names")
+    pairs = [(config.estimator, config.seed) for config in configs]
+    for estimator, seed in pairs:
+        if pairs.count((estimator, seed)) > 1:
+            raise InputError(f"{estimator} with seed {seed} is given twice")
+
+
+def _prepare(out: Path, overwrite: bool) -> None:
+    """Refuse what may not be replaced, remove what may: only files that an earlier comparison wrote."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder for the results")
+    runs = sorted(out.glob("runs/*/*/seed*"))
+    held = [name for name in (*_TABLES, *FILES) if (out / name).exists()] + [str(run.relative_to(out)) for run in runs]
+    if held and not overwrite:
+        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    for name in _TABLES:
+        (out / name).unlink(missing_ok=True)
+    for folder in runs:
+        remove_run(folder)
+        (folder / _ERROR).unlink(missing_ok=True)
+
+
+def _folder(out: Path, log: str, config: RunConfig) -> Path:
+    return out / "runs" / file_name(log) / config.estimator / f"seed{config.seed}"
+
+
+def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
+    row: dict[str, Any] = {"log": job.log.name, "estimator": job.config.estimator, "seed": job.config.seed}
+    if isinstance(outcome, _Outcome):
+        scalars = {k: v for k, v in outcome.scores.items() if not isinstance(v, list)}
+        return row | {"status": "ok", "reason": None} | scalars
+    message = " ".join(str(outcome).split())
+    if not isinstance(outcome, FglocError):
+        message = f"{type(outcome).__name__}: {message}"
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_text(job.folder / _ERROR, "".join(traceback.format_exception(outcome)))
+    return row | {"status": "failed", "reason": message}
+
+
+def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
+    table = pl.DataFrame(rows, infer_schema_length=None)
+    with replacing(out / "results.parquet") as temporary:
+        table.write_parquet(temporary)
+    write_text(out / "results.csv", table.write_csv())
+    write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
+    write_text(out / "table.md", markdown(*comparison_cells(rows)))

@@ -1,0 +1,140 @@
+"""The files of one run: ``final.tum``, ``causal.tum``, ``estimates.parquet``, ``metrics.json``, ``config.toml``."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.files import write_text, write_toml
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory, write_tum
+from factors.se2 import Array
+
+FILES = (
+    "final.tum",
+    "causal.tum",
+    "estimates.parquet",
+    "config.toml",
+    "metrics.json",
+)  # the last says that all are there
+COVARIANCES = {
+    "cov_xx": (0, 0),
+    "cov_xy": (0, 1),
+    "cov_xh": (0, 2),
+    "cov_yy": (1, 1),
+    "cov_yh": (1, 2),
+    "cov_hh": (2, 2),
+}
+
+
+def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Score a run, write its files into the folder ``out``, and return the scores.
+
+    ``estimates.parquet`` has one row a tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m], ``heading``
+    [rad], the covariances in the world's frame, ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``,
+    ``update_ms`` (causal: the slowest update since the tick before, null if there was none) and ``status`` (of the causal
+    estimate at that time). ``causal.tum`` holds the estimates from the first localized one on.
+
+    Raises InputError if ``out`` holds results and ``overwrite`` is off. Everything is written beside ``out`` first; files in
+    ``out`` that are not ours are left alone.
+    """
+    check_free(out, overwrite=overwrite)
+    scores = score(result, log)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    try:
+        causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
+        write_tum(result.final, temporary / "final.tum", log.t0_ns)
+        write_tum(causal, temporary / "causal.tum", log.t0_ns)
+        estimates(result, log).write_parquet(temporary / "estimates.parquet")
+        write_toml(temporary / "config.toml", result.config)
+        write_text(temporary / "metrics.json", json.dumps(_plain(scores), indent=2, allow_nan=False) + "\n")
+        remove_run(out)
+        out.mkdir(exist_ok=True)
+        for name in FILES:
+            (temporary / name).replace(out / name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return scores
+
+
+def check_free(out: Path, *, overwrite: bool) -> None:
+    """InputError if ``out`` is no folder, or holds the results of a run that may not be replaced."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder for the results")
+    found = [name for name in FILES if (out / name).exists()]
+    if found and not overwrite:
+        raise InputError(f"{out}: holds results already ({found[0]}); choose another folder, or --overwrite")
+
+
+def remove_run(out: Path) -> None:
+    """Remove the files of an earlier run, the mark of completeness first, and nothing else."""
+    for name in reversed(FILES):
+        (out / name).unlink(missing_ok=True)
+
+
+def estimates(result: RunResult, log: Log) -> pl.DataFrame:
+    """The table of ``estimates.parquet``; see :func:`write_run`."""
+    status = np.array(result.status, dtype=object)
+    causal = Trajectory(result.t, result.poses, result.covariances)
+    at = np.searchsorted(result.t, result.final.t - 1e-9).clip(max=len(result.t) - 1)
+    return pl.concat(
+        [
+            _rows("causal", causal, log, _slowest_update(result), status),
+            _rows("final", result.final, log, np.full(len(result.final), np.nan), status[at]),
+        ]
+    )
+
+
+def _rows(
+    kind: str, trajectory: Trajectory, log: Log, update_ms: Array, status: np.typing.NDArray[np.object_]
+) -> pl.DataFrame:
+    n = len(trajectory)
+    missing = np.full(n, np.nan)
+    covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
+    position, heading, nees = missing, missing, missing
+    if log.reference is not None:
+        e = errors(trajectory, log.reference)
+        position, heading, nees = e.position, e.heading, e.nees
+    columns: dict[str, Any] = {
+        "kind": [kind] * n,
+        "t_ns": log.t0_ns + np.round(trajectory.t * 1e9).astype(np.int64),
+        "x": trajectory.poses[:, 0],
+        "y": trajectory.poses[:, 1],
+        "heading": trajectory.poses[:, 2],
+        **{name: covariances[:, i, j] for name, (i, j) in COVARIANCES.items()},
+        "error_position": position,
+        "error_heading": heading,
+        "nees": nees,
+        "update_ms": update_ms,
+        "status": status.tolist(),
+    }
+    table = pl.DataFrame(columns, schema_overrides={"kind": pl.String, "t_ns": pl.Int64, "status": pl.String})
+    return table.with_columns(pl.col(pl.Float64).fill_nan(None))
+
+
+def _slowest_update(result: RunResult) -> Array:
+    slowest = np.full(len(result.t), np.nan)
+    tick = np.searchsorted(result.t, result.timings.update_t)
+    inside = tick < len(result.t)  # updates after the last tick belong to none
+    np.fmax.at(slowest, tick[inside], result.timings.update_ms[inside])
+    return slowest
+
+
+def _plain(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON has no NaN and no infinity: null."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in scores.items()}
