@@ -1,0 +1,189 @@
+"""Figures on cases whose answer is known, and against the evo package."""
+
+import math
+
+import numpy as np
+import pytest
+from evo.core import metrics as evo
+from evo.core.trajectory import PosePath3D
+from scipy.stats import binom, chi2
+
+from factorgraph_loc.estimators.base import Diagnostics, Learnt
+from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
+from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.log import Log
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import se2
+
+TIMINGS = Timings(np.array([0.5]), np.array([2.0]), 1.0, 10.0, 0.1, 100.0)
+
+
+def drive(n=600, dt=0.1, speed=0.4):
+    """A wandering drive, and an estimate of it that drifts."""
+    rng = np.random.default_rng(1)
+    t = np.arange(n) * dt
+    twists = np.stack((np.full(n, speed * dt), np.zeros(n), 0.04 * np.sin(t / 7.0)), axis=1)
+    truth, estimate = [np.array((1.0, 2.0, 3.0))], [np.array((1.02, 1.97, 3.05))]
+    for twist in twists[1:]:
+        truth.append(se2.compose(truth[-1], se2.exp(twist)))
+        estimate.append(se2.compose(estimate[-1], se2.exp(twist + 0.005 * rng.standard_normal(3))))
+    return t, np.array(truth), np.array(estimate)
+
+
+def result_of(t, poses, status, final=None, diagnostics=None):
+    covariances = np.tile(np.eye(3), (len(t), 1, 1))
+    final = Trajectory(t, poses, covariances) if final is None else final
+    diagnostics = Diagnostics() if diagnostics is None else diagnostics
+    return RunResult("log", {}, t, poses, covariances, status, final, diagnostics, Learnt(), TIMINGS, {})
+
+
+def test_constant_offset():
+    t, truth, _ = drive()
+    figures = accuracy(Trajectory(t, truth + np.array((3.0, 4.0, 0.0))), Trajectory(t, truth))
+    for how in ("rmse", "median", "p95", "max"):
+        assert figures[f"position_{how}"] == pytest.approx(5.0)
+        assert figures[f"heading_{how}"] == pytest.approx(0.0)
+    assert figures["rpe_position_per_m"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["anees"] is None
+
+
+def test_heading_errors_wrap():
+    t = np.arange(3) * 0.1
+    truth = np.array([(0.0, 0.0, math.pi - 0.01)] * 3)
+    estimate = np.array([(0.0, 0.0, -math.pi + 0.02)] * 3)
+    assert accuracy(Trajectory(t, estimate), Trajectory(t, truth))["heading_rmse"] == pytest.approx(0.03)
+
+
+def test_gaps_of_the_reference_are_left_out():
+    reference = Trajectory(np.array([0.0, 0.1, 0.2, 1.2, 1.3]), np.zeros((5, 3)))
+    t = np.arange(14) * 0.1
+    poses = np.zeros((14, 3))
+    poses[3:12, 0] = 100.0
+    e = errors(Trajectory(t, poses), reference)
+    assert np.isnan(e.position[3:12]).all()
+    figures = accuracy(Trajectory(t, poses), reference)
+    assert figures["position_max"] == 0.0
+    assert figures["scored"] == 5
+
+
+def test_no_relative_error_spans_a_gap():
+    poses = np.stack((np.arange(8) * 0.6, np.zeros(8), np.zeros(8)), axis=1)
+    reference = poses.copy()
+    reference[3] = np.nan
+    # 0..2 holds one piece of 1.2 m, 4..7 one more; the rest is too short
+    assert len(relative_errors(poses, reference)[0]) == 2
+
+
+def test_heading_is_not_scored_where_the_reference_has_none():
+    t, truth, estimate = drive()
+    covariances = np.tile(np.diag((1.0, 1.0, 1e-9)), (len(t), 1, 1))
+    figures = accuracy(Trajectory(t, estimate, covariances), Trajectory(t, truth, has_heading=False))
+    assert figures["heading_rmse"] is None
+    assert figures["rpe_position_per_m"] is None
+    assert figures["rpe_heading_per_m"] is None
+    assert figures["anees"] == pytest.approx(np.mean(np.sum((estimate - truth)[:, :2] ** 2, axis=1)))
+
+
+def test_nees_of_a_known_covariance():
+    t = np.arange(4) * 0.1
+    covariances = np.tile(np.array([(4.0, 1.0, 0.0), (1.0, 2.0, 0.1), (0.0, 0.1, 0.5)]), (4, 1, 1))
+    difference = np.array((1.0, -2.0, 0.3))
+    expected = difference @ np.linalg.inv(covariances[0]) @ difference
+    figures = accuracy(Trajectory(t, np.tile(difference, (4, 1)), covariances), Trajectory(t, np.zeros((4, 3))))
+    assert figures["anees"] == pytest.approx(expected)
+    assert figures["nees_bounds"] == pytest.approx([chi2.ppf(0.025, 12) / 4, chi2.ppf(0.975, 12) / 4])
+
+
+def test_a_covariance_that_is_none_is_counted_and_left_out():
+    t = np.arange(3) * 0.1
+    covariances = np.stack((np.eye(3), np.zeros((3, 3)), np.full((3, 3), np.nan)))
+    figures = accuracy(Trajectory(t, np.ones((3, 3)) * 0.1, covariances), Trajectory(t, np.zeros((3, 3))))
+    assert figures["invalid_covariances"] == 2
+    assert figures["anees"] == pytest.approx(0.03)
+
+
+def test_errors_drawn_from_the_covariance_are_consistent():
+    """Independent errors: ANEES and coverage fall outside their intervals in one of 10^6 correct implementations."""
+    n = 5000
+    rng = np.random.default_rng(3)
+    covariance = np.array([(0.04, 0.01, 0.0), (0.01, 0.09, 0.002), (0.0, 0.002, 0.01)])
+    poses = rng.multivariate_normal(np.zeros(3), covariance, size=n)
+    t = np.arange(n) * 0.1
+    figures = accuracy(Trajectory(t, poses, np.tile(covariance, (n, 1, 1))), Trajectory(t, np.zeros((n, 3))))
+    low, high = chi2.ppf((5e-7, 1.0 - 5e-7), 3 * n) / n
+    assert low < figures["anees"] < high
+    low, high = binom.ppf((5e-7, 1.0 - 5e-7), n, 0.95) / n
+    assert low <= figures["coverage_95"] <= high
+
+
+def path(poses):
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1] = c, -s, s, c
+    matrices[:, :2, 3] = poses[:, :2]
+    return PosePath3D(poses_se3=list(matrices))
+
+
+def test_absolute_and_relative_errors_are_those_of_evo():
+    t, truth, estimate = drive()
+    figures = accuracy(Trajectory(t, estimate), Trajectory(t, truth))
+    pair = (path(truth), path(estimate))
+    ape = evo.APE(evo.PoseRelation.translation_part)
+    ape.process_data(pair)
+    assert figures["position_rmse"] == pytest.approx(ape.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
+    assert figures["position_median"] == pytest.approx(ape.get_statistic(evo.StatisticsType.median), rel=1e-9)
+    assert figures["position_max"] == pytest.approx(ape.get_statistic(evo.StatisticsType.max), rel=1e-9)
+    turn = evo.APE(evo.PoseRelation.rotation_angle_rad)
+    turn.process_data(pair)
+    assert figures["heading_rmse"] == pytest.approx(turn.get_statistic(evo.StatisticsType.rmse), rel=1e-6)
+    relations = {"position": evo.PoseRelation.translation_part, "heading": evo.PoseRelation.rotation_angle_rad}
+    for what, relation in relations.items():
+        rpe = evo.RPE(relation, delta=1.0, delta_unit=evo.Unit.meters, all_pairs=False, pairs_from_reference=True)
+        rpe.process_data(pair)
+        assert len(rpe.error) > 15
+        expected = rpe.get_statistic(evo.StatisticsType.rmse)
+        assert figures[f"rpe_{what}_per_m"] == pytest.approx(expected, rel=1e-6)
+
+
+def log_of(t, truth):
+    return Log("log", Rig(), World(), {}, None if truth is None else Trajectory(t, truth))
+
+
+def test_scored_from_the_first_localized():
+    t = np.arange(5) * 0.1
+    poses = np.zeros((5, 3))
+    poses[:2, 0] = 50.0
+    status = ("unlocalized", "ambiguous", "localized", "ambiguous", "localized")
+    scores = score(result_of(t, poses, status), log_of(t, np.zeros((5, 3))))
+    assert scores["causal.position_max"] == 0.0
+    assert scores["final.scored"] == scores["causal.scored"] == 3
+    assert scores["time_to_localized"] == pytest.approx(0.2)
+
+
+def test_never_localized_has_a_final_score_only():
+    t = np.arange(5) * 0.1
+    scores = score(result_of(t, np.zeros((5, 3)), ("unlocalized",) * 5), log_of(t, np.zeros((5, 3))))
+    assert scores["causal.position_rmse"] is None
+    assert scores["time_to_localized"] is None
+    assert scores["final.scored"] == 5
+
+
+def test_without_a_reference_nis_counts_and_times_are_reported():
+    diagnostics = Diagnostics()
+    for nis in (1.0, 2.0, 30.0):
+        diagnostics.innovation("bearing_range", 0.0, nis, 2)
+    diagnostics.ignore("unknown landmark", 3)
+    diagnostics.reject("gate")
+    t = np.arange(5) * 0.1
+    scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, diagnostics=diagnostics), log_of(t, None))
+    assert scores["causal.position_rmse"] is None
+    assert scores["nis.bearing_range.mean_per_dof"] == pytest.approx(33.0 / 6.0)
+    assert scores["nis.bearing_range.beyond_95"] == pytest.approx(1.0 / 3.0)
+    assert scores["nis.bearing_range.count"] == 3
+    assert scores["ignored.unknown landmark"] == scores["ignored.total"] == 3
+    assert scores["rejected.total"] == 1
+    assert scores["late.total"] == 0
+    assert scores["timing.update_ms_median"] == 2.0
+    assert scores["timing.real_time_factor"] == 10.0
