@@ -1,0 +1,92 @@
+"""A short log, and an estimator that notes what it is given."""
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.estimators.base import Diagnostics, Learnt, PoseEstimate
+from factorgraph_loc.files import FileModel
+from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
+from factorgraph_loc.rig import BearingRangeSettings, Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World
+
+
+@pytest.fixture
+def log():
+    """Two seconds straight ahead at 1 m/s along x; a landmark is seen twice at one stamp in each half second."""
+    t = np.arange(41) * 0.05
+    truth = np.stack((t, 0.0 * t, 0.0 * t), axis=1)
+    seen = np.repeat(np.arange(4) * 0.5 + 0.02, 2)
+    landmarks = np.array([(5.0, 1.0), (5.0, -1.0)] * 4)
+    offset = landmarks - np.stack((seen, 0.0 * seen), axis=1)
+    return Log(
+        name="straight",
+        rig=Rig(bearing_range=BearingRangeSettings(range_sigma=0.1)),
+        world=World(landmarks={"a": Landmark(x=5.0, y=1.0), "b": Landmark(x=5.0, y=-1.0)}),
+        streams={
+            "odometry": VelocityStream(t, np.ones(41), np.zeros(41)),
+            "bearing_range": BearingRangeStream(
+                seen, ["a", "b"] * 4, np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
+            ),
+        },
+        reference=Trajectory(t, truth),
+        t0_ns=1_700_000_000_000_000_000,
+    )
+
+
+class FakeSettings(FileModel):
+    """``localized_at`` [s]; ``broken_at`` [s]: from then on the pose is not a number."""
+
+    localized_at: float = 0.0
+    broken_at: float = 1e9
+
+
+class Fake:
+    """Stays at the prior and writes down all calls."""
+
+    deterministic = True
+    supports_unknown_start = False
+
+    def __init__(self, setup, settings):
+        self.diagnostics = Diagnostics()
+        self.setup, self.settings = setup, settings
+        self.calls, self.ticks = [], []
+        self.pose, self.t = np.zeros(3), 0.0
+        Fake.made = self
+
+    def initialize(self, prior):
+        self.calls.append(("initialize", prior.t))
+        self.pose = prior.pose
+        self.prior = prior
+
+    def process(self, measurement):
+        self.calls.append((type(measurement).__name__, measurement.t))
+        self.t = measurement.t
+        if self.calls[-1][0] == "Tick":
+            self.ticks.append(measurement.t)
+
+    def estimate(self):
+        self.calls.append(("estimate", self.t))
+        pose = self.pose if self.t < self.settings.broken_at else np.full(3, np.nan)
+        status = "localized" if self.t >= self.settings.localized_at else "unlocalized"
+        return PoseEstimate(self.t, pose, np.eye(3), status)
+
+    def learnt(self):
+        return Learnt({"scale": (1.0, 0.1)})
+
+    def trajectory(self):
+        return Trajectory(np.array(self.ticks), np.tile(self.pose, (len(self.ticks), 1)))
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch):
+    """The class of the estimator that is registered as ``fake``; ``fake.made`` is the last one made."""
+    monkeypatch.setitem(
+        sys.modules, "factorgraph_loc.estimators.fake", SimpleNamespace(Fake=Fake, FakeSettings=FakeSettings)
+    )
+    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("fake", "Fake", "FakeSettings"))
+    return Fake

@@ -1,0 +1,77 @@
+"""Comparisons: every pair is run, failures are reported, nothing is lost."""
+
+from dataclasses import replace
+
+import polars as pl
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.compare import compare
+from factorgraph_loc.experiments.output import FILES
+from factorgraph_loc.experiments.processes import ProcessDiedError, run_each
+from factorgraph_loc.experiments.run import RunConfig
+
+
+def test_a_job_that_fails_or_dies_takes_nothing_with_it():
+    jobs = ["6 * 7", "1 / 0", "__import__('os')._exit(3)", "__import__('os').environ['OPENBLAS_NUM_THREADS']"]
+    outcomes = dict(run_each(eval, jobs, workers=2))
+    assert outcomes[0] == 42
+    assert isinstance(outcomes[1], ZeroDivisionError)
+    assert isinstance(outcomes[2], ProcessDiedError)
+    assert outcomes[3] == "1"
+
+
+def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
+    nowhere = replace(log, name="no/where", reference=None)
+    configs = [RunConfig(name, seed=seed) for name in ("dead_reckoning", "particle_filter") for seed in (3, 4)]
+    out = tmp_path / "out"
+    done = []
+    comparison = compare([log, nowhere], configs, out, progress=lambda *counts: done.append(counts))
+    assert done == [(i + 1, 6) for i in range(6)]
+    assert [(r["log"], r["estimator"], r["seed"], r["status"]) for r in comparison.rows] == [
+        (name, estimator, seed, status)
+        for name, status in (("straight", "ok"), ("no/where", "failed"))
+        for estimator, seed in (("dead_reckoning", 3), ("particle_filter", 3), ("particle_filter", 4))
+    ]
+    assert len({tuple(row) for row in comparison.rows}) == 1
+    assert len(comparison.failures) == 3
+    assert comparison.failures[0].startswith("no/where, dead_reckoning, seed 3: dead_reckoning cannot start")
+
+    assert {path.name for path in (out / "runs/straight/particle_filter/seed4").iterdir()} == set(FILES)
+    for table in (pl.read_csv(out / "results.csv"), pl.read_parquet(out / "results.parquet")):
+        assert len(table) == 6
+        assert table["causal.position_rmse"].null_count() == 3
+    assert set(pl.read_csv(out / "differences.csv")["log"]) == {"straight", "no/where"}
+    assert "| particle_filter |" in (out / "table.md").read_text()
+    assert (out / "plots/straight-trajectories.png").is_file()
+
+    with pytest.raises(InputError, match="holds results already"):
+        compare([log], configs[:1], out)
+    (out / "notes.txt").write_text("mine")
+    compare([log], configs[:1], out, overwrite=True)
+    assert len(pl.read_csv(out / "results.csv")) == 1
+    assert pl.read_csv(out / "differences.csv").is_empty()
+    assert not list((out / "runs/straight/particle_filter").rglob("metrics.json"))
+    assert (out / "notes.txt").is_file()
+
+
+def test_an_unforeseen_error_leaves_its_traceback(log, tmp_path):
+    broken = replace(log, streams={"odometry": log.streams["odometry"], "bearing_range": None})
+    (row,) = compare([broken], [RunConfig("dead_reckoning", prior="0,0,0")], tmp_path).rows
+    assert row["reason"].startswith("AttributeError: ")
+    assert "Traceback" in (tmp_path / "runs/straight/dead_reckoning/seed0/error.txt").read_text()
+
+
+def test_bad_input_is_found_before_anything_runs(log, tmp_path):
+    config = RunConfig("dead_reckoning")
+    for logs, configs, message in (
+        ([], [config], "nothing to compare"),
+        ([log], [], "nothing to compare"),
+        ([log, log], [config], "two logs are called straight"),
+        ([log], [config, RunConfig("dead_reckoning", {"max_delay": 0.1})], "given twice"),
+        ([log], [RunConfig("dead_reckoning", {"max_dely": 0.1})], "did you mean max_delay"),
+        ([log], [RunConfig("smother")], "did you mean smoother"),
+    ):
+        with pytest.raises(InputError, match=message):
+            compare(logs, configs, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

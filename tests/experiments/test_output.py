@@ -1,0 +1,108 @@
+"""The files of a run."""
+
+import json
+import tomllib
+
+import numpy as np
+import polars as pl
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.output import FILES, write_run
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.trajectory import read_tum
+
+COLUMNS = [
+    "kind",
+    "t_ns",
+    "x",
+    "y",
+    "heading",
+    "cov_xx",
+    "cov_xy",
+    "cov_xh",
+    "cov_yy",
+    "cov_yh",
+    "cov_hh",
+    "error_position",
+    "error_heading",
+    "nees",
+    "update_ms",
+    "status",
+]
+
+
+@pytest.fixture
+def result(log):
+    return run(log, RunConfig("fake", {"localized_at": 0.5}))
+
+
+def test_files(result, log, tmp_path):
+    scores = write_run(result, log, tmp_path / "new" / "out")
+    out = tmp_path / "new" / "out"
+    assert {path.name for path in out.iterdir()} == set(FILES)
+    assert list(out.parent.iterdir()) == [out]
+    assert json.loads((out / "metrics.json").read_text()) == scores
+    assert tomllib.loads((out / "config.toml").read_text())["estimator"] == "fake"
+    assert read_tum(out / "causal.tum", log.t0_ns).t == pytest.approx(np.arange(5, 21) * 0.1)
+    assert len(read_tum(out / "final.tum")) == 21
+
+
+def test_table_of_estimates(result, log, tmp_path):
+    write_run(result, log, tmp_path / "out")
+    table = pl.read_parquet(tmp_path / "out" / "estimates.parquet")
+    assert table.columns == COLUMNS
+    types = {"kind": pl.String, "t_ns": pl.Int64, "status": pl.String}
+    assert dict(table.schema) == {name: types.get(name, pl.Float64) for name in COLUMNS}
+    causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
+    assert len(causal) == len(final) == 21
+    assert causal["t_ns"].to_list() == [log.t0_ns + i * 100_000_000 for i in range(21)]
+    assert causal["error_position"].to_numpy() == pytest.approx(np.arange(21) * 0.1)
+    assert causal["nees"].to_numpy() == pytest.approx((np.arange(21) * 0.1) ** 2)
+    assert np.flatnonzero(causal["update_ms"].is_not_null()).tolist() == [1, 6, 11, 16]
+    assert causal["status"].to_list() == final["status"].to_list() == ["unlocalized"] * 5 + ["localized"] * 16
+    assert final["update_ms"].null_count() == final["cov_xx"].null_count() == 21
+    assert not any(table[name].is_nan().any() for name in COLUMNS if name not in types)
+
+
+def test_json_has_no_nan(result, log, tmp_path):
+    text = (write_run(result, log, tmp_path / "out"), (tmp_path / "out" / "metrics.json").read_text())[1]
+    assert "NaN" not in text
+    assert "Infinity" not in text
+
+
+def test_results_are_not_overwritten_unless_told(result, log, tmp_path):
+    out = tmp_path / "out"
+    write_run(result, log, out)
+    before = (out / "metrics.json").read_bytes()
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds results already"):
+        write_run(result, log, out)
+    assert (out / "metrics.json").read_bytes() == before
+    write_run(result, log, out, overwrite=True)
+    assert (out / "notes.txt").read_text() == "mine"
+    assert {path.name for path in out.iterdir()} == {*FILES, "notes.txt"}
+
+
+def test_a_folder_without_results_may_be_used(result, log, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    write_run(result, log, tmp_path)
+    assert (tmp_path / "metrics.json").is_file()
+
+
+def test_a_file_in_the_way(result, log, tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="is a file"):
+        write_run(result, log, tmp_path / "out", overwrite=True)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_run(result, log, tmp_path / "out" / "below")
+
+
+def test_nothing_is_left_half_written(result, log, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
+    with pytest.raises(OSError, match="no space"):
+        write_run(result, log, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,161 @@
+"""What an estimator is given in a run, in which order, and what is kept."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import BearingRangeStream, StartPose, VelocityStream
+from factorgraph_loc.trajectory import Trajectory
+
+
+def test_order_of_what_is_fed(log, fake):
+    run(log, RunConfig("fake"))
+    calls = fake.made.calls
+    assert calls[:2] == [("VelocityOdometry", 0.0), ("initialize", 0.0)]
+    fed = [call for call in calls if call[0] not in ("estimate", "initialize")]
+    assert [t for _, t in fed] == sorted(t for _, t in fed)
+    kinds = [kind for kind, t in fed if t == pytest.approx(0.1)]
+    assert kinds == ["VelocityOdometry", "Tick"]
+
+
+def test_ticks_stand_on_a_grid_of_10_hz(log, fake):
+    result = run(log, RunConfig("fake"))
+    assert result.t == pytest.approx(np.arange(21) * 0.1)
+    assert fake.made.ticks == result.t.tolist()
+    assert len(result.final) == len(result.poses) == len(result.covariances) == len(result.status) == 21
+
+
+def test_an_update_is_one_stamp(log, fake):
+    result = run(log, RunConfig("fake"))
+    assert result.timings.update_t == pytest.approx(np.arange(4) * 0.5 + 0.02)
+    assert (result.timings.update_ms > 0.0).all()
+    calls = fake.made.calls
+    after = [calls[i + 1][0] for i, (kind, _) in enumerate(calls) if kind in ("BearingRange", "Tick")]
+    assert set(after) == {"estimate"}
+    assert result.timings.real_time_factor == pytest.approx(2.0 / result.timings.causal_seconds)
+    assert result.timings.peak_memory_mb > 10.0
+
+
+def test_what_is_older_than_the_prior(log, fake):
+    log = replace(log, start=StartPose(0.72, np.array((0.72, 0.0, 0.0)), np.full(3, 0.1)))
+    result = run(log, RunConfig("fake"))
+    calls = fake.made.calls
+    started = calls.index(("initialize", 0.72))
+    assert {kind for kind, _ in calls[:started]} == {"VelocityOdometry"}
+    assert result.diagnostics.ignored == {"before the start": 2}
+    assert result.t[0] == 0.72
+    assert result.t[-1] <= 2.0
+
+
+def test_a_late_measurement_is_fed_when_it_arrives(log, fake):
+    s = log.streams["bearing_range"]
+    late = BearingRangeStream(s.t - np.array([0, 0, 0, 0, 0.8, 0.8, 0, 0]), s.landmark, s.range, s.bearing)
+    # it arrives with the newest of its stream so far, at 0.52 s
+    run(replace(log, streams=dict(log.streams) | {"bearing_range": late}), RunConfig("fake"))
+    calls = [call for call in fake.made.calls if call[0] != "estimate"]
+    where = next(i for i, (kind, t) in enumerate(calls) if kind == "BearingRange" and t == pytest.approx(0.22))
+    assert max(t for _, t in calls[:where]) == pytest.approx(0.52)
+
+
+def test_sensors_are_a_setting(log, fake):
+    result = run(log, RunConfig("fake", sensors=("odometry",)))
+    assert fake.made.setup.sensors == ("odometry",)
+    assert len(result.timings.update_t) == 0
+    with pytest.raises(InputError, match=r"straight: has no sensor 'bearing_rnge': did you mean bearing_range\?"):
+        run(log, RunConfig("fake", sensors=("odometry", "bearing_rnge")))
+    with_rfid = replace(log, rig=log.rig.model_copy(update={"sensors": ("odometry", "rfid")}))
+    assert "rfid" in run(with_rfid, RunConfig("fake")).warnings[0]
+
+
+def test_effective_configuration(log):
+    config = run(log, RunConfig("fake", {"localized_at": 0.5}, seed=7)).config
+    assert config["settings"] == {"localized_at": 0.5, "broken_at": 1e9}
+    assert (config["prior"], config["seed"], config["sensors"]) == ("reference", 7, ["odometry", "bearing_range"])
+    assert config["rig"]["bearing_range"]["range_sigma"] == 0.1
+    assert set(config["versions"]) == {"factorgraph-loc", "gtsam", "numpy", "python"}
+    with pytest.raises(InputError, match="localised_at"):
+        run(log, RunConfig("fake", {"localised_at": 0.5}))
+
+
+def test_progress_ends_at_one(log):
+    shares = []
+    run(log, RunConfig("fake"), shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_pose_that_is_not_finite_is_an_error(log):
+    with pytest.raises(FglocError, match=r"straight: the estimate at 1\.000 s is not finite"):
+        run(log, RunConfig("fake", {"broken_at": 0.95}))
+
+
+def test_a_log_without_measurements(log):
+    with pytest.raises(InputError, match="has no measurements of odometry"):
+        run(replace(log, streams={"odometry": VelocityStream(*np.empty((3, 0)))}), RunConfig("fake", prior="0,0,0"))
+
+
+def test_priors(log):
+    prior, source = resolve_prior(log, None)
+    assert source == "reference"
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.05, 0.05, 0.05))
+    vague = replace(log, reference=Trajectory(log.reference.t, log.reference.poses, has_heading=False))
+    assert resolve_prior(vague, "reference")[0].covariance[2, 2] == pytest.approx(0.01)
+    stated = replace(log, start=StartPose(0.3, np.ones(3), np.array((0.1, 0.2, 0.3))))
+    prior, source = resolve_prior(stated, None)
+    assert (prior.t, source) == (0.3, "log")
+    assert np.diag(prior.covariance) == pytest.approx((0.01, 0.04, 0.09))
+    prior, source = resolve_prior(log, "1, -2, 0.5")
+    assert (prior.pose.tolist(), prior.t, source) == ([1.0, -2.0, 0.5], 0.0, "1, -2, 0.5")
+    assert resolve_prior(replace(log, reference=None), None) == (None, "unknown")
+
+
+def test_the_reference_prior_is_not_before_the_odometry(log):
+    odometry = log.streams["odometry"]
+    later = VelocityStream(odometry.t[9:], odometry.v[9:], odometry.w[9:])
+    assert resolve_prior(replace(log, streams={"odometry": later}), "reference")[0].t == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize("prior", ["here", "1,2", "1,2,nan", "0,0,90"])
+def test_priors_that_are_none(log, prior):
+    with pytest.raises(InputError, match=f"prior is '{prior}', expected"):
+        resolve_prior(log, prior)
+
+
+def test_missing_priors(log):
+    with pytest.raises(InputError, match="states no start"):
+        run(log, RunConfig("fake", prior="log"))
+    with pytest.raises(InputError, match="has no reference"):
+        run(replace(log, reference=None), RunConfig("fake", prior="reference"))
+    with pytest.raises(InputError, match="fake cannot start from an unknown pose"):
+        run(log, RunConfig("fake", prior="unknown"))
+
+
+def test_unknown_start_where_supported(log, fake, monkeypatch):
+    monkeypatch.setattr(fake, "supports_unknown_start", True)
+    result = run(log, RunConfig("fake", {"localized_at": 1.0}, prior="unknown"))
+    assert "initialize" not in [kind for kind, _ in fake.made.calls]
+    assert result.first_localized() == 10
+
+
+def test_same_seed_same_result(log):
+    one, other = (run(log, RunConfig("particle_filter", seed=3)) for _ in range(2))
+    assert np.array_equal(one.poses, other.poses)
+    assert np.array_equal(one.final.poses, other.final.poses)
+
+
+def test_one_thread_is_asked_for_before_numpy():
+    code = (
+        "import sys, os; from factorgraph_loc.experiments.threads import use_one_thread; use_one_thread();"
+        "assert 'numpy' not in sys.modules; print(os.environ['OPENBLAS_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])"
+    )
+    clean = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    for environment, expected in ((clean, "1 1"), (clean | {"OMP_NUM_THREADS": "4"}, "1 4")):
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
