@@ -30,6 +30,7 @@ _ACCURACY = (
     *(f"{what}_{how}" for what in ("position", "heading") for how in ("rmse", "median", "p95", "max")),
     "rpe_position_per_m",
     "rpe_heading_per_m",
+    "rpe_pieces",
     "anees",
     "nees_bounds",
     "coverage_95",
@@ -111,9 +112,10 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, 
     """The figures of one trajectory against the reference; all None without one.
 
     ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
-    :func:`relative_errors`. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading). ``nees_bounds``: between these
-    an average of as many *independent* NEES lies with 95 %; errors along a trajectory are correlated, so a consistent estimator
-    leaves them more often. ``coverage_95``: share of the times at which the true (x, y) lies in the 95 % ellipse.
+    :func:`relative_errors` over ``rpe_pieces`` of path. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading).
+    ``nees_bounds``: between these an average of as many *independent* NEES lies with 95 %; errors along a trajectory are
+    correlated, so a consistent estimator leaves them more often. ``coverage_95``: share of the times at which the true (x, y)
+    lies in the 95 % ellipse.
     ``invalid_covariances``: how many covariances were not positive definite, and are in none of these three. ``scored``: how
     many poses have a reference.
     """
@@ -127,6 +129,7 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, 
         position, heading = relative_errors(trajectory.poses, e.reference)
         figures["rpe_position_per_m"] = _rms(position)
         figures["rpe_heading_per_m"] = _rms(heading)
+        figures["rpe_pieces"] = len(position)
     nees = e.nees[np.isfinite(e.nees)]
     if len(nees):
         tail = (1.0 - CONFIDENCE) / 2.0

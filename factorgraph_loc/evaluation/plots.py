@@ -62,8 +62,10 @@ def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     """Causal and final trajectories over landmarks and reference; the view is that of the map and the reference."""
-    figure, axes = _figure(1, 2, 8.5, f"{log.name}: trajectories")
     landmarks = log.world.positions()
+    view = _view(landmarks, log.reference)
+    height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
+    figure, axes = _figure(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         if log.reference is not None:
             line = _with_gaps(log.reference.t, log.reference.poses)
@@ -79,7 +81,9 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
         axis.set_aspect("equal", adjustable="box")
         axis.set_xlabel("x [m]")
         axis.set_ylabel("y [m]")
-        _show(axis, landmarks, log.reference)
+        if view is not None:
+            axis.set_xlim(view[0, 0], view[1, 0])
+            axis.set_ylim(view[0, 1], view[1, 1])
     _legend(figure, axes[0])
     return figure
 
@@ -188,15 +192,14 @@ def _with_gaps(t: Array, poses: Array) -> Array:
     return np.insert(poses, gaps, np.nan, axis=0)
 
 
-def _show(axis: Axes, landmarks: Array, reference: Trajectory | None) -> None:
-    """Limit the view to map and reference: dead reckoning may run far away."""
+def _view(landmarks: Array, reference: Trajectory | None) -> Array | None:
+    """Lower and upper corner (2, 2) of map and reference: dead reckoning may run far away. None without a reference."""
     if reference is None or not len(reference):
-        return
+        return None
     points = np.concatenate((landmarks, reference.poses[:, :2]))
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.08 * max(*(high - low), 1.0)
-    axis.set_xlim(low[0] - margin, high[0] + margin)
-    axis.set_ylim(low[1] - margin, high[1] + margin)
+    return np.array((low - margin, high + margin))
 
 
 def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
