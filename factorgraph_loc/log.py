@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -74,8 +75,8 @@ class BearingRangeStream:
     bearing: Array
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        starts = np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
-        for i, j in zip(starts, [*starts[1:], len(self.t)], strict=True):
+        bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
+        for i, j in pairwise(bounds):
             yield BearingRange(float(self.t[i]) + offset, tuple(self.landmark[i:j]), self.range[i:j], self.bearing[i:j])
 
 

@@ -51,33 +51,52 @@ class Trajectory:
 
 
 def read_tum(path: Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
-    """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``."""
-    times: list[float] = []
-    poses: list[tuple[float, float, float]] = []
+    """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
+
+    InputError names file and row of what is not so, and of a stamp that is not after the one before.
+    """
+    rows, t_ns, poses = read_tum_rows(path)
+    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
+    if len(stuck):
+        i = int(stuck[0])
+        raise bad_field(path, "t", f"{t_ns[i]} ns", "a stamp after that of the row before", row=int(rows[i]))
+    return Trajectory((t_ns - t0_ns) * 1e-9, poses, has_heading=has_heading)
+
+
+def read_tum_rows(path: Path) -> tuple[Array, Array, Array]:
+    """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds and planar poses (N, 3)."""
+    rows: list[int] = []
+    stamps: list[int] = []
+    values: list[list[float]] = []
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from error
     for row, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
         parts = line.split()
+        if not parts or parts[0].startswith("#"):
+            continue
         if len(parts) != 8:
-            raise bad_field(path, "row", line, "8 values: t x y z qx qy qz qw", row=row)
+            raise bad_field(path, "row", line.strip(), "8 values: t x y z qx qy qz qw", row=row)
         try:
-            x, y, _, qx, qy, qz, qw = (float(p) for p in parts[1:])
-            t = seconds_after(parts[0], t0_ns)
-        except ValueError:
-            raise bad_field(path, "row", line, "8 numbers", row=row) from None
-        if not np.all(np.isfinite((t, x, y, qx, qy, qz, qw))):
-            raise bad_field(path, "row", line, "finite numbers", row=row)
-        if times and t <= times[-1]:
-            raise bad_field(path, "t", parts[0], "a stamp after that of the row before", row=row)
-        times.append(t)
-        poses.append((x, y, np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))))
-    if not times:
+            stamps.append(nanoseconds(parts[0]))
+            values.append([float(p) for p in parts[1:]])
+        except (ValueError, OverflowError):
+            raise bad_field(path, "row", line.strip(), "8 finite numbers", row=row) from None
+        rows.append(row)
+    if not rows:
         raise InputError(f"{path}: holds no poses, expected at least one row")
-    return Trajectory(np.array(times), np.array(poses), has_heading=has_heading)
+    x, y, _, qx, qy, qz, qw = table = np.array(values).T
+    bad = np.flatnonzero(~np.all(np.isfinite(table), axis=0))
+    if len(bad):
+        raise bad_field(path, "row", lines[rows[bad[0]] - 1].strip(), "8 finite numbers", row=rows[bad[0]])
+    length = np.sqrt(qx**2 + qy**2 + qz**2 + qw**2)
+    bad = np.flatnonzero(np.abs(length - 1.0) > 0.01)
+    if len(bad):
+        found = float(length[bad[0]])
+        raise bad_field(path, "length of qx qy qz qw", found, "1, a unit quaternion", row=rows[bad[0]])
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
+    return np.array(rows), np.array(stamps, dtype=np.int64), np.column_stack((x, y, heading))
 
 
 def write_tum(trajectory: Trajectory, path: Path, t0_ns: int = 0) -> None:
@@ -85,16 +104,20 @@ def write_tum(trajectory: Trajectory, path: Path, t0_ns: int = 0) -> None:
     rows = []
     for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
         t_ns = t0_ns + round(t * 1e9)
+        sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
         qz, qw = np.sin(heading / 2.0), np.cos(heading / 2.0)
-        rows.append(f"{t_ns // 10**9}.{t_ns % 10**9:09d} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
+        rows.append(f"{sign}{whole}.{fraction:09d} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
     write_text(path, "".join(rows))
 
 
-def seconds_after(stamp: str, t0_ns: int) -> float:
-    """A stamp in decimal seconds, as seconds after ``t0_ns``, without losing nanoseconds of an absolute time."""
+def nanoseconds(stamp: str) -> int:
+    """A stamp in decimal seconds as nanoseconds, without losing those of an absolute time."""
     whole, _, fraction = stamp.partition(".")
     if whole.lstrip("+-").isdigit() and (fraction == "" or fraction.isdigit()):
         ns = int((fraction + "000000000")[:9])
         total = int(whole) * 10**9 + (-ns if whole.startswith("-") else ns)
-        return (total - t0_ns) * 1e-9
-    return float(stamp) - t0_ns * 1e-9
+    else:
+        total = round(float(stamp) * 1e9)
+    if abs(total) >= 2**62:
+        raise OverflowError(f"{stamp} s is beyond 64 bits of nanoseconds")
+    return total

@@ -1,0 +1,7 @@
+"""Readers: one module per log format, and ``load``, which finds the right one."""
+
+from factorgraph_loc.readers.load import load
+from factorgraph_loc.readers.manifests import Dataset, Manifest, describe, manifests, read_manifest, verify
+from factorgraph_loc.readers.registry import READERS
+
+__all__ = ["READERS", "Dataset", "Manifest", "describe", "load", "manifests", "read_manifest", "verify"]

@@ -1,0 +1,95 @@
+"""What every reader checks of its rows. What cannot be mended is an InputError with its row, the rest a line of warning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.log import BearingRangeStream, Log
+from factors.se2 import Array
+
+MAX_LATE_NS = 500_000_000  # what estimators still put in at its time
+MAX_ODOMETRY_GAP = 5.0  # s
+
+
+def require_finite(source: object, rows: Array, field: str, values: Array) -> None:
+    """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): their rows in ``source``."""
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise bad_field(source, field, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]))
+
+
+def require_above_zero(source: object, rows: Array, field: str, values: Array) -> None:
+    """InputError at the first of ``values`` (N,) that is not above zero; NaN, not measured, passes."""
+    bad = np.flatnonzero(values <= 0.0)
+    if len(bad):
+        raise bad_field(source, field, float(values[bad[0]]), "more than 0", row=int(rows[bad[0]]))
+
+
+def in_order(source: object, rows: Array, t_ns: Array, warnings: list[str]) -> Array:
+    """Indices (M,) of the rows to keep of a stream that must not go back in time: of equal stamps (N,) the last."""
+    back = np.flatnonzero(np.diff(t_ns) < 0) + 1
+    if len(back):
+        i = int(back[0])
+        expected = f"a stamp not before that of the row before, {int(t_ns[i - 1])} ns"
+        raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
+    keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
+    if dropped := len(t_ns) - len(keep):
+        warnings.append(f"{source}: {dropped} rows have the stamp of the row after them and are left out")
+    return keep
+
+
+def sightings_in_order(
+    source: object, rows: Array, t_ns: Array, landmarks: Sequence[str], warnings: list[str]
+) -> Array:
+    """Indices (M,) of the sightings to keep, in order of arrival: of one landmark at one stamp the last.
+
+    A row at most 0.5 s older than the newest before it is late and kept, an older one an InputError.
+    """
+    newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
+    late = newest - t_ns
+    too_late = np.flatnonzero(late > MAX_LATE_NS)
+    if len(too_late):
+        i = int(too_late[0])
+        expected = f"a stamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
+        raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
+    if count := int(np.count_nonzero(late)):
+        warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
+    last = {key: i for i, key in enumerate(zip(t_ns.tolist(), landmarks, strict=True))}
+    if dropped := len(t_ns) - len(last):
+        warnings.append(f"{source}: {dropped} rows see a landmark that a later row sees at the same stamp: left out")
+    return np.array(sorted(last.values()), dtype=np.int64)
+
+
+def seconds(t_ns: Array, t0_ns: int) -> Array:
+    """Stamps (N,) in nanoseconds as seconds after ``t0_ns``."""
+    return np.asarray((t_ns - t0_ns) * 1e-9, dtype=float)
+
+
+def look_over(log: Log) -> list[str]:
+    """Warnings about a whole log; InputError if it has no odometry."""
+    odometry = log.streams.get("odometry")
+    if odometry is None or len(odometry.t) == 0:
+        raise InputError(f"{log.name}: has no odometry, which every estimator needs")
+    warnings = []
+    gaps = np.diff(odometry.t)
+    wide = np.flatnonzero(gaps > MAX_ODOMETRY_GAP)
+    if len(wide):
+        i = int(np.argmax(gaps))
+        count = "a gap" if len(wide) == 1 else f"{len(wide)} gaps"
+        warnings.append(
+            f"odometry: {count} above {MAX_ODOMETRY_GAP:g} s, the longest {gaps[i]:.1f} s at t = {odometry.t[i]:.3f} s"
+        )
+    for name, stream in log.streams.items():
+        if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
+            warnings.append(f"{name}: {early} rows come before the first odometry")
+    sightings = log.streams.get("bearing_range")
+    if isinstance(sightings, BearingRangeStream):
+        unknown = [name for name in sightings.landmark if name not in log.world.landmarks]
+        if unknown:
+            names = sorted(set(unknown))
+            shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+            warnings.append(f"bearing_range: {len(unknown)} rows name landmarks that the map lacks: {shown}")
+    return warnings

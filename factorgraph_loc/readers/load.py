@@ -1,0 +1,134 @@
+"""From what a user names to logs: a manifest, a folder in our own format, a shipped name, or any path with its reader."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import inside, nearest, parse_model
+from factorgraph_loc.log import Log
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers import registry as readers
+from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, manifests, read_manifest
+from factorgraph_loc.rig import Rig, read_rig
+from factorgraph_loc.world import World, read_world
+
+RUN_FILE = "run.toml"
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What to read, and what to put into the log that the reader makes."""
+
+    reader: str
+    path: Path | None
+    name: str | None = None  # None: the reader's
+    options: Mapping[str, Any] = field(default_factory=dict)
+    rig: Rig | None = None
+    world: World | None = None
+    start: StartSettings | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+def load(
+    log: str,
+    *,
+    data_root: Path | None = None,
+    reader: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    rig: Path | None = None,
+    world: Path | None = None,
+) -> list[Log]:
+    """The logs that ``log`` names.
+
+    ``log`` is a manifest, a folder in the native format or its ``run.toml``, a name that ``manifests()`` lists, or, with
+    ``reader``, any path. ``options`` are the reader's and go before a manifest's; a list, or text with commas, makes a log of
+    each value. ``rig`` and ``world`` replace those of the log. ``data_root``: where the files of manifests are, by default
+    the environment's FGLOC_DATA. InputError names what is wrong in one line.
+    """
+    given = dict(options or {})
+    source = _find(log, data_root, reader)
+    merged = {**source.options, **given}
+    choices = {key: _choices(value) for key, value in merged.items()}
+    naming = [key for key, value in choices.items() if key in given or len(value) > 1]
+    replaced = replace(
+        source,
+        rig=read_rig(rig) if rig is not None else source.rig,
+        world=read_world(world) if world is not None else source.world,
+    )
+    return [
+        _read(replaced, dict(zip(choices, values, strict=True)), naming)
+        for values in itertools.product(*choices.values())
+    ]
+
+
+def _choices(value: Any) -> list[Any]:
+    """The values of an option: those of a list, or of the command line's text with commas."""
+    if isinstance(value, str):
+        return [part.strip() for part in value.split(",")]
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
+def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
+    path = Path(log)
+    if reader is not None:
+        readers.reader(reader)  # a wrong name of a reader is told before a wrong path
+        if not path.exists():
+            raise InputError(f"{log}: does not exist")
+        return _Source(reader, path, None if reader == "native" else path.resolve().stem)
+    if path.is_dir() and (path / RUN_FILE).is_file():
+        return _Source("native", path)
+    if path.is_file():
+        if path.name == RUN_FILE:
+            return _Source("native", path.parent)
+        if path.suffix == ".toml":
+            return _from_manifest(path, data_root)
+        raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
+    known = manifests()
+    if log in known:
+        return _from_manifest(known[log], data_root)
+    if path.is_dir():
+        raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
+    raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
+
+
+def _from_manifest(file: Path, data_root: Path | None) -> _Source:
+    manifest: Manifest = read_manifest(file)
+    path = None
+    if manifest.path is not None:
+        path = inside(find_data_root(data_root, file), manifest.path, file)
+        if not path.exists():
+            raise InputError(f"{file}: its data {path} does not exist")
+    return _Source(
+        reader=manifest.reader,
+        path=path,
+        name=file.stem,
+        options=manifest.options,
+        rig=None if manifest.rig is None else read_rig(inside(file.parent, manifest.rig, file)),
+        world=None if manifest.world is None else read_world(inside(file.parent, manifest.world, file)),
+        start=manifest.start,
+        metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
+    )
+
+
+def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
+    """One log; ``naming``: the options that become part of its name, for they tell it from others of its source."""
+    chosen = readers.reader(source.reader)
+    log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
+    name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
+    log = replace(
+        log,
+        name=name,
+        rig=source.rig or log.rig,
+        world=source.world or log.world,
+        start=source.start.pose(log.t0_ns) if source.start else log.start,
+        metadata={**log.metadata, **source.metadata},
+    )
+    warnings = list(log.warnings)
+    if log.rig is readers.DEFAULT_RIG:
+        warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
+    return replace(log, warnings=(*warnings, *checks.look_over(log)))

@@ -1,0 +1,140 @@
+"""The data sets that ship with the project, each described by a manifest ``NAME.toml``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sysconfig
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+import factorgraph_loc
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.log import StartPose
+
+SHIPPED = Path("share", "factorgraph-loc", "datasets")  # below the data path of an installation
+DATA_ROOT = "FGLOC_DATA"
+
+
+class StartSettings(FileModel):
+    """A known start: pose, standard deviations, and absolute time (without it, t = 0 of the log)."""
+
+    x: Annotated[float, Field(description="m")]
+    y: Annotated[float, Field(description="m")]
+    heading: Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
+    sigma_position: Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
+    sigma_heading: Annotated[float, Field(gt=0.0, le=10.0, description="rad")]
+    t_ns: int | None = None
+
+    def pose(self, t0_ns: int) -> StartPose:
+        """As a start in a log whose t = 0 is at ``t0_ns``."""
+        t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) * 1e-9
+        sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
+        return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)
+
+
+class Manifest(FileModel):
+    """What a manifest says. ``path`` and the files of ``checksums`` (sha256) are below the data root, ``rig`` and ``world``
+    below the manifest's folder. ``options`` go to the reader; one whose value is a list makes several logs."""
+
+    title: str
+    reader: str
+    licence: str
+    origin: str
+    path: str | None = None
+    rig: str | None = None
+    world: str | None = None
+    options: Mapping[str, Any] = Field(default_factory=dict)
+    start: StartSettings | None = None
+    checksums: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A manifest, where it stands, and whether the files that it needs are there."""
+
+    name: str
+    file: Path
+    manifest: Manifest
+    available: bool
+
+
+def manifests() -> dict[str, Path]:
+    """The manifests that ship with the project: name -> file, by name."""
+    for folder in manifest_folders():
+        found = {
+            file.stem: file
+            for file in sorted(folder.glob("*.toml"))
+            if not file.name.endswith((".rig.toml", ".world.toml"))
+        }
+        if found:
+            return found
+    return {}
+
+
+def manifest_folders() -> list[Path]:
+    """Where the shipped manifests may be: in a source checkout beside the package, else where an installer puts data."""
+    checkout = Path(factorgraph_loc.__file__).resolve().parent.parent
+    folders = [checkout / "datasets"] if (checkout / "pyproject.toml").is_file() else []
+    user = sysconfig.get_path("data", sysconfig.get_preferred_scheme("user"))
+    return [*folders, Path(sysconfig.get_path("data")) / SHIPPED, Path(user) / SHIPPED]
+
+
+def read_manifest(file: Path) -> Manifest:
+    """Read a manifest; InputError names file, key and what is expected."""
+    return parse_model(Manifest, read_toml(file), file)
+
+
+def describe(name: str, *, data_root: Path | None = None) -> Dataset:
+    """A shipped data set by name; InputError with the nearest name if there is none."""
+    known = manifests()
+    if name not in known:
+        raise InputError(f"there is no data set {name!r}{nearest(name, list(known))}")
+    manifest = read_manifest(known[name])
+    return Dataset(name, known[name], manifest, available(manifest, data_root))
+
+
+def available(manifest: Manifest, data_root: Path | None) -> bool:
+    """Whether the files of a manifest are there."""
+    names = [*manifest.checksums, *([] if manifest.path is None else [manifest.path])]
+    if not names:
+        return True
+    if data_root is None and not os.environ.get(DATA_ROOT):
+        return False
+    root = find_data_root(data_root, manifest.title)
+    return all(inside(root, name, manifest.title).exists() for name in names)
+
+
+def verify(manifest: Manifest, data_root: Path | None = None) -> list[str]:
+    """What is wrong with the files of a manifest, a line each: missing, or another content than the checksum says."""
+    if not manifest.checksums:
+        return []
+    root = find_data_root(data_root, manifest.title)
+    faults = []
+    for name, expected in manifest.checksums.items():
+        file = inside(root, name, manifest.title)
+        if not file.is_file():
+            faults.append(f"{file}: is missing")
+            continue
+        with file.open("rb") as content:
+            if hashlib.file_digest(content, "sha256").hexdigest() != expected:
+                faults.append(f"{file}: is not the file that the manifest describes (its sha256 differs)")
+    return faults
+
+
+def find_data_root(data_root: Path | None, source: object) -> Path:
+    """The folder that holds the data: the argument, else the environment's; InputError if there is none."""
+    if data_root is None:
+        named = os.environ.get(DATA_ROOT)
+        if not named:
+            raise InputError(f"{source}: needs the data folder: give --data-root or set {DATA_ROOT}")
+        data_root = Path(named)
+    if not data_root.is_dir():
+        raise InputError(f"{source}: the data folder {data_root} does not exist")
+    return data_root

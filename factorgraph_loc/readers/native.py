@@ -1,0 +1,230 @@
+"""Our own format: a folder with ``run.toml``, a CSV or Parquet table per sensor, and ``reference.tum``."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_toml
+from factorgraph_loc.log import (
+    BearingRangeStream,
+    IncrementStream,
+    Log,
+    StartPose,
+    Stream,
+    VelocityStream,
+    YawRateStream,
+)
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.manifests import StartSettings
+from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.readers.tables import Table, read_table, write_table
+from factorgraph_loc.rig import Rig, read_rig, write_rig
+from factorgraph_loc.trajectory import Trajectory, read_tum_rows, write_tum
+from factorgraph_loc.world import World, read_world, write_world
+from factors.se2 import Array
+
+RUN_FILE = "run.toml"
+REFERENCE = "reference.tum"
+VELOCITIES = ("t_ns", "v", "w")
+INCREMENTS = ("t_ns", "dx", "dy", "dtheta")
+SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "odometry": (VELOCITIES, INCREMENTS),
+    "imu": (("t_ns", "w"),),
+    "bearing_range": (("t_ns", "landmark", "range", "bearing"),),
+}
+SUFFIXES = (".csv", ".parquet")
+
+
+class Options(FileModel):
+    """The native format has no options."""
+
+
+class RunFile(FileModel):
+    """``run.toml``. ``rig`` and ``world``: a table, or the name of a file below the folder.
+
+    ``has_heading``: whether the heading of the reference means something.
+    """
+
+    name: str | None = None
+    rig: dict[str, Any] | str | None = None
+    world: dict[str, Any] | str | None = None
+    has_heading: bool = True
+    start: StartSettings | None = None
+    metadata: dict[str, str] = Field(default_factory=dict)
+
+
+def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
+    """The log in the folder ``path``; t = 0 at the first stamp of its tables. InputError names file, row and field."""
+    if path is None or not (path / RUN_FILE).is_file():
+        raise InputError(f"{path}: has no {RUN_FILE}, expected a folder in the native format")
+    run_path = path / RUN_FILE
+    run = parse_model(RunFile, read_toml(run_path), run_path)
+    warnings: list[str] = []
+    tables = read_tables(path, warnings)
+    if "odometry" not in tables:
+        raise InputError(f"{path}: has no odometry, which every estimator needs")
+    t0_ns = min(int(table.t_ns.min()) for table in tables.values())
+    streams: dict[str, Stream] = {}
+    for sensor, table in tables.items():
+        streams[sensor] = make_stream(sensor, table, t0_ns, warnings)
+    return Log(
+        name=run.name or path.resolve().name,
+        rig=rig_of(run, run_path),
+        world=world_of(run, run_path),
+        streams=streams,
+        reference=read_reference(path / REFERENCE, t0_ns, run.has_heading, warnings),
+        start=run.start.pose(t0_ns) if run.start else None,
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+        metadata=run.metadata,
+    )
+
+
+def rig_of(run: RunFile, source: Path) -> Rig:
+    if run.rig is None:
+        return DEFAULT_RIG
+    if isinstance(run.rig, str):
+        return read_rig(inside(source.parent, run.rig, source))
+    return parse_model(Rig, run.rig, f"{source} [rig]")
+
+
+def world_of(run: RunFile, source: Path) -> World:
+    if run.world is None:
+        return World()
+    if isinstance(run.world, str):
+        return read_world(inside(source.parent, run.world, source))
+    return parse_model(World, run.world, f"{source} [world]")
+
+
+def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
+    """The tables that hold rows, by sensor. A table of a sensor that this version does not read is a warning."""
+    tables = {}
+    for sensor, shapes in SHAPES.items():
+        files = [folder / f"{sensor}{suffix}" for suffix in SUFFIXES if (folder / f"{sensor}{suffix}").is_file()]
+        if len(files) > 1:
+            raise InputError(f"{folder}: holds both {files[0].name} and {files[1].name}, expected one of them")
+        for file in files:
+            table = read_table(inside(folder, file.name, folder), shapes)
+            if len(table.rows):
+                tables[sensor] = table
+            else:
+                warnings.append(f"{file}: holds no rows")
+    unread = sorted(file.name for file in folder.iterdir() if file.suffix in SUFFIXES and file.stem not in SHAPES)
+    if unread:
+        warnings.append(f"{folder}: this version does not read {', '.join(unread)}")
+    return tables
+
+
+def make_stream(sensor: str, table: Table, t0_ns: int, warnings: list[str]) -> Stream:
+    """A table as a stream; what is wrong in it is an InputError or a line in ``warnings``."""
+    if sensor == "bearing_range":
+        return make_sightings(table, t0_ns, warnings)
+    for field, values in table.numbers.items():
+        checks.require_finite(table.path, table.rows, field, values)
+    keep = checks.in_order(table.path, table.rows, table.t_ns, warnings)
+    t = checks.seconds(table.t_ns[keep], t0_ns)
+    kept = {field: values[keep] for field, values in table.numbers.items()}
+    if sensor == "imu":
+        return YawRateStream(t, kept["w"])
+    if "v" in kept:
+        return VelocityStream(t, kept["v"], kept["w"])
+    return IncrementStream(t, kept["dx"], kept["dy"], kept["dtheta"])
+
+
+def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
+    ranges, bearings = table.numbers["range"], table.numbers["bearing"]
+    nothing = np.flatnonzero(np.isnan(ranges) & np.isnan(bearings))
+    if len(nothing):
+        raise bad_field(table.path, "row", "", "a range, a bearing or both", row=int(table.rows[nothing[0]]))
+    checks.require_above_zero(table.path, table.rows, "range", ranges)
+    turned = np.flatnonzero(np.abs(bearings) > 2.0 * np.pi)
+    if len(turned):
+        i = int(turned[0])
+        raise bad_field(table.path, "bearing", float(bearings[i]), "radians, not degrees", row=int(table.rows[i]))
+    keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, table.names, warnings)
+    t = checks.seconds(table.t_ns[keep], t0_ns)
+    return BearingRangeStream(t, [table.names[i] for i in keep], ranges[keep], bearings[keep])
+
+
+def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
+    if not path.is_file():
+        return None
+    rows, t_ns, poses = read_tum_rows(path)
+    keep = checks.in_order(path, rows, t_ns, warnings)
+    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
+
+
+def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "csv") -> None:
+    """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
+
+    Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
+    written, and of a start's deviations in x and y only the larger one.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        content = temporary / "log"  # its mode is that of any new folder, mkdtemp's own is private
+        content.mkdir()
+        write_files(log, content, format)
+        content.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_files(log: Log, folder: Path, format: str) -> None:
+    base = re.sub(r"[^\w.-]+", "_", log.name).strip(".") or "log"
+    run: dict[str, Any] = {"name": log.name, "rig": f"{base}.rig.toml", "world": f"{base}.world.toml"}
+    write_rig(log.rig, folder / run["rig"])
+    write_world(log.world, folder / run["world"])
+    for sensor, stream in log.streams.items():
+        columns = {"t_ns": absolute(stream.t, log.t0_ns), **columns_of(stream)}
+        write_table(folder / f"{sensor}.{format}", columns)
+    if log.reference is not None:
+        run["has_heading"] = log.reference.has_heading
+        write_tum(log.reference, folder / REFERENCE, log.t0_ns)
+    if log.start is not None:
+        run["start"] = start_table(log.start, log.t0_ns)
+    if log.metadata:
+        run["metadata"] = dict(log.metadata)
+    write_toml(folder / RUN_FILE, run)
+
+
+def absolute(t: Array, t0_ns: int) -> Array:
+    return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
+
+
+def columns_of(stream: Stream) -> Mapping[str, Array | Sequence[str]]:
+    """The columns of a stream beside its stamps."""
+    match stream:
+        case VelocityStream():
+            return {"v": stream.v, "w": stream.w}
+        case IncrementStream():
+            return {"dx": stream.dx, "dy": stream.dy, "dtheta": stream.dtheta}
+        case YawRateStream():
+            return {"w": stream.w}
+        case BearingRangeStream():
+            return {"landmark": list(stream.landmark), "range": stream.range, "bearing": stream.bearing}
+    raise TypeError(f"the native format has no table for {type(stream).__name__}")
+
+
+def start_table(start: StartPose, t0_ns: int) -> dict[str, Any]:
+    x, y, heading = (float(v) for v in start.pose)
+    return {
+        "x": x,
+        "y": y,
+        "heading": heading,
+        "sigma_position": float(max(start.sigmas[:2])),
+        "sigma_heading": float(start.sigmas[2]),
+        "t_ns": round(start.t * 1e9) + t0_ns,
+    }
