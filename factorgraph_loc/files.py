@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -40,7 +40,8 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
+        # a misspelt key is also a missing one: the spelling is what the user can act on
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         key = ".".join(str(part) for part in first["loc"])
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
@@ -54,10 +55,13 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
     """The keys that the model below ``path`` takes; empty where that is not a model."""
-    for part in path:
+    parts = iter(path)
+    for part in parts:
         field = kind.model_fields.get(str(part))
         nested = field.annotation if field is not None else None
-        options = [nested, *getattr(nested, "__args__", ())]
+        if get_origin(nested) is dict:
+            next(parts, None)  # the key within the dict
+        options = [nested, *get_args(nested)]
         models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
         if not models:
             return []

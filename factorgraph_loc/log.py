@@ -23,7 +23,8 @@ class Stream(Protocol):
     Rows stand in the order in which they arrived; a stamp may be a little older than the one before (a late measurement).
     """
 
-    t: Array
+    @property
+    def t(self) -> Array: ...
 
     def measurements(self, offset: float) -> Iterator[Measurement]: ...
 

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import write_text
 from factors import se2
 from factors.se2 import Array
+
+Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -60,10 +63,10 @@ def read_tum(path: Path, t0_ns: int = 0, *, has_heading: bool = True) -> Traject
     if len(stuck):
         i = int(stuck[0])
         raise bad_field(path, "t", f"{t_ns[i]} ns", "a stamp after that of the row before", row=int(rows[i]))
-    return Trajectory((t_ns - t0_ns) * 1e-9, poses, has_heading=has_heading)
+    return Trajectory(np.asarray((t_ns - t0_ns) * 1e-9, dtype=float), poses, has_heading=has_heading)
 
 
-def read_tum_rows(path: Path) -> tuple[Array, Array, Array]:
+def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
     """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds and planar poses (N, 3)."""
     rows: list[int] = []
     stamps: list[int] = []
@@ -96,7 +99,7 @@ def read_tum_rows(path: Path) -> tuple[Array, Array, Array]:
         found = float(length[bad[0]])
         raise bad_field(path, "length of qx qy qz qw", found, "1, a unit quaternion", row=rows[bad[0]])
     heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    return np.array(rows), np.array(stamps, dtype=np.int64), np.column_stack((x, y, heading))
+    return np.array(rows, dtype=np.int64), np.array(stamps, dtype=np.int64), np.column_stack((x, y, heading))
 
 
 def write_tum(trajectory: Trajectory, path: Path, t0_ns: int = 0) -> None:

@@ -2,6 +2,17 @@
 
 from factorgraph_loc.readers.load import load
 from factorgraph_loc.readers.manifests import Dataset, Manifest, describe, manifests, read_manifest, verify
+from factorgraph_loc.readers.native import write_native
 from factorgraph_loc.readers.registry import READERS
 
-__all__ = ["READERS", "Dataset", "Manifest", "describe", "load", "manifests", "read_manifest", "verify"]
+__all__ = [
+    "READERS",
+    "Dataset",
+    "Manifest",
+    "describe",
+    "load",
+    "manifests",
+    "read_manifest",
+    "verify",
+    "write_native",
+]

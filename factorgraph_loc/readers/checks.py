@@ -8,27 +8,28 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import BearingRangeStream, Log
+from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
 MAX_LATE_NS = 500_000_000  # what estimators still put in at its time
 MAX_ODOMETRY_GAP = 5.0  # s
 
 
-def require_finite(source: object, rows: Array, field: str, values: Array) -> None:
+def require_finite(source: object, rows: Integers, field: str, values: Array) -> None:
     """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): their rows in ``source``."""
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise bad_field(source, field, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]))
 
 
-def require_above_zero(source: object, rows: Array, field: str, values: Array) -> None:
+def require_above_zero(source: object, rows: Integers, field: str, values: Array) -> None:
     """InputError at the first of ``values`` (N,) that is not above zero; NaN, not measured, passes."""
     bad = np.flatnonzero(values <= 0.0)
     if len(bad):
         raise bad_field(source, field, float(values[bad[0]]), "more than 0", row=int(rows[bad[0]]))
 
 
-def in_order(source: object, rows: Array, t_ns: Array, warnings: list[str]) -> Array:
+def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
     """Indices (M,) of the rows to keep of a stream that must not go back in time: of equal stamps (N,) the last."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
@@ -42,8 +43,8 @@ def in_order(source: object, rows: Array, t_ns: Array, warnings: list[str]) -> A
 
 
 def sightings_in_order(
-    source: object, rows: Array, t_ns: Array, landmarks: Sequence[str], warnings: list[str]
-) -> Array:
+    source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
+) -> Integers:
     """Indices (M,) of the sightings to keep, in order of arrival: of one landmark at one stamp the last.
 
     A row at most 0.5 s older than the newest before it is late and kept, an older one an InputError.
@@ -63,7 +64,7 @@ def sightings_in_order(
     return np.array(sorted(last.values()), dtype=np.int64)
 
 
-def seconds(t_ns: Array, t0_ns: int) -> Array:
+def seconds(t_ns: Integers, t0_ns: int) -> Array:
     """Stamps (N,) in nanoseconds as seconds after ``t0_ns``."""
     return np.asarray((t_ns - t0_ns) * 1e-9, dtype=float)
 

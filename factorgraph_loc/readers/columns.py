@@ -9,10 +9,11 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.readers import checks
+from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
 
-def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Array]:
+def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
     """The finite numbers (N, K) of a file with K ``fields``, and their rows (N,) as an editor counts lines.
 
     Lines that are blank or begin with ``#`` are passed over. InputError names file, row and field of what is wrong; a file

@@ -15,7 +15,7 @@ from pydantic import Field
 
 import factorgraph_loc
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.files import FileModel, inside, parse_model, read_toml
 from factorgraph_loc.log import StartPose
 
 SHIPPED = Path("share", "factorgraph-loc", "datasets")  # below the data path of an installation
@@ -57,12 +57,14 @@ class Manifest(FileModel):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A manifest, where it stands, and whether the files that it needs are there."""
+    """A shipped data set; ``present``: whether the files that it needs are there."""
 
     name: str
-    file: Path
-    manifest: Manifest
-    available: bool
+    title: str
+    reader: str
+    licence: str
+    origin: str
+    present: bool
 
 
 def manifests() -> dict[str, Path]:
@@ -91,24 +93,23 @@ def read_manifest(file: Path) -> Manifest:
     return parse_model(Manifest, read_toml(file), file)
 
 
-def describe(name: str, *, data_root: Path | None = None) -> Dataset:
-    """A shipped data set by name; InputError with the nearest name if there is none."""
-    known = manifests()
-    if name not in known:
-        raise InputError(f"there is no data set {name!r}{nearest(name, list(known))}")
-    manifest = read_manifest(known[name])
-    return Dataset(name, known[name], manifest, available(manifest, data_root))
+def describe(data_root: Path | None = None) -> list[Dataset]:
+    """What ships with the project, by name; InputError if a data root is named that does not exist."""
+    datasets = []
+    for name, file in manifests().items():
+        m = read_manifest(file)
+        datasets.append(Dataset(name, m.title, m.reader, m.licence, m.origin, is_present(m, file, data_root)))
+    return datasets
 
 
-def available(manifest: Manifest, data_root: Path | None) -> bool:
-    """Whether the files of a manifest are there."""
+def is_present(manifest: Manifest, file: Path, data_root: Path | None) -> bool:
     names = [*manifest.checksums, *([] if manifest.path is None else [manifest.path])]
     if not names:
         return True
     if data_root is None and not os.environ.get(DATA_ROOT):
         return False
-    root = find_data_root(data_root, manifest.title)
-    return all(inside(root, name, manifest.title).exists() for name in names)
+    root = find_data_root(data_root, file)
+    return all(inside(root, name, file).exists() for name in names)
 
 
 def verify(manifest: Manifest, data_root: Path | None = None) -> list[str]:

@@ -17,7 +17,7 @@ from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns
 from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory import Integers, Trajectory
 from factorgraph_loc.world import Landmark, World
 from factors import se2
 from factors.se2 import Array
@@ -65,7 +65,7 @@ def read(path: Path | None, options: Options) -> Log:
     )
 
 
-def nanoseconds(t: Array) -> Array:
+def nanoseconds(t: Array) -> Integers:
     """Stamps (N,) [s] in whole microseconds: the files give milliseconds, and a double near 10^9 s holds no nanoseconds."""
     return np.asarray(np.rint(t * 1e6).astype(np.int64) * 1000)
 

@@ -28,7 +28,7 @@ from factorgraph_loc.readers.manifests import StartSettings
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rig import Rig, read_rig, write_rig
-from factorgraph_loc.trajectory import Trajectory, read_tum_rows, write_tum
+from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.world import World, read_world, write_world
 from factors.se2 import Array
 
@@ -200,7 +200,7 @@ def write_files(log: Log, folder: Path, format: str) -> None:
     write_toml(folder / RUN_FILE, run)
 
 
-def absolute(t: Array, t0_ns: int) -> Array:
+def absolute(t: Array, t0_ns: int) -> Integers:
     return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
 
 

@@ -15,7 +15,7 @@ from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.matlab import read_matlab
 from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory import Integers, Trajectory
 from factorgraph_loc.world import Landmark, World
 from factors import se2
 from factors.se2 import Array
@@ -68,20 +68,20 @@ def shipped(run: int) -> Path:
     import gtsam  # noqa: PLC0415 - heavy, and needed for this only
 
     try:
-        return Path(gtsam.findExampleDataFile(f"Plaza{run}_.mat"))
+        return Path(gtsam.findExampleDataFile(f"Plaza{run}_.mat"))  # type: ignore[no-untyped-call]
     except RuntimeError as error:
         raise InputError(f"Plaza{run}_.mat: is not in the installed gtsam, give the path of the file") from error
 
 
-def rows_of(table: Array) -> Array:
-    return np.arange(1, len(table) + 1)
+def rows_of(table: Array) -> Integers:
+    return np.arange(1, len(table) + 1, dtype=np.int64)
 
 
-def nanoseconds(t: Array) -> Array:
+def nanoseconds(t: Array) -> Integers:
     return np.asarray(np.rint(t * 1e9).astype(np.int64))
 
 
-def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Array]:
+def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Integers]:
     """The rows of a table to keep, and their stamps [ns]."""
     t_ns = nanoseconds(table[:, 0])
     keep = checks.in_order(source, rows_of(table), t_ns, warnings)

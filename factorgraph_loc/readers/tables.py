@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import nearest
+from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
 STAMP = "t_ns"
@@ -28,9 +29,9 @@ class Table:
     """
 
     path: Path
-    rows: Array
+    rows: Integers
     columns: tuple[str, ...]
-    t_ns: Array
+    t_ns: Integers
     numbers: dict[str, Array]
     names: list[str]
 
@@ -43,14 +44,10 @@ def read_table(path: Path, shapes: Sequence[tuple[str, ...]]) -> Table:
     return _read_parquet(path, shapes) if path.suffix == ".parquet" else _read_csv(path, shapes)
 
 
-def write_table(path: Path, columns: dict[str, Array | Sequence[str]]) -> None:
+def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
     """Write columns of equal length to CSV or Parquet, as the suffix says; NaN becomes an empty field. Numbers keep all digits."""
-    frame = pl.DataFrame(
-        {
-            name: pl.Series(name, column).fill_nan(None) if name not in TEXT else pl.Series(name, column)
-            for name, column in columns.items()
-        }
-    )
+    series = [pl.Series(name, column) for name, column in columns.items()]
+    frame = pl.DataFrame([s if s.name in TEXT else s.fill_nan(None) for s in series])
     if path.suffix == ".parquet":
         frame.write_parquet(path)
     else:
@@ -116,7 +113,7 @@ def _decimals(path: Path, rows: Sequence[int], name: str, cells: Sequence[str]) 
     return values
 
 
-def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Array:
+def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Integers:
     stamps = []
     for row, cell in zip(rows, cells, strict=True):
         try:
@@ -144,7 +141,7 @@ def _read_parquet(path: Path, shapes: Sequence[tuple[str, ...]]) -> Table:
     except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(f"{path}: is not a Parquet file that can be read") from error
     shape = _shape(path, frame.columns, shapes)
-    rows = np.arange(1, frame.height + 1)
+    rows = np.arange(1, frame.height + 1, dtype=np.int64)
     if not frame[STAMP].dtype.is_integer():
         raise InputError(f"{path}: {STAMP} is of type {frame[STAMP].dtype}, expected integers, nanoseconds")
     stamps = frame[STAMP].cast(pl.Int64, strict=False)

@@ -14,7 +14,7 @@ from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.matlab import read_matlab
 from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory import Integers, Trajectory
 from factorgraph_loc.world import Landmark, World
 from factors import se2
 from factors.se2 import Array
@@ -39,7 +39,7 @@ def read(path: Path | None, options: Options) -> Log:
     for name in (*SERIES, "r", "b"):
         if len(fields[name]) != count:
             raise InputError(f"{path}: {name} has {len(fields[name])} rows, expected {count} as t has")
-    rows = np.arange(1, count + 1)
+    rows = np.arange(1, count + 1, dtype=np.int64)
     warnings: list[str] = []
     series = {name: fields[name][:, 0] for name in SERIES}
     for name in ("t", "v", "om"):
@@ -73,18 +73,19 @@ def read_landmarks(path: Path, table: Array) -> World:
     )
 
 
-def read_sightings(path: Path, r: Array, b: Array, t: Array, rows: Array, max_range: float) -> BearingRangeStream:
+def read_sightings(path: Path, r: Array, b: Array, t: Array, rows: Integers, max_range: float) -> BearingRangeStream:
     """The landmarks nearer than ``max_range``; ranges ``r`` and bearings ``b`` are (N, 17), and r = 0 is not seen."""
     for name, table in (("r", r), ("b", b)):
         checks.require_finite(path, np.repeat(rows, LANDMARKS), name, table.ravel())
     if np.any(r < 0.0):
         i, j = (int(k) for k in np.argwhere(r < 0.0)[0])
         raise bad_field(path, f"r of landmark {j + 1}", float(r[i, j]), "a range, or 0 if not seen", row=int(rows[i]))
-    i, j = np.nonzero((r > 0.0) & (r < max_range))
-    return BearingRangeStream(t[i], [str(k) for k in (j + 1).tolist()], r[i, j], se2.wrap(b[i, j]))
+    row, column = np.nonzero((r > 0.0) & (r < max_range))
+    names = [str(k + 1) for k in column.tolist()]
+    return BearingRangeStream(t[row], names, r[row, column], se2.wrap(b[row, column]))
 
 
-def read_reference(path: Path, series: dict[str, Array], t: Array, rows: Array, keep: Array) -> Trajectory | None:
+def read_reference(path: Path, series: dict[str, Array], t: Array, rows: Integers, keep: Integers) -> Trajectory | None:
     """The motion capture's poses where it saw the robot: gaps stay gaps."""
     valid = keep[series["true_valid"][keep] > 0]
     if len(valid) == 0:
