@@ -51,6 +51,7 @@ class OdometrySettings(FileModel):
     time_offset: Seconds = 0.0
     scale_distance: Scale = 1.0
     scale_rotation: Scale = 1.0
+    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
     heading_rate_bias: Rate = 0.0
     heading_rate_bias_sigma: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s; above 0 it is estimated")] = 0.0
     direction: Angle = 0.0
@@ -126,6 +127,7 @@ class Rig(FileModel):
         return OdometryModel(
             scale_distance=s.scale_distance,
             scale_rotation=s.scale_rotation,
+            speed_bias=s.speed_bias,
             heading_rate_bias=s.heading_rate_bias,
             direction=s.direction,
             delay=s.delay,

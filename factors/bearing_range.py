@@ -1,13 +1,15 @@
 """Identified landmarks seen as bearing and range, or as range alone (ranging beacons).
 
 A sensor sits on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and
-``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic
-Robotics", 2005, eq. 6.40). The noise is Gaussian in its core with the heavy tails of a Cauchy loss, joint over range and bearing of one landmark.
+``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
+eq. 6.40). The noise is Gaussian in its core with the heavy tails of a Cauchy loss, joint over range and bearing of one landmark.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from factors import se2
@@ -95,6 +97,60 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
     return error
 
 
+def whitened(
+    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
+) -> tuple[Array, Array]:
+    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, 3) by its body-frame perturbation.
+
+    Compiled, as it is the inner loop of every filter and graph; :func:`residuals` and :func:`jacobians` are its plain twins.
+    """
+    error, jacobian = np.zeros((len(points), 2)), np.zeros((len(points), 2, 3))
+    _whitened(
+        pose,
+        model.mounting,
+        (model.range_scale, model.range_sigma, model.range_sigma_relative, model.bearing_bias, model.bearing_sigma),
+        points,
+        ranges,
+        bearings,
+        error,
+        jacobian,
+    )
+    return error, jacobian
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _whitened(
+    pose: Array,
+    mounting: tuple[float, float, float],
+    model: tuple[float, float, float, float, float],
+    points: Array,
+    ranges: Array,
+    bearings: Array,
+    error: Array,
+    jacobian: Array,
+) -> None:
+    range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for k in range(len(points)):
+        dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
+        px, py = c * dx + s * dy, c * dy - s * dx  # in the robot's frame
+        sx, sy = px - mounting[0], py - mounting[1]
+        distance = max(math.hypot(sx, sy), 1e-6)
+        ux, uy = sx / distance, sy / distance
+        if not math.isnan(ranges[k]):
+            weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * ranges[k])
+            error[k, 0] = (range_scale * distance - ranges[k]) * weight
+            weight *= range_scale
+            jacobian[k, 0, 0], jacobian[k, 0, 1] = -ux * weight, -uy * weight
+            jacobian[k, 0, 2] = (ux * py - uy * px) * weight
+        if not math.isnan(bearings[k]):
+            turn = math.atan2(sy, sx) - mounting[2] + bearing_bias - bearings[k]
+            error[k, 1] = (turn - 2.0 * math.pi * math.ceil((turn - math.pi) / (2.0 * math.pi))) / bearing_sigma
+            weight = 1.0 / (distance * bearing_sigma)
+            jacobian[k, 1, 0], jacobian[k, 1, 1] = uy * weight, -ux * weight
+            jacobian[k, 1, 2] = (-uy * py - ux * px) * weight
+
+
 def cauchy_weight(squared: Array, scale: float) -> Array:
     """Weight of a squared whitened residual under the Cauchy loss (Holland and Welsch, 1977)."""
     return 1.0 / (1.0 + np.asarray(squared) / scale**2)
@@ -145,11 +201,7 @@ class BearingRangeFactor:
     def whitened(self, pose: Array) -> tuple[Array, Array]:
         """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, 3), without the robust weight."""
         at = pose if self.offset is None else se2.compose(pose, self.offset)
-        error = residuals(self.model, at, self.points, self.ranges, self.bearings)
-        sigma = sigmas(self.model, self.ranges)
-        jacobian = jacobians(self.model, at, self.points)[0] / sigma[:, :, None]
-        jacobian[:, 0][np.isnan(self.ranges)] = 0.0
-        jacobian[:, 1][np.isnan(self.bearings)] = 0.0
+        error, jacobian = whitened(self.model, at, self.points, self.ranges, self.bearings)
         if self.offset_covariance is not None:
             spread = jacobian @ self.offset_covariance @ np.swapaxes(jacobian, -1, -2) + np.eye(2)
             whitener = np.linalg.inv(np.linalg.cholesky(spread))

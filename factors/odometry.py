@@ -43,15 +43,15 @@ class Growth:
 class OdometryModel:
     """What we believe about wheel odometry (and about the gyro that may replace its rotation).
 
-    ``scale_distance``, ``scale_rotation``: true over reported motion. ``heading_rate_bias`` [rad/s] is added to the true
-    rate in the report, whether the robot moves or not (``gyro_bias`` likewise). ``direction`` [rad]: that of travel, in the
-    robot's frame.
+    ``scale_distance``, ``scale_rotation``: true over reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
+    ``gyro_bias`` [rad/s] are what is reported at rest. ``direction`` [rad]: that of travel, in the robot's frame.
     ``delay`` and ``lag`` [s] belong to commanded velocities. A velocity is held for at most ``max_hold`` seconds; after
     that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
     """
 
     scale_distance: float = 1.0
     scale_rotation: float = 1.0
+    speed_bias: float = 0.0
     heading_rate_bias: float = 0.0
     direction: float = 0.0
     delay: float = 0.0
@@ -148,7 +148,7 @@ class OdometryChain:
     """The odometry of a run so far, as a chain of knots in its own frame.
 
     Rows come in time order, or late (then the knots behind them are computed anew). Beyond the last row its velocity is held.
-    What lies more than ``horizon`` seconds before the newest row is forgotten.
+    What lies more than ``horizon`` seconds before the newest row is forgotten; adding a row older than that returns False.
     """
 
     def __init__(self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0) -> None:
@@ -158,26 +158,22 @@ class OdometryChain:
         self._rows: list[_Row] = []
         self._knots: list[_Knot] = []
         self._times: list[float] = []
+        self._forgotten = False
 
     def __bool__(self) -> bool:
         return bool(self._knots)
 
-    @property
-    def oldest(self) -> float:
-        """The earliest time at which a row can still be put in."""
-        return self._times[0] if self._times else -math.inf
-
-    def add_velocity(self, t: float, v: float, w: float) -> None:
+    def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
-        self._insert(_Row(t + self.model.delay, "velocity", (v, w)))
+        return self._insert(_Row(t + self.model.delay, "velocity", (v, w)))
 
-    def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> None:
+    def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
         """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row."""
-        self._insert(_Row(t, "increment", (dx, dy, dtheta)))
+        return self._insert(_Row(t, "increment", (dx, dy, dtheta)))
 
-    def add_yaw_rate(self, t: float, w: float) -> None:
+    def add_yaw_rate(self, t: float, w: float) -> bool:
         """A gyro's row [rad/s], held from ``t`` until the next; it replaces the rotation that the wheels tell."""
-        self._insert(_Row(t, "gyro", (w,)))
+        return self._insert(_Row(t, "gyro", (w,)))
 
     def state(self, t: float) -> ChainState:
         """The state of the chain at ``t``; before the first kept knot the robot is taken to stand, its motion unknown."""
@@ -197,14 +193,17 @@ class OdometryChain:
         """
         return relative_motion(self.model, start, end)
 
-    def _insert(self, row: _Row) -> None:
+    def _insert(self, row: _Row) -> bool:
+        if self._forgotten and row.t < self._times[0]:
+            return False
         i = bisect.bisect_right(self._times, row.t)
         if i < len(self._rows):
             self._rows.insert(i, row)
             self._rebuild(i)
-            return
-        self._append(row)
-        self._forget()
+        else:
+            self._append(row)
+            self._forget()
+        return True
 
     def _rebuild(self, i: int) -> None:
         rows = self._rows[i:]
@@ -221,7 +220,7 @@ class OdometryChain:
         else:
             knot = previous.after(duration, m.lag, m.max_hold)
             if row.kind == "velocity":
-                speed = m.scale_distance * row.values[0]
+                speed = m.scale_distance * (row.values[0] - m.speed_bias)
                 knot.ux, knot.uy = speed * math.cos(m.direction), speed * math.sin(m.direction)
                 if not self._use_gyro:
                     knot.uw = m.scale_rotation * (row.values[1] - m.heading_rate_bias)
@@ -237,6 +236,7 @@ class OdometryChain:
             return _Knot(row.t)  # the first row: when its motion began is not known
         m = self.model
         rho_x, rho_y, phi = (float(v) for v in se2.log(np.array(row.values)) / duration)
+        rho_x -= m.speed_bias
         c, s = math.cos(m.direction), math.sin(m.direction)
         previous.ux = m.scale_distance * (c * rho_x - s * rho_y)
         previous.uy = m.scale_distance * (s * rho_x + c * rho_y)
@@ -250,6 +250,7 @@ class OdometryChain:
         if self._times[-1] - self._times[0] > 2.0 * self._horizon:
             keep = bisect.bisect_right(self._times, self._times[-1] - self._horizon) - 1
             del self._rows[:keep], self._knots[:keep], self._times[:keep]
+            self._forgotten = True
 
 
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
@@ -269,7 +270,9 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     c, s = math.cos(delta[2]), math.sin(delta[2])
     chord_x, chord_y = c * delta[0] + s * delta[1], -s * delta[0] + c * delta[1]
     nx, ny = -chord_y, chord_x
-    d_along, d_lateral = math.cos(model.direction), math.sin(model.direction)
+    # on the way the robot looked, on average, half the turn back from where it looks at the end
+    travel = model.direction - delta[2] / 2.0
+    d_along, d_lateral = math.cos(travel), math.sin(travel)
     covariance = np.array(
         [
             [

@@ -27,14 +27,15 @@ class Motion:
             self._diagnostics.ignore("yaw rate")
         elif not isinstance(m, YawRate) and not self._use_wheels:
             self._diagnostics.ignore("odometry")
-        elif m.t < self._chain.oldest:
+        elif not self._add(m):
             self._diagnostics.drop_late("odometry")
-        elif isinstance(m, VelocityOdometry):
-            self._chain.add_velocity(m.t, m.v, m.w)
-        elif isinstance(m, IncrementOdometry):
-            self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
-        else:
-            self._chain.add_yaw_rate(m.t, m.w)
+
+    def _add(self, m: Odometry) -> bool:
+        if isinstance(m, VelocityOdometry):
+            return self._chain.add_velocity(m.t, m.v, m.w)
+        if isinstance(m, IncrementOdometry):
+            return self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
+        return self._chain.add_yaw_rate(m.t, m.w)
 
     def state(self, t: float) -> ChainState:
         return self._chain.state(t)

@@ -1,0 +1,185 @@
+"""The landmark sensor: prediction, Jacobians, the compiled twin, agreement with GTSAM's factors."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from factors import se2
+from factors.bearing_range import (
+    BearingRangeFactor,
+    BearingRangeModel,
+    cauchy_loss,
+    cauchy_weight,
+    jacobians,
+    log_likelihood,
+    predict,
+    residuals,
+    sigmas,
+    whitened,
+)
+from factors.graph import custom_factor, jacobian_factor, read_pose
+
+place = st.floats(-8.0, 8.0)
+poses = st.tuples(place, place, st.floats(-3.1, 3.1)).map(np.array)
+points = st.tuples(place, place).map(np.array)
+models = st.builds(
+    BearingRangeModel,
+    mounting=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-3.0, 3.0)),
+    range_scale=st.floats(0.8, 1.2),
+    range_sigma=st.floats(0.05, 0.5),
+    range_sigma_relative=st.floats(0.0, 0.3),
+    bearing_bias=st.floats(-0.2, 0.2),
+    bearing_sigma=st.floats(0.01, 0.2),
+    robust=st.floats(0.5, 5.0),
+)
+
+
+def apart(model, pose, point):
+    """Not at the sensor itself, where bearing has no derivative, nor where it wraps."""
+    distance, bearing = predict(model, pose, point)
+    return distance > 0.3 and abs(bearing) < 3.0
+
+
+def test_prediction_by_hand():
+    model = BearingRangeModel(mounting=(1.0, 0.0, np.pi / 2), range_scale=2.0, bearing_bias=0.1)
+    distance, bearing = predict(model, np.array((0.0, 0.0, np.pi / 2)), np.array((-3.0, 1.0)))
+    assert distance == pytest.approx(6.0)
+    assert bearing == pytest.approx(0.1)
+
+
+@given(models, poses, points)
+def test_jacobians_are_the_numerical_ones(model, pose, point):
+    assume(apart(model, pose, point))
+    by_pose, by_point, by_sensor = jacobians(model, pose, point)
+    step = 1e-6
+
+    def derivative(function, size):
+        columns = []
+        for d in step * np.eye(size):
+            after, before = np.array(function(d)), np.array(function(-d))
+            columns.append(np.array((after[0] - before[0], se2.wrap(after[1] - before[1]))) / (2 * step))
+        return np.column_stack(columns)
+
+    def with_sensor(d):
+        changed = BearingRangeModel(
+            mounting=tuple(np.array(model.mounting) + d[:3]),
+            bearing_bias=model.bearing_bias + d[3],
+            range_scale=model.range_scale + d[4],
+        )
+        return predict(changed, pose, point)
+
+    np.testing.assert_allclose(
+        by_pose, derivative(lambda d: predict(model, se2.compose(pose, se2.exp(d)), point), 3), atol=1e-5
+    )
+    np.testing.assert_allclose(by_point, derivative(lambda d: predict(model, pose, point + d), 2), atol=1e-5)
+    np.testing.assert_allclose(by_sensor, derivative(with_sensor, 5), atol=1e-5)
+
+
+@given(models, poses, st.integers(0, 10_000))
+def test_the_compiled_function_gives_what_its_plain_twins_give(model, pose, seed):
+    rng = np.random.default_rng(seed)
+    seen = rng.uniform(-8.0, 8.0, (4, 2))
+    ranges, bearings = rng.uniform(0.2, 9.0, 4), rng.uniform(-3.1, 3.1, 4)
+    ranges[1] = bearings[2] = np.nan
+    assume(all(apart(model, pose, p) for p in seen))
+    error, jacobian = whitened(model, pose, seen, ranges, bearings)
+    plain = jacobians(model, pose, seen)[0] / sigmas(model, ranges)[:, :, None]
+    plain[1, 0] = plain[2, 1] = 0.0
+    np.testing.assert_allclose(error, residuals(model, pose, seen, ranges, bearings), atol=1e-8)
+    np.testing.assert_allclose(jacobian, plain, rtol=1e-6, atol=1e-6)
+
+
+@given(models, poses, st.integers(0, 10_000), st.booleans())
+def test_jacobian_of_the_factor_is_the_numerical_one(model, pose, seed, displaced):
+    rng = np.random.default_rng(seed)
+    seen = rng.uniform(-8.0, 8.0, (3, 2))
+    offset = np.array((0.1, 0.02, 0.1)) if displaced else None
+    at = pose if offset is None else se2.compose(pose, offset)
+    assume(all(apart(model, at, p) for p in seen))
+    ranges, bearings = predict(model, at, seen)
+    noise = 1e-3 * np.eye(3) if displaced else None
+    # no residual: there the robust weights stand still
+    factor = BearingRangeFactor(model, seen, ranges, bearings, offset, noise)
+    residual, (block,) = factor.linearize([pose])
+    np.testing.assert_allclose(residual, 0.0, atol=1e-9)
+    step = 1e-7
+    for j, d in enumerate(step * np.eye(3)):
+        after = factor.linearize([se2.compose(pose, se2.exp(d))])[0]
+        before = factor.linearize([se2.compose(pose, se2.exp(-d))])[0]
+        np.testing.assert_allclose(block[:, j], (after - before) / (2 * step), rtol=1e-3, atol=1e-3)
+
+
+@given(poses, points)
+def test_residuals_are_those_of_gtsams_factors(pose, point):
+    model = BearingRangeModel(range_sigma=0.3, bearing_sigma=0.05)
+    assume(apart(model, pose, point))
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(*pose))
+    values.insert(1, point)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.05, 0.3)))
+    theirs = gtsam.BearingRangeFactor2D(0, 1, gtsam.Rot2(0.4), 3.0, noise).error(values)
+    error = residuals(model, pose, point[None], np.array([3.0]), np.array([0.4]))
+    assert 0.5 * np.sum(error**2) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
+
+
+@given(poses, points)
+def test_ranges_with_a_mounting_are_those_of_gtsams_factor(pose, point):
+    mounting = (0.3, -0.2, 0.7)
+    model = BearingRangeModel(mounting=mounting, range_sigma=0.3)
+    assume(apart(model, pose, point))
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(*pose))
+    values.insert(1, point)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.3)
+    theirs = gtsam.RangeFactorWithTransform2D(0, 1, 3.0, noise, gtsam.Pose2(*mounting)).error(values)
+    error = residuals(model, pose, point[None], np.array([3.0]), np.array([np.nan]))
+    assert 0.5 * np.sum(error**2) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
+
+
+@given(st.floats(0.0, 100.0), st.floats(0.5, 5.0))
+def test_the_weight_is_the_slope_of_the_loss(squared, scale):
+    step = 1e-5
+    slope = (cauchy_loss(squared + step, scale) - cauchy_loss(max(squared - step, 0.0), scale)) / (
+        squared + step - max(squared - step, 0.0)
+    )
+    assert 2.0 * slope == pytest.approx(float(cauchy_weight(np.array(squared), scale)), rel=1e-3)
+
+
+def test_the_likelihood_of_particles_is_the_cost_of_the_factor():
+    model = BearingRangeModel(mounting=(0.1, 0.0, 0.2))
+    seen, ranges, bearings = np.array(((3.0, 1.0), (-2.0, 4.0))), np.array((3.0, np.nan)), np.array((0.1, 2.0))
+    particles = np.random.default_rng(1).normal(size=(5, 3))
+    factor = BearingRangeFactor(model, seen, ranges, bearings)
+    costs = [factor.cost([p]) for p in particles]
+    np.testing.assert_allclose(log_likelihood(model, particles, seen, ranges, bearings), np.negative(costs), atol=1e-12)
+
+
+def test_a_custom_factor_that_fails_is_silent_and_says_so():
+    factor = BearingRangeFactor(BearingRangeModel(), np.array(((1.0, 2.0),)), np.array((2.0,)), np.array((0.1,)))
+    failures: list[str] = []
+    wrapped = custom_factor(factor, (0,), (read_pose,), (3,), 2, failures.append)
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(np.nan, 0.0, 0.0))
+    assert wrapped.error(values) == 0.0
+    assert failures
+
+
+def test_a_custom_factor_of_wrong_shape_is_refused():
+    factor = BearingRangeFactor(BearingRangeModel(), np.array(((1.0, 2.0),)), np.array((2.0,)), np.array((0.1,)))
+    failures: list[str] = []
+    wrapped = custom_factor(factor, (0,), (read_pose,), (4,), 2, failures.append)
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(0.0, 0.0, 0.0))
+    wrapped.error(values)
+    assert "shapes" in failures[0]
+
+
+def test_custom_and_linear_factor_are_the_same():
+    factor = BearingRangeFactor(BearingRangeModel(), np.array(((1.0, 2.0),)), np.array((2.0,)), np.array((0.1,)))
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(0.1, 0.2, 0.3))
+    theirs = custom_factor(factor, (0,), (read_pose,), (3,), 2, lambda _: None).linearize(values)
+    ours = jacobian_factor(factor, (0,), [np.array((0.1, 0.2, 0.3))])
+    np.testing.assert_allclose(theirs.augmentedJacobian(), ours.augmentedJacobian(), atol=1e-12)

@@ -1,0 +1,168 @@
+"""The motion model: integration, late rows, noise that does not depend on how a path is cut, Jacobians."""
+
+import itertools
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factors import se2
+from factors.graph import read_pose
+from factors.odometry import (
+    Growth,
+    Increment,
+    OdometryChain,
+    OdometryFactor,
+    OdometryModel,
+    between_factor,
+    recalibrated,
+)
+
+NOISY = OdometryModel(
+    along=Growth(0.1, 0.02, 0.01), lateral=Growth(0.03, 0.01, 0.0), heading=Growth(0.05, 0.1, 0.002), direction=0.1
+)
+
+
+def velocities(model, rows, **options):
+    chain = OdometryChain(model, **options)
+    for row in rows:
+        chain.add_velocity(*row)
+    return chain
+
+
+def pose_of(state):
+    return np.array((state.x, state.y, state.heading))
+
+
+def test_a_held_velocity_drives_an_arc():
+    chain = velocities(OdometryModel(), [(0.0, 1.0, 0.5)])
+    np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
+
+
+def test_scales_and_biases_correct_the_report():
+    model = OdometryModel(scale_distance=2.0, scale_rotation=0.5, speed_bias=-0.1, heading_rate_bias=0.2)
+    chain = velocities(model, [(0.0, 0.4, 1.2)])
+    np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
+
+
+def test_increments_with_the_same_biases_go_the_same_way():
+    model = OdometryModel(scale_distance=2.0, scale_rotation=0.5, speed_bias=-0.1, heading_rate_bias=0.2)
+    chain = OdometryChain(model)
+    chain.add_increment(0.0, 0.0, 0.0, 0.0)
+    chain.add_increment(1.0, *se2.exp(np.array((0.4, 0.0, 1.2))))
+    np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
+
+
+def test_delay_and_lag_follow_the_step_response():
+    delay, lag = 0.1, 0.2
+    chain = velocities(OdometryModel(delay=delay, lag=lag), [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0)])
+    t = 1.8
+    expected = (t - 1.0 - delay) - lag * (1.0 - np.exp(-(t - 1.0 - delay) / lag))
+    assert chain.state(t).x == pytest.approx(expected, abs=1e-12)
+
+
+def test_beyond_the_hold_the_motion_is_unknown():
+    chain = velocities(OdometryModel(max_hold=1.0, unknown_distance=0.3), [(0.0, 1.0, 0.0)])
+    start, end = chain.state(0.0), chain.state(61.0)
+    assert end.x == pytest.approx(1.0)
+    assert end.unknown - start.unknown == pytest.approx(60.0)
+    variance = chain.relative(start, end).covariance[0, 0]
+    assert variance == pytest.approx(0.3**2 * 60.0, rel=1e-3)
+
+
+@given(st.permutations(range(6)))
+def test_late_rows_give_what_rows_in_order_give(order):
+    rows = [(0.1 * i, 0.5 + 0.1 * i, 0.3 - 0.2 * i) for i in range(6)]
+    model = OdometryModel(lag=0.15, delay=0.05)
+    shuffled, ordered = velocities(model, [rows[i] for i in order]), velocities(model, rows)
+    np.testing.assert_allclose(pose_of(shuffled.state(0.8)), pose_of(ordered.state(0.8)), atol=1e-12)
+
+
+def test_what_later_rows_correct_is_in_the_next_increment():
+    chain = OdometryChain(OdometryModel())
+    chain.add_increment(0.0, 0.0, 0.0, 0.0)
+    chain.add_increment(0.1, 0.1, 0.0, 0.0)
+    ahead = chain.state(0.15)  # by holding 1 m/s
+    chain.add_increment(0.2, 0.3, 0.0, 0.0)  # but it was 3 m/s
+    assert ahead.x == pytest.approx(0.15)
+    assert chain.relative(ahead, chain.state(0.2)).delta[0] == pytest.approx(0.25)
+
+
+def test_old_rows_are_forgotten_and_recent_ones_kept():
+    chain = velocities(OdometryModel(), [(0.01 * i, 1.0, 0.0) for i in range(5000)], horizon=5.0)
+    assert not chain.add_velocity(30.0, 1.0, 0.0)
+    assert chain.add_velocity(45.5, 1.0, 0.0)
+    assert chain.state(49.0).x == pytest.approx(49.0)
+
+
+def test_gyro_replaces_the_rotation_of_the_wheels():
+    chain = OdometryChain(OdometryModel(gyro_bias=0.1), use_gyro=True)
+    chain.add_velocity(0.0, 1.0, 9.0)
+    chain.add_yaw_rate(0.0, 0.6)
+    np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
+
+
+@given(st.integers(1, 40), st.floats(0.05, 1.0), st.floats(-0.6, 0.6))
+def test_noise_does_not_depend_on_how_a_path_is_cut(pieces, speed, turn_rate):
+    chain = velocities(NOISY, [(0.0, speed, turn_rate)])
+    times = np.linspace(0.0, 1.0, pieces + 1)
+    covariance = np.zeros((3, 3))
+    for start, end in itertools.pairwise(times):
+        step = chain.relative(chain.state(start), chain.state(end))
+        carried = se2.adjoint(se2.inverse(step.delta))
+        covariance = carried @ covariance @ carried.T + step.covariance
+    whole = chain.relative(chain.state(0.0), chain.state(1.0)).covariance
+    # the model of the whole takes the noise as spread evenly over the chord: good to a few percent over a metre
+    np.testing.assert_allclose(covariance, whole, atol=0.05 * np.abs(whole).max())
+
+
+increments = st.tuples(st.floats(-0.5, 1.0), st.floats(-0.2, 0.2), st.floats(-0.8, 0.8)).map(np.array)
+
+
+def random_covariance(seed):
+    root = np.random.default_rng(seed).normal(size=(3, 3)) * 0.1 + 0.2 * np.eye(3)
+    return root @ root.T
+
+
+@given(increments, st.tuples(*[st.floats(-0.2, 0.2)] * 3).map(np.array))
+def test_jacobian_of_the_parameters_is_the_numerical_one(delta, parameters):
+    increment = Increment(delta, np.eye(3), 0.7)
+    _, jacobian = recalibrated(increment, parameters)
+    step = 1e-6
+    numerical = np.column_stack(
+        [
+            se2.log(se2.between(recalibrated(increment, parameters - d)[0], recalibrated(increment, parameters + d)[0]))
+            / (2 * step)
+            for d in step * np.eye(3)
+        ]
+    )
+    np.testing.assert_allclose(jacobian, numerical, atol=1e-7)
+
+
+@given(increments, increments, increments, st.integers(0, 1000))
+def test_jacobians_of_the_factor_are_the_numerical_ones(delta, start, moved, seed):
+    factor = OdometryFactor(Increment(delta, random_covariance(seed), 0.5), (0, 2))
+    values = [start, se2.compose(start, moved), np.array((0.03, -0.1))]
+    _, blocks = factor.linearize(values)
+    step = 1e-6
+    for i, block in enumerate(blocks):
+        for j in range(block.shape[1]):
+            shifted = []
+            for sign in (1.0, -1.0):
+                d = np.zeros(block.shape[1])
+                d[j] = sign * step
+                value = values[i] + d if i == 2 else se2.compose(values[i], se2.exp(d))
+                shifted.append(factor.linearize([*values[:i], value, *values[i + 1 :]])[0])
+            np.testing.assert_allclose(block[:, j], (shifted[0] - shifted[1]) / (2 * step), atol=1e-4)
+
+
+@given(increments, increments, increments, st.integers(0, 1000))
+def test_the_factor_without_parameters_is_gtsams(delta, start, moved, seed):
+    increment = Increment(delta, random_covariance(seed), 0.5)
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2(*start))
+    values.insert(1, gtsam.Pose2(*se2.compose(start, moved)))
+    ours = OdometryFactor(increment).cost([read_pose(values, 0), read_pose(values, 1)])
+    assert ours == pytest.approx(between_factor(0, 1, increment).error(values), rel=1e-6, abs=1e-9)

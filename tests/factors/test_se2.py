@@ -1,0 +1,75 @@
+"""SE(2) on arrays: the group's laws, and agreement with GTSAM's Pose2."""
+
+import gtsam
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factors import se2
+
+coordinate = st.floats(-50.0, 50.0)
+angle = st.floats(-3.1, 3.1)
+poses = st.tuples(coordinate, coordinate, angle).map(np.array)
+twists = st.tuples(coordinate, coordinate, st.one_of(angle, st.floats(-1e-6, 1e-6))).map(np.array)
+
+
+def as_array(pose: gtsam.Pose2) -> np.ndarray:
+    return np.array((pose.x(), pose.y(), pose.theta()))
+
+
+@given(poses, poses)
+def test_compose_and_between_are_those_of_gtsam(a, b):
+    first, second = gtsam.Pose2(*a), gtsam.Pose2(*b)
+    np.testing.assert_allclose(se2.compose(a, b)[:2], as_array(first.compose(second))[:2], atol=1e-9)
+    np.testing.assert_allclose(se2.between(a, b)[:2], as_array(first.between(second))[:2], atol=1e-9)
+    np.testing.assert_allclose(se2.adjoint(a), first.AdjointMap(), atol=1e-12)
+
+
+@given(poses)
+def test_inverse_undoes(a):
+    np.testing.assert_allclose(se2.compose(a, se2.inverse(a)), np.zeros(3), atol=1e-9)
+
+
+@given(twists)
+def test_log_undoes_exp(xi):
+    np.testing.assert_allclose(se2.log(se2.exp(xi)), xi, atol=1e-6)
+
+
+@given(twists)
+def test_exp_is_that_of_gtsam(xi):
+    # the two switch to their series at different angles, where each is good to about 1e-8 of the length
+    np.testing.assert_allclose(se2.exp(xi)[:2], as_array(gtsam.Pose2.Expmap(xi))[:2], atol=2e-6)
+
+
+@given(st.lists(st.tuples(poses, poses), min_size=1, max_size=5))
+def test_arrays_give_what_single_poses_give(pairs):
+    a, b = np.array([p for p, _ in pairs]), np.array([q for _, q in pairs])
+    for function in (se2.compose, se2.between):
+        np.testing.assert_allclose(function(a, b), [function(p, q) for p, q in pairs], atol=1e-9)
+    for function in (se2.inverse, se2.exp, se2.log):
+        np.testing.assert_allclose(function(a), [function(p) for p, _ in pairs], atol=1e-9)
+
+
+@given(st.floats(-1e3, 1e3))
+def test_wrap_stays_in_its_interval_and_keeps_the_direction(value):
+    wrapped = float(se2.wrap(np.array(value)))
+    assert -np.pi < wrapped <= np.pi
+    assert np.cos(wrapped - value) > 1.0 - 1e-9
+    assert se2.wrap_scalar(value) == wrapped
+
+
+@given(st.tuples(st.floats(-5, 5), st.floats(-5, 5), angle).map(np.array))
+def test_right_jacobian_is_the_numerical_one(xi):
+    step = 1e-6
+    numerical = np.column_stack(
+        [se2.log(se2.between(se2.exp(xi - d), se2.exp(xi + d))) / (2 * step) for d in step * np.eye(3)]
+    )
+    np.testing.assert_allclose(se2.right_jacobian(xi), numerical, atol=1e-6)
+
+
+@given(poses)
+def test_covariance_to_the_world_and_back(pose):
+    covariance = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]])
+    there = se2.body_to_world(pose, covariance)
+    np.testing.assert_allclose(se2.world_to_body(pose, there), covariance, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.eigvalsh(there), np.linalg.eigvalsh(covariance), atol=1e-12)
