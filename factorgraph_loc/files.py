@@ -35,6 +35,17 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is not TOML: {error}") from error
 
 
+def read_text(path: Path) -> str:
+    """The content of a text file, its line ends as they are; InputError if it is missing or not UTF-8."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8") from error
+
+
 def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
     """``content`` as a model of ``kind``; InputError names ``source``, the key, the value and what is expected."""
     try:

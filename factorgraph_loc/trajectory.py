@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import write_text
+from factorgraph_loc.files import read_text, write_text
 from factors import se2
 from factors.se2 import Array
 
@@ -63,7 +63,7 @@ def read_tum(path: Path, t0_ns: int = 0, *, has_heading: bool = True) -> Traject
     if len(stuck):
         i = int(stuck[0])
         raise bad_field(path, "t", f"{t_ns[i]} ns", "a stamp after that of the row before", row=int(rows[i]))
-    return Trajectory(np.asarray((t_ns - t0_ns) * 1e-9, dtype=float), poses, has_heading=has_heading)
+    return Trajectory(np.asarray((t_ns - t0_ns) / 1e9, dtype=float), poses, has_heading=has_heading)
 
 
 def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
@@ -71,10 +71,7 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
     rows: list[int] = []
     stamps: list[int] = []
     values: list[list[float]] = []
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+    lines = read_text(path).split("\n")
     for row, line in enumerate(lines, start=1):
         parts = line.split()
         if not parts or parts[0].startswith("#"):

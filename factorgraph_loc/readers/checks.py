@@ -66,7 +66,7 @@ def sightings_in_order(
 
 def seconds(t_ns: Integers, t0_ns: int) -> Array:
     """Stamps (N,) in nanoseconds as seconds after ``t0_ns``."""
-    return np.asarray((t_ns - t0_ns) * 1e-9, dtype=float)
+    return np.asarray((t_ns - t0_ns) / 1e9, dtype=float)
 
 
 def look_over(log: Log) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import read_text
 from factorgraph_loc.readers import checks
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
@@ -19,10 +20,7 @@ def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
     Lines that are blank or begin with ``#`` are passed over. InputError names file, row and field of what is wrong; a file
     without anything in it, not even a comment, is wrong.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+    text = read_text(path)
     if not text.strip():
         raise InputError(f"{path}: is empty, expected rows of {', '.join(fields)}")
     numbered = [

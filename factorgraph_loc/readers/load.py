@@ -52,8 +52,11 @@ def load(
     """
     given = dict(options or {})
     source = _find(log, data_root, reader)
-    merged = {**source.options, **given}
-    choices = {key: _choices(value) for key, value in merged.items()}
+    choices = {key: _choices(value) for key, value in source.options.items()}
+    # the command line gives a list as text with commas
+    choices |= {key: _choices(value.split(",") if isinstance(value, str) else value) for key, value in given.items()}
+    if empty := [key for key, values in choices.items() if not values]:
+        raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
     naming = [key for key, value in choices.items() if key in given or len(value) > 1]
     replaced = replace(
         source,
@@ -67,9 +70,7 @@ def load(
 
 
 def _choices(value: Any) -> list[Any]:
-    """The values of an option: those of a list, or of the command line's text with commas."""
-    if isinstance(value, str):
-        return [part.strip() for part in value.split(",")]
+    """The values of an option, of which there may be a list."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
@@ -79,7 +80,7 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
         readers.reader(reader)  # a wrong name of a reader is told before a wrong path
         if not path.exists():
             raise InputError(f"{log}: does not exist")
-        return _Source(reader, path, None if reader == "native" else path.resolve().stem)
+        return _Source(reader, path, None if reader == "native" else _name(path))
     if path.is_dir() and (path / RUN_FILE).is_file():
         return _Source("native", path)
     if path.is_file():
@@ -94,6 +95,10 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
     if path.is_dir():
         raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
+
+
+def _name(path: Path) -> str:
+    return path.resolve().stem if path.is_file() else path.resolve().name
 
 
 def _from_manifest(file: Path, data_root: Path | None) -> _Source:

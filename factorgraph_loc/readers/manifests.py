@@ -34,7 +34,7 @@ class StartSettings(FileModel):
 
     def pose(self, t0_ns: int) -> StartPose:
         """As a start in a log whose t = 0 is at ``t0_ns``."""
-        t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) * 1e-9
+        t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) / 1e9
         sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
         return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)
 

@@ -158,7 +158,7 @@ def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRang
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
     if not path.is_file():
         return None
-    rows, t_ns, poses = read_tum_rows(path)
+    rows, t_ns, poses = read_tum_rows(inside(path.parent, path.name, path.parent))
     keep = checks.in_order(path, rows, t_ns, warnings)
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
 

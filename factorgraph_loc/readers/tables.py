@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import nearest
+from factorgraph_loc.files import nearest, read_text
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
@@ -72,24 +73,20 @@ def _shape(path: Path, header: Sequence[str], shapes: Sequence[tuple[str, ...]])
 def _read_csv(path: Path, shapes: Sequence[tuple[str, ...]]) -> Table:
     rows: list[int] = []
     cells: list[list[str]] = []
+    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
-            header = [name.strip() for name in next(reader, [])]
-            if not any(header):
-                raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
-            shape = _shape(path, header, shapes)
-            for parts in reader:
-                if not parts:
-                    continue
-                if len(parts) != len(header):
-                    raise bad_field(
-                        path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=reader.line_num
-                    )
-                rows.append(reader.line_num)
-                cells.append(parts)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+        header = [name.strip() for name in next(reader, [])]
+        if not any(header):
+            raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
+        shape = _shape(path, header, shapes)
+        for parts in reader:
+            if len(parts) <= 1 and not "".join(parts).strip():
+                continue
+            if len(parts) != len(header):
+                expected = f"{len(header)} values: {','.join(header)}"
+                raise bad_field(path, "row", ",".join(parts), expected, row=reader.line_num)
+            rows.append(reader.line_num)
+            cells.append(parts)
     except csv.Error as error:
         raise InputError(f"{path}:{reader.line_num}: is not CSV: {error}") from error
     columns = dict(zip(header, zip(*cells, strict=True), strict=True)) if cells else dict.fromkeys(header, ())
