@@ -1,12 +1,20 @@
-"""The exceptions that a user can cause. The command line prints them in one line and exits with code 2."""
+"""The exceptions that a user can cause. The command line prints them in one line and exits with their code."""
 
 
 class FglocError(Exception):
     """Base of all errors that are reported to the user as one line."""
 
+    exit_code = 2
+
 
 class InputError(FglocError):
     """Something in a file, an option or an argument is not as expected."""
+
+
+class RunFailedError(FglocError):
+    """The input is in order, but the run gave no usable result."""
+
+    exit_code = 1
 
 
 def bad_field(file: object, field: str, value: object, expected: str, *, row: int | None = None) -> InputError:

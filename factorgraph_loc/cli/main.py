@@ -16,7 +16,7 @@ DEBUG = "--debug"
 
 
 class Commands(TyperGroup):
-    """The one place where an error that a user can cause becomes a line on stderr and exit code 2."""
+    """The one place where an error that a user can cause becomes a line on stderr and an exit code."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """``--debug`` is taken wherever it stands on the line."""
@@ -31,7 +31,7 @@ class Commands(TyperGroup):
             if ctx.params.get("debug"):
                 raise
             typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-            raise typer.Exit(2) from error
+            raise typer.Exit(error.exit_code) from error
 
 
 app = typer.Typer(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
@@ -28,7 +28,7 @@ from factorgraph_loc.cli.options import (
     parse_settings,
 )
 
-# column of the table: figure of the scores, digits
+# of the table of one run; column: figure of the scores, digits
 COLUMNS = {
     "position RMSE [m]": ("position_rmse", 3),
     "95 % [m]": ("position_p95", 3),
@@ -36,7 +36,6 @@ COLUMNS = {
     "heading RMSE [rad]": ("heading_rmse", 4),
     "ANEES": ("anees", 2),
 }
-COMPARED = {"position [m]": ("position_rmse", 3), "heading [rad]": ("heading_rmse", 4), "ANEES": ("anees", 2)}
 
 
 def run(
@@ -58,13 +57,15 @@ def run(
     """Run one estimator on one log; write trajectories, estimates and scores."""
     from factorgraph_loc.estimators.registry import check_names
     from factorgraph_loc.experiments import run as experiment
-    from factorgraph_loc.experiments.output import write_run
+    from factorgraph_loc.experiments.output import check_free, write_run
 
     check_names([estimator])
+    check_free(out, overwrite=overwrite)  # now, not when all is computed
     settings = parse_settings(set_ or (), [estimator])[estimator]
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     config = experiment.RunConfig(estimator, settings, parse_list(sensors) if sensors else None, prior, seed)
-    result = experiment.run(loaded, config)
+    with show.progress(estimator, counted=False) as report:
+        result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
     for warning in result.warnings:
         show.note(f"warning: {warning}")
@@ -94,44 +95,31 @@ def compare(
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
     from factorgraph_loc.estimators.registry import check_names
+    from factorgraph_loc.evaluation.tables import comparison_table, verdict
     from factorgraph_loc.experiments import compare as experiment
     from factorgraph_loc.experiments.run import RunConfig
 
     names = parse_list(estimators)
     check_names(names)
+    experiment.check_free(out, overwrite=overwrite)  # now, not when all logs are read
     settings = parse_settings(set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
     used = parse_list(sensors) if sensors else None
     configs = [RunConfig(name, settings[name], used, prior, seed) for name in names for seed in chosen]
-    with show.progress("runs") as report:
+    with show.progress("runs", counted=True) as report:
         comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
     for failure in comparison.failures:
         show.note(f"failed: {failure}")
     if json:
         show.document({"runs": comparison.rows, "failures": comparison.failures})
     else:
-        _print_rows(comparison.rows)
-        typer.echo(f"\ntable and plots are in {out}")
+        show.rich_table(comparison_table(comparison.rows))
+        for line in verdict(comparison.rows):
+            typer.echo(line)
+        typer.echo(f"\nresults are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/, runs/")
     if comparison.failures:
         raise typer.Exit(1)
-
-
-def _print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
-    """One line a run, causal and final side by side."""
-    pairs = [(kind, *column) for kind in ("causal", "final") for column in COMPARED.values()]
-    header = ("log", "estimator", "seed", *(f"{kind} {name}" for kind in ("causal", "final") for name in COMPARED))
-    lines = [
-        (
-            str(row["log"]),
-            str(row["estimator"]),
-            str(row["seed"]),
-            *(show.number(row[f"{kind}.{figure}"], digits) for kind, figure, digits in pairs),
-            show.number(row["timing.update_ms_median"], 2),
-        )
-        for row in rows
-    ]
-    show.table((*header, "update [ms]"), lines)
 
 
 def _print_scores(scores: Mapping[str, Any]) -> None:
@@ -150,5 +138,11 @@ def _print_scores(scores: Mapping[str, Any]) -> None:
                 )
     counts = ", ".join(f"{scores[f'{kind}.total']} {kind}" for kind in ("ignored", "rejected", "late"))
     typer.echo(f"measurements: {counts}")
-    median, factor = (show.number(scores[f"timing.{name}"], 2) for name in ("update_ms_median", "real_time_factor"))
-    typer.echo(f"time: {median} ms per update (median), {factor} times real time")
+    final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
+    if scores["time_to_localized"] is None:  # it only collected what came
+        typer.echo(f"time: {final}")
+        return
+    median, factor = (
+        show.number(scores[f"timing.{name}"], n) for name, n in (("update_ms_median", 2), ("real_time_factor", 0))
+    )
+    typer.echo(f"time: {median} ms per update (median), {factor} times real time, {final}")

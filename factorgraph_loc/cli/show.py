@@ -8,9 +8,12 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 def note(text: str) -> None:
@@ -25,7 +28,6 @@ def document(content: Any) -> None:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A table on stdout: the first column to the left, numbers to the right."""
-    from rich.console import Console
     from rich.table import Table
 
     out = Table(box=None, pad_edge=False, header_style="bold")
@@ -34,18 +36,38 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         out.add_column(name, justify="right" if numeric else "left", overflow="fold", no_wrap=i == 0)
     for row in rows:
         out.add_row(*row)
+    rich_table(out)
+
+
+def rich_table(content: Table) -> None:
+    """A table of rich's on stdout. In a narrow terminal its cells are folded, but never cut off."""
+    from rich.console import Console
+
+    console = Console(markup=False, highlight=False)
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1000
-    Console(width=width, markup=False, highlight=False).print(out)
+    console.width = max(width, console.measure(content).minimum)
+    console.print(content)
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on stderr while the block lasts, to be told how many are done of how many; silent where stderr is no terminal."""
+def progress(what: str, *, counted: bool) -> Iterator[Callable[[float, float], None]]:
+    """A bar on stderr while the block lasts, to be told how much is done of how much; silent where stderr is no terminal.
+
+    ``counted``: these are numbers of things, shown as such; else a percentage is shown.
+    """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    amount = MofNCompleteColumn() if counted else TaskProgressColumn()
+    columns = (TextColumn(what), BarColumn(), amount, TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -24,6 +24,7 @@ COLUMNS = {
     "x real time": ("timing.real_time_factor", 0, False),
 }
 ALL = "(all logs)"
+BASELINE = "dead_reckoning"
 
 Row = Mapping[str, Any]
 
@@ -66,6 +67,33 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     for line, after in zip(lines, [*lines[1:], None], strict=True):
         table.add_row(*line, end_section=after is None or after[0] != line[0])
     return table
+
+
+def verdict(rows: Sequence[Row]) -> list[str]:
+    """In words: the estimator with the least position error, causal and final, beside dead reckoning where that ran.
+
+    Pooled over logs and seeds. An estimator of which a run failed, or has no such score, is out: it cannot be compared.
+    """
+    logs = list(dict.fromkeys(row["log"] for row in rows))
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    lines = []
+    for kind in ("causal", "final"):
+        found: dict[str, float] = {}
+        for name in names:
+            scores = {
+                log: [r.get(f"{kind}.position_rmse") for r in rows if (r["log"], r["estimator"]) == (log, name)]
+                for log in logs
+            }
+            known = [[v for v in values if v is not None] for values in scores.values()]
+            if all(known) and sum(map(len, known)) == sum(map(len, scores.values())):
+                found[name] = pooled_rms([pooled_rms(values) for values in known])
+        if found:
+            best = min(found, key=found.__getitem__)
+            line = f"least {kind} position error: {best}, {found[best]:.3f} m"
+            if BASELINE in found and best != BASELINE:
+                line += f" ({BASELINE}: {found[BASELINE]:.3f} m)"
+            lines.append(line)
+    return lines
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

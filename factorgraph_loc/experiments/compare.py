@@ -19,13 +19,15 @@ from factorgraph_loc.evaluation.plots import Track, plot_log
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import comparison_cells, markdown
 from factorgraph_loc.experiments.output import FILES, remove_run, write_run
+from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.processes import run_each
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.files import replacing, write_text
+from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
 
 _ERROR = "error.txt"
 _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
+_PLOTS = ("*-trajectories.png", "*-update-time.png", "*-error-distribution.png", "*-errors-*.png")
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ def compare(
     ``progress`` is given the number of runs done and of all.
 
     Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
-    estimator and seed, bad settings, or an ``out`` that holds results while ``overwrite`` is off.
+    estimator and seed, bad settings, a prior that is none, a sensor that no log has, or an ``out`` that holds results while
+    ``overwrite`` is off.
     """
     configs = _without_needless_seeds(configs)
     _check(logs, configs)
@@ -124,8 +127,13 @@ def _is_deterministic(estimator: str) -> bool:
 def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
     if not logs or not configs:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
+    streams = list(dict.fromkeys(name for log in logs for name in log.streams))
     for config in configs:
         registry.settings_of(config.estimator, config.settings)
+        check_prior(config.prior)
+        for sensor in config.sensors or ():
+            if sensor not in streams:
+                raise InputError(f"no log has a sensor {sensor!r}{nearest(sensor, streams)}")
     names = [file_name(log.name) for log in logs]
     for log, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
@@ -136,21 +144,33 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
             raise InputError(f"{estimator} with seed {seed} is given twice")
 
 
-def _prepare(out: Path, overwrite: bool) -> None:
-    """Refuse what may not be replaced, remove what may: only files that an earlier comparison wrote."""
+def check_free(out: Path, *, overwrite: bool) -> None:
+    """InputError if ``out`` is no folder, or holds results that may not be replaced."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
-    runs = sorted(out.glob("runs/*/*/seed*"))
-    held = [name for name in (*_TABLES, *FILES) if (out / name).exists()] + [str(run.relative_to(out)) for run in runs]
+    held = [name for name in (*_TABLES, *FILES) if (out / name).exists()]
+    held += [str(run.relative_to(out)) for run in _runs(out)]
     if held and not overwrite:
         raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+
+
+def _runs(out: Path) -> list[Path]:
+    return sorted(out.glob("runs/*/*/seed*"))
+
+
+def _prepare(out: Path, overwrite: bool) -> None:
+    """Refuse what may not be replaced, remove what may: only files that an earlier comparison wrote."""
+    check_free(out, overwrite=overwrite)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     for name in _TABLES:
         (out / name).unlink(missing_ok=True)
-    for folder in runs:
+    for pattern in _PLOTS:
+        for plot in out.glob(f"plots/{pattern}"):
+            plot.unlink()
+    for folder in _runs(out):
         remove_run(folder)
         (folder / _ERROR).unlink(missing_ok=True)
 

@@ -40,6 +40,12 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     return PosePrior(first_odometry(log), pose, _covariance(HEADING_SIGMA)), prior
 
 
+def check_prior(prior: str | None) -> None:
+    """InputError if ``prior`` is none of what :func:`resolve_prior` takes; what a log has is not looked at."""
+    if prior not in (None, "unknown", "log", "reference"):
+        _parse(prior)
+
+
 def first_odometry(log: Log) -> float:
     """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
     stream = log.streams.get("odometry")

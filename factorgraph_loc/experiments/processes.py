@@ -8,14 +8,14 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_compl
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from factorgraph_loc.errors import FglocError
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.threads import use_one_thread
 
 Job = TypeVar("Job")
 Value = TypeVar("Value")
 
 
-class ProcessDiedError(FglocError):
+class ProcessDiedError(RunFailedError):
     """A process ended without a result: killed, out of memory, or a crash in native code."""
 
 

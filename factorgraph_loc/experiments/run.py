@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc import __version__
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior
 from factorgraph_loc.evaluation.result import RunResult, Timings
@@ -53,7 +53,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
     its velocity holds on; other measurements older than the prior are counted as ignored. ``progress`` is given the share done.
 
-    Raises InputError if the configuration does not fit the log, FglocError if the estimator gives a pose that is not finite.
+    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
     Whatever the estimator itself raises is passed on.
     """
     sensors = _sensors(log, config.sensors)
@@ -72,7 +72,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     final = estimator.trajectory()
     final_seconds = perf_counter() - started
     if not np.all(np.isfinite(final.poses)):
-        raise FglocError(f"{config.estimator} on {log.name}: the final trajectory holds poses that are not finite")
+        raise RunFailedError(f"{config.estimator} on {log.name}: the final trajectory holds poses that are not finite")
 
     versions = _versions()
     effective = {
@@ -194,7 +194,7 @@ class _Loop:
         e = self._estimator.estimate()
         if e.status != "unlocalized" and not np.all(np.isfinite(e.pose)):
             name = type(self._estimator).__name__
-            raise FglocError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")
+            raise RunFailedError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")
         # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status)

@@ -51,6 +51,12 @@ def test_compare_checks_names_and_seeds_before_it_runs(fgloc, short_log, tmp_pat
     out = tmp_path / "out"
     assert_refused(fgloc("compare", short_log, "-e", "ekf,smother", "-o", out), "'smother'", "did you mean smoother?")
     assert_refused(fgloc("compare", short_log, "-e", "ekf", "-o", out, "--seeds", "5:5"), "--seeds", "'5:5'")
+    for option, text, named in (
+        ("--prior", "1,2", "'1,2'"),
+        ("--sensors", "odometri", "did you mean odometry?"),
+        ("--set", "ekf.max_dely=1", "did you mean max_delay?"),
+    ):
+        assert_refused(fgloc("compare", short_log, "-e", "ekf", "-o", out, option, text), named)
     assert not out.exists()
 
 

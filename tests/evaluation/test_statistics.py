@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.statistics import differences, pooled_rms
-from factorgraph_loc.evaluation.tables import ALL, comparison_cells, comparison_table, markdown
+from factorgraph_loc.evaluation.tables import ALL, comparison_cells, comparison_table, markdown, verdict
 
 METRIC = "causal.position_rmse"
 
@@ -104,6 +104,14 @@ def test_times_of_an_offline_estimator_are_not_shown():
     rows[0]["time_to_localized"] = None
     _, (line,) = comparison_cells(rows)
     assert line[header.index("x real time")] == "-"
+
+
+def test_verdict_names_the_best_that_can_be_compared():
+    rows = rows_of({(log, name, 0): value for log in ("one", "two") for name, value in (("a", 0.4), ("b", 0.2))})
+    rows += rows_of({("one", "c", 0): 0.1, ("one", "dead_reckoning", 0): 3.0, ("two", "dead_reckoning", 0): 4.0})
+    lines = verdict(rows)
+    assert f"least {METRIC.split('.')[0]} position error: b, 0.200 m (dead_reckoning: 3.536 m)" in lines
+    assert verdict(rows_of({("one", "a", 0): None})) == []
 
 
 def test_table_as_markdown_and_for_the_terminal():

@@ -48,11 +48,14 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     with pytest.raises(InputError, match="holds results already"):
         compare([log], configs[:1], out)
     (out / "notes.txt").write_text("mine")
+    (out / "plots/mine.png").write_text("mine")
     compare([log], configs[:1], out, overwrite=True)
     assert len(pl.read_csv(out / "results.csv")) == 1
     assert pl.read_csv(out / "differences.csv").is_empty()
     assert not list((out / "runs/straight/particle_filter").rglob("metrics.json"))
     assert (out / "notes.txt").is_file()
+    assert (out / "plots/mine.png").is_file()
+    assert [path.name for path in (out / "plots").glob("*-errors-*")] == ["straight-errors-dead_reckoning.png"]
 
 
 def test_an_unforeseen_error_leaves_its_traceback(log, tmp_path):
@@ -71,6 +74,8 @@ def test_bad_input_is_found_before_anything_runs(log, tmp_path):
         ([log], [config, RunConfig("dead_reckoning", {"max_delay": 0.1})], "given twice"),
         ([log], [RunConfig("dead_reckoning", {"max_dely": 0.1})], "did you mean max_delay"),
         ([log], [RunConfig("smother")], "did you mean smoother"),
+        ([log], [RunConfig("ekf", prior="1,2")], "prior is '1,2'"),
+        ([log], [RunConfig("ekf", sensors=("odometri",))], "did you mean odometry"),
     ):
         with pytest.raises(InputError, match=message):
             compare(logs, configs, tmp_path / "out")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import BearingRangeStream, StartPose, VelocityStream
@@ -92,7 +92,7 @@ def test_progress_ends_at_one(log):
 
 
 def test_a_pose_that_is_not_finite_is_an_error(log):
-    with pytest.raises(FglocError, match=r"straight: the estimate at 1\.000 s is not finite"):
+    with pytest.raises(RunFailedError, match=r"straight: the estimate at 1\.000 s is not finite"):
         run(log, RunConfig("fake", {"broken_at": 0.95}))
 
 
