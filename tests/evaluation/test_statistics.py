@@ -110,7 +110,7 @@ def test_verdict_names_the_best_that_can_be_compared():
     rows = rows_of({(log, name, 0): value for log in ("one", "two") for name, value in (("a", 0.4), ("b", 0.2))})
     rows += rows_of({("one", "c", 0): 0.1, ("one", "dead_reckoning", 0): 3.0, ("two", "dead_reckoning", 0): 4.0})
     lines = verdict(rows)
-    assert f"least {METRIC.split('.')[0]} position error: b, 0.200 m (dead_reckoning: 3.536 m)" in lines
+    assert f"least {METRIC.partition('.')[0]} position error: b, 0.200 m (dead_reckoning: 3.536 m)" in lines
     assert verdict(rows_of({("one", "a", 0): None})) == []
 
 
