@@ -6,11 +6,14 @@ The kernel is compiled: in numpy it takes ten times as long, and most of a parti
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.se2 import Array
 
+Indices = NDArray[np.int64]
 
-def draw_ancestors(predicted: Array, log_weights: Array, after: Array, covariance: Array, uniform: Array) -> Array:
+
+def draw_ancestors(predicted: Array, log_weights: Array, after: Array, covariance: Array, uniform: Array) -> Indices:
     """One index (M,) into the N particles for each later pose.
 
     ``predicted`` (N, 3): the particles moved without noise; ``log_weights`` (N,); ``after`` (M, 3): the later poses;
@@ -35,8 +38,8 @@ def transition_log_density(predicted: Array, after: Array, covariance: Array) ->
     return np.asarray(-0.5 * np.sum(error**2, axis=-1))
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _draw(predicted: Array, log_weights: Array, after: Array, whitener: Array, uniform: Array) -> Array:
+@numba.njit(cache=True)
+def _draw(predicted: Array, log_weights: Array, after: Array, whitener: Array, uniform: Array) -> Indices:
     count = len(predicted)
     cosine, sine = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
     density = np.empty(count)

@@ -1,8 +1,8 @@
 """The offline optimum: the whole log in one robust least-squares problem, solved when all is known.
 
 While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
-are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins wide and narrows to its
-own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Cauchy loss).
+are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins
+wide and narrows to its own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Cauchy loss).
 """
 
 from __future__ import annotations
@@ -14,15 +14,13 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.estimators.base import PoseEstimate
-from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
+from factorgraph_loc.estimators.keyframes import ITERATIONS_OF_GUESS, GraphEstimator, GraphSettings, Keyframe
 from factorgraph_loc.estimators.landmarks import robust_update
-from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range import BearingRangeFactor
 from factors.se2 import Array
-
 
 ITERATIONS_PER_WIDTH = 5
 
@@ -62,22 +60,15 @@ class Batch(GraphEstimator):
         covariances, self._parameter_covariance = problem.covariances(best.poses, best.parameters)
         return self._between(best.poses, covariances)
 
-    def _begin(self, first: Keyframe) -> None:  # noqa: ARG002
+    def _begin(self, first: Keyframe) -> None:
         self._guesses.append(self._pose)
 
-    def _extend(self, keyframe: Keyframe, guess: Array) -> None:
-        assert keyframe.from_previous is not None
-        self._pose = se2.compose(self._pose, keyframe.from_previous.delta)
-        self._covariance = propagate(self._covariance, keyframe.from_previous)
-        for factor in keyframe.factors:
-            self._update_guess(factor)
-        self._guesses.append(self._pose)
+    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
+        self._pose, self._covariance = guess, spread
+        self._guesses.append(guess)
 
     def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
         if keyframe.index == len(self._guesses) - 1:
-            self._update_guess(factor)
+            delta, self._covariance, _ = robust_update(factor, self._pose, self._covariance, ITERATIONS_OF_GUESS)
+            self._pose = se2.compose(self._pose, se2.exp(delta))
             self._guesses[-1] = self._pose
-
-    def _update_guess(self, factor: BearingRangeFactor) -> None:
-        delta, self._covariance, _ = robust_update(factor, self._pose, self._covariance, iterations=5)
-        self._pose = se2.compose(self._pose, se2.exp(delta))

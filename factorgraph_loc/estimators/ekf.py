@@ -27,7 +27,7 @@ from factors.se2 import Array
 class EkfSettings(FilterSettings):
     """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993)."""
 
-    iterations: Annotated[int, Field(ge=1, le=20)] = 3
+    iterations: Annotated[int, Field(ge=1, le=20)] = 1
 
 
 @dataclass(frozen=True)

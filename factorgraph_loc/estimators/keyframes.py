@@ -29,6 +29,8 @@ from factors.bearing_range import BearingRangeFactor
 from factors.odometry import PARAMETERS, ChainState, Increment, OdometryFactor, recalibrated
 from factors.se2 import Array
 
+ITERATIONS_OF_GUESS = 5
+
 
 class GraphSettings(FileModel):
     """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come."""
@@ -137,8 +139,11 @@ class GraphEstimator(ABC):
         """Start the graph with its first keyframe and the prior."""
 
     @abstractmethod
-    def _extend(self, keyframe: Keyframe, guess: Array) -> None:
-        """Add a keyframe with its factors and a guess of its pose, and bring pose, covariance and parameters up to date."""
+    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
+        """Add a keyframe with its factors, and bring pose, covariance and parameters up to date.
+
+        ``guess`` (3,) and ``spread`` (3, 3): its pose and body-frame covariance by an update of the one before.
+        """
 
     @abstractmethod
     def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
@@ -175,13 +180,13 @@ class GraphEstimator(ABC):
         factor = None if m is None else self._landmarks.factor(m)
         if factor is not None:
             # the guess is where the graph linearises first, and what the robust weights are computed at
-            delta, _, innovation = robust_update(factor, pose, covariance, iterations=5)
+            delta, covariance, innovation = robust_update(factor, pose, covariance, ITERATIONS_OF_GUESS)
             self._landmarks.report(t, factor, innovation)
             pose = se2.compose(pose, se2.exp(delta))
             keyframe.factors.append(factor)
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
-        self._extend(keyframe, pose)
+        self._extend(keyframe, pose, covariance)
 
     def _keyframe_before(self, t: float) -> Keyframe:
         return self._keyframes[bisect.bisect_right(self._keyframe_times, t) - 1]

@@ -15,6 +15,7 @@ from factors.odometry import Increment
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # of an iterated update, m and rad
+GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 
 
 class KnownLandmarks:
@@ -62,9 +63,10 @@ def robust_update(
 ) -> tuple[Array, Array, Innovation]:
     """Kalman update of ``pose`` (3,) and further states, robust and iterated.
 
-    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. A landmark's
-    noise is widened by the inverse of its Cauchy weight: at first by the normalised innovation, as the prediction's own
-    uncertainty is no reason to doubt a landmark; then by the residual at the updated pose (iteratively reweighted least squares).
+    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. At first a
+    landmark whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that
+    it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
+    Cauchy weight at the updated pose (iteratively reweighted least squares).
     Returns the correction (S,), the updated covariance and the innovation at the prediction.
     """
     size = len(covariance)
@@ -77,10 +79,10 @@ def robust_update(
         error = h @ delta - residual.ravel()
         if iteration == 0:
             first = Innovation(error, spread + np.eye(len(error)))
-            squared = _per_landmark(first)
+            widening = np.maximum(1.0, _per_landmark(first) / GATE) ** 2
         else:
-            squared = np.sum(residual**2, axis=-1)
-        noise = np.repeat(1.0 / cauchy_weight(squared, factor.model.robust), 2)
+            widening = 1.0 / cauchy_weight(np.sum(residual**2, axis=-1), factor.model.robust)
+        noise = np.repeat(widening, 2)
         gain = np.linalg.solve(spread + np.diag(noise), h @ covariance).T
         step = gain @ error
         settled = np.abs(step - delta).max() < CONVERGED

@@ -14,12 +14,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.estimators.ancestors import draw_ancestors
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
-from factorgraph_loc.estimators.ancestors import draw_ancestors
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range import log_likelihood
@@ -182,7 +182,7 @@ class ParticleFilter(Filter):
         return out
 
     def _cloud(self, record: int) -> _Cloud:
-        cloud = self._records[record].cloud
+        cloud: _Cloud | None = self._records[record].cloud
         assert cloud is not None
         return cloud
 

@@ -7,13 +7,14 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, cast
 
 import gtsam
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
 from factorgraph_loc.estimators.problem import PARAMETERS_KEY
 from factorgraph_loc.estimators.registry import Setup
@@ -65,9 +66,9 @@ class Smoother(GraphEstimator):
         return self._between(np.array([p for p, _ in estimates]), np.array([c for _, c in estimates]))
 
     def _begin(self, first: Keyframe) -> None:
-        self._extend(first, self._pose)
+        self._extend(first, self._pose, self._covariance)
 
-    def _extend(self, keyframe: Keyframe, guess: Array) -> None:
+    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(keyframe.key, gtsam.Pose2(*guess))
         if keyframe.index == 0:
@@ -76,7 +77,7 @@ class Smoother(GraphEstimator):
             graph.add(self._odometry_factor(keyframe))
         for factor in keyframe.factors:
             graph.add(self._landmark_factor(keyframe, factor))
-        self._filtered.append((guess, self._covariance))
+        self._filtered.append((guess, spread))
         self._leave(keyframe.t)
         self._update(graph, values, keyframe)
 
@@ -99,12 +100,12 @@ class Smoother(GraphEstimator):
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
     def _advance(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float]) -> None:
-        if self._settings.lag is None:
+        if isinstance(self._solver, gtsam.ISAM2):
             self._solver.update(graph, values)
             return
         if len(self._parameters):
             stamps = {**stamps, PARAMETERS_KEY: self._keyframes[-1].t}  # constants never leave the window
-        self._solver.update(graph, values, stamps)
+        self._solver.update(graph, values, cast("Mapping[Any, Any]", stamps))
 
     def _read(self, newest: Keyframe) -> None:
         """Bring the newest pose, its covariance and the constants up to date."""
@@ -133,6 +134,16 @@ class Smoother(GraphEstimator):
                 self._left.append(self._filtered[keyframe.index])
 
     def _rebuild(self, newest: Keyframe) -> None:
+        try:
+            self._start_again(newest)
+        except RuntimeError as error:
+            if not newest.factors:
+                raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
+            self.diagnostics.reject("bearing_range: the graph cannot be solved with it", len(newest.factors))
+            newest.factors.clear()
+            self._rebuild(newest)
+
+    def _start_again(self, newest: Keyframe) -> None:
         """A new solver with what is in the graph; the oldest keyframe of the window carries its causal estimate as prior."""
         self._solver = self._new_solver("QR")
         oldest = self._keyframes[len(self._left)]
@@ -159,8 +170,10 @@ class Smoother(GraphEstimator):
     def _converge(self) -> Array:
         """Poses (M, 3) after updates without news, until the solution stands still."""
         poses = self._all_poses()
+        nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for _ in range(MAX_FINAL_UPDATES):
-            self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), self._keyframes[-1])
+            if isinstance(self._solver, gtsam.ISAM2):
+                self._solver.update(*nothing, force_relinearize=True)
             before, poses = poses, self._all_poses()
             if np.abs(se2.log(se2.between(before, poses))).max() < CONVERGED_STEP:
                 break

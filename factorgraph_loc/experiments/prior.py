@@ -10,6 +10,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.log import Log
 
+# of a start read from the reference
+REFERENCE_POSITION_SIGMA = 0.02  # m
+REFERENCE_HEADING_SIGMA = 0.01  # rad
+# of a start that a person typed
 POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
 VAGUE_HEADING_SIGMA = 0.1  # rad, where the reference's heading is no measurement
@@ -20,7 +24,7 @@ EXPECTED = "reference, log, unknown or X,Y,HEADING"
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     """The Gaussian that a run starts from, and the name of its source.
 
-    ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.05 m and 0.05 rad), ``log`` (the start
+    ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
     stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``unknown``, or None: the
     log's start, else the reference, else unknown. An unknown start is returned as None.
 
@@ -37,7 +41,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     if prior == "reference":
         return _from_reference(log), prior
     pose = np.array(_parse(prior))
-    return PosePrior(first_odometry(log), pose, _covariance(HEADING_SIGMA)), prior
+    return PosePrior(first_odometry(log), pose, _covariance(POSITION_SIGMA, HEADING_SIGMA)), prior
 
 
 def check_prior(prior: str | None) -> None:
@@ -63,12 +67,13 @@ def _from_reference(log: Log) -> PosePrior:
         raise InputError(
             f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
         )
-    sigma = HEADING_SIGMA if log.reference.has_heading else VAGUE_HEADING_SIGMA
-    return PosePrior(float(log.reference.t[after]), np.array(log.reference.poses[after]), _covariance(sigma))
+    sigma = REFERENCE_HEADING_SIGMA if log.reference.has_heading else VAGUE_HEADING_SIGMA
+    covariance = _covariance(REFERENCE_POSITION_SIGMA, sigma)
+    return PosePrior(float(log.reference.t[after]), np.array(log.reference.poses[after]), covariance)
 
 
-def _covariance(heading_sigma: float) -> np.typing.NDArray[np.float64]:
-    return np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, heading_sigma)))
+def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
+    return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
 
 
 def _parse(prior: str) -> tuple[float, float, float]:
