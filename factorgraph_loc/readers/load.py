@@ -54,7 +54,10 @@ def load(
     source = _find(log, data_root, reader)
     choices = {key: _choices(value) for key, value in source.options.items()}
     # the command line gives a list as text with commas
-    choices |= {key: _choices(value.split(",") if isinstance(value, str) else value) for key, value in given.items()}
+    choices |= {
+        key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
+        for key, value in given.items()
+    }
     if empty := [key for key, values in choices.items() if not values]:
         raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
     naming = [key for key, value in choices.items() if key in given or len(value) > 1]

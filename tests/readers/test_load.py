@@ -1,0 +1,147 @@
+"""What a user may name, and the data sets that ship."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import parse_model
+from factorgraph_loc.readers import READERS, describe, load, manifests, read_manifest, verify
+from factorgraph_loc.readers.registry import reader
+from factorgraph_loc.rig import read_rig
+
+MANIFEST = 'title = "t"\nreader = "mrclam"\npath = "set"\nlicence = "none"\norigin = "here"\n'
+
+
+@pytest.fixture
+def manifest(mrclam):
+    """Writes a manifest for the small MRCLAM folder, with more lines."""
+    folder = mrclam.parent / "manifests"
+    folder.mkdir()
+
+    def write(more: str = "[options]\nrobot = 1\n", text: str = MANIFEST) -> Path:
+        (folder / "small.toml").write_text(text + more)
+        return folder / "small.toml"
+
+    return write
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_readers_are_there(name):
+    assert callable(reader(name).read)
+
+
+@pytest.mark.parametrize("name", manifests())
+def test_shipped_manifests_are_right(name):
+    """Reader, options and rig are known, whether the data is there or not."""
+    manifest = read_manifest(manifests()[name])
+    parse_model(reader(manifest.reader).options, manifest.options, name)
+    assert read_rig(manifests()[name].parent / manifest.rig).bearing_range is not None
+    assert all(file.startswith(manifest.path) for file in manifest.checksums)
+
+
+def test_describe_without_data(monkeypatch):
+    monkeypatch.delenv("FGLOC_DATA", raising=False)
+    present = {d.name: d.present for d in describe()}
+    assert set(present) == set(manifests())
+    assert {name for name, there in present.items() if there} == {"plaza1", "plaza2"}
+
+
+def test_describe_and_verify_with_data(data_root):
+    assert all(d.present for d in describe(data_root))
+    for file in manifests().values():
+        assert verify(read_manifest(file), data_root) == []
+
+
+def test_a_manifest(manifest, tmp_path):
+    file = manifest(
+        'rig = "cart.rig.toml"\n[options]\nrobot = 1\n'
+        "[start]\nx = 1\ny = 2\nheading = 0\nsigma_position = 0.1\nsigma_heading = 0.1\n"
+    )
+    (file.parent / "cart.rig.toml").write_text('name = "cart"\n')
+    (log,) = load(str(file), data_root=tmp_path)
+    assert (log.name, log.rig.name, log.metadata["licence"]) == ("small", "cart", "none")
+    assert (log.start.t, log.start.pose.tolist()) == (0.0, [1.0, 2.0, 0.0])
+
+
+def test_the_data_root_from_the_environment(manifest, tmp_path, monkeypatch, refused):
+    monkeypatch.setenv("FGLOC_DATA", str(tmp_path))
+    assert load(str(manifest()))[0].name == "small"
+    monkeypatch.delenv("FGLOC_DATA")
+    refused(manifest(), "--data-root", "FGLOC_DATA")
+    refused(manifest(), "does not exist", data_root=tmp_path / "nowhere")
+
+
+def test_a_list_makes_several_logs(manifest, mrclam, tmp_path):
+    for name in ("Odometry", "Measurement", "Groundtruth"):
+        (mrclam / f"Robot3_{name}.dat").write_text((mrclam / f"Robot1_{name}.dat").read_text())
+    file = manifest("[options]\nrobot = [1, 3]\n")
+    names = [log.name for log in load(str(file), data_root=tmp_path)]
+    assert names == ["small-robot1", "small-robot3"]
+    # text with commas is the command line's list
+    names = [log.name for log in load(str(mrclam), reader="mrclam", options={"robot": "1, 3"})]
+    assert names == ["set-robot1", "set-robot3"]
+
+
+def test_rig_and_world_replace_those_of_the_log(native, tmp_path):
+    (tmp_path / "o.rig.toml").write_text('name = "other"\n')
+    (tmp_path / "o.world.toml").write_text('name = "other"\n[landmarks.A]\nx = 0\ny = 0\n')
+    (log,) = load(str(native), rig=tmp_path / "o.rig.toml", world=tmp_path / "o.world.toml")
+    assert (log.rig.name, log.world.name) == ("other", "other")
+    # checked against the map that is used
+    assert log.warnings == ("bearing_range: 1 rows name landmarks that the map lacks: B",)
+
+
+BAD_MANIFESTS = {
+    "path outside": (MANIFEST.replace('"set"', '"../../etc"'), "", "path '../../etc' leaves its folder"),
+    "absolute path": (MANIFEST.replace('"set"', '"/etc"'), "", "path '/etc' leaves its folder"),
+    "rig outside": (MANIFEST, 'rig = "../x.rig.toml"\n', "path '../x.rig.toml' leaves its folder"),
+    "no data": (MANIFEST.replace('"set"', '"sat"'), "", "small.toml: its data", "does not exist"),
+    "no title": (MANIFEST.replace("title", "titel"), "", "unknown key titel", "did you mean title?"),
+    "no reader": (MANIFEST.replace('"mrclam"', '"mrclan"'), "", "no reader 'mrclan'", "did you mean mrclam?"),
+    "option missing": (MANIFEST, "", "options of reader mrclam: robot is missing"),
+    "option misspelt": (MANIFEST, "[options]\nrobt = 1\n", "unknown key robt", "did you mean robot?"),
+    "option wrong": (MANIFEST, "[options]\nrobot = 9\n", "robot is 9", "less than or equal to 5"),
+    "empty list": (MANIFEST, "[options]\nrobot = []\n", "option robot is an empty list"),
+    "checksum": (MANIFEST, '[checksums]\n"set/Barcodes.dat" = "12"\n', "checksums.set/Barcodes.dat is '12'"),
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "fragments"), [(t, m, f) for t, m, *f in BAD_MANIFESTS.values()], ids=list(BAD_MANIFESTS)
+)
+def test_bad_manifests(manifest, tmp_path, refused, text, more, fragments):
+    refused(manifest(more, text), *fragments, data_root=tmp_path)
+
+
+def test_a_link_that_leaves_the_data_root(manifest, mrclam, tmp_path, refused):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "set").symlink_to(mrclam)
+    refused(manifest(), "leaves its folder", data_root=root)
+
+
+def test_names_that_lead_nowhere(tmp_path, refused):
+    refused("plaza22", "neither a file, nor a folder, nor a known data set", "did you mean plaza2?")
+    refused(tmp_path, "has no run.toml")
+    refused(tmp_path, "no reader 'natve'", "did you mean native?", reader="natve")
+    refused(tmp_path / "nothing", "does not exist", reader="mrclam")
+    refused(tmp_path, "expected a folder in the native format", reader="native")
+    (tmp_path / "x.bag").write_text("")
+    refused(tmp_path / "x.bag", "is not a manifest (.toml)")
+
+
+def test_the_native_format_has_no_options(native, refused):
+    refused(native, "options of reader native: unknown key robot", options={"robot": "1"})
+
+
+def test_verify(manifest, mrclam, tmp_path):
+    right = hashlib.sha256((mrclam / "Barcodes.dat").read_bytes()).hexdigest()
+    lines = {"Barcodes.dat": right, "Robot1_Odometry.dat": "0" * 64, "Robot9_Odometry.dat": right}
+    found = read_manifest(manifest("[checksums]\n" + "".join(f'"set/{n}" = "{s}"\n' for n, s in lines.items())))
+    changed, missing = verify(found, tmp_path)
+    assert "Robot1_Odometry.dat: is not the file" in changed
+    assert "Robot9_Odometry.dat: is missing" in missing
+    with pytest.raises(InputError, match="does not exist"):
+        verify(found, tmp_path / "nowhere")

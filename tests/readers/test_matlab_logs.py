@@ -1,0 +1,177 @@
+"""The readers of MATLAB files: Plaza, which is there wherever gtsam is, and the woods."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+from factorgraph_loc.readers import load
+
+
+def plaza(**changes):
+    """A tiny Plaza file's fields; ``changes`` replace them, None leaves one out."""
+    fields = {
+        "DR": np.array([[10.1, 0.5, 0.0], [10.2, 0.5, 0.1]]),
+        "TD": np.array([[10.05, 2, 1, 5.0], [10.15, 2, 6, 7.0]]),
+        "GT": np.array([[10.0, 0, 0, 0], [10.1, 0.5, 0, 0], [10.2, 1, 0, 0.1]]),
+        "TL": np.array([[1.0, 3, 4], [6, -3, 4]]),
+    }
+    return {name: value for name, value in {**fields, **changes}.items() if value is not None}
+
+
+def woods(**changes):
+    """A tiny file of the woods: three rows, landmark 1 seen at 0.5 m and landmark 17 at 2 m in the first of them."""
+    r = np.zeros((3, 17))
+    r[0, 0], r[0, 16] = 0.5, 2.0
+    column = np.zeros((3, 1))
+    fields = {
+        "t": np.array([[0.0], [0.1], [0.2]]),
+        "v": column + 0.25,
+        "om": column,
+        "r": r,
+        "b": np.where(r > 0.0, 0.5, 0.0),
+        "l": np.arange(34.0).reshape(17, 2),
+        "x_true": column,
+        "y_true": column,
+        "th_true": column + 4.0,
+        "true_valid": np.array([[1], [0], [1]], dtype=np.uint8),
+    }
+    return {name: value for name, value in {**fields, **changes}.items() if value is not None}
+
+
+@pytest.fixture
+def read_plaza(tmp_path, one):
+    def call(run=1, **changes):
+        savemat(tmp_path / "small.mat", plaza(**changes))
+        return one(tmp_path / "small.mat", reader="plaza", options={"run": run})
+
+    return call
+
+
+@pytest.fixture
+def read_woods(tmp_path, one):
+    def call(max_range=5.0, **changes):
+        savemat(tmp_path / "small.mat", woods(**changes))
+        return one(tmp_path / "small.mat", reader="utias_woods", options={"max_range": max_range})
+
+    return call
+
+
+def test_plaza(read_plaza):
+    log = read_plaza()
+    odometry, ranges = log.streams["odometry"], log.streams["bearing_range"]
+    np.testing.assert_array_equal(odometry.t, (0.0, 0.1, 0.2))  # led by a row without motion
+    np.testing.assert_array_equal(odometry.dx, (0.0, 0.5, 0.5))
+    np.testing.assert_array_equal(odometry.dtheta, (0.0, 0.0, 0.1))
+    assert ranges.landmark == ["1", "6"]
+    assert np.isnan(ranges.bearing).all()
+    assert list(log.world.landmarks) == ["1", "6"]
+    assert not log.reference.has_heading
+
+
+def test_plaza_2_has_its_heading_turned(read_plaza):
+    log = read_plaza(run=2)
+    assert log.reference.has_heading
+    assert log.reference.poses[1, 2] == pytest.approx(np.pi)
+
+
+def test_plaza_ranges_are_put_in_order(read_plaza):
+    log = read_plaza(TD=np.array([[12.0, 2, 1, 5.0], [10.5, 2, 6, 7.0], [12.0, 2, 1, 6.0]]))
+    np.testing.assert_array_equal(log.streams["bearing_range"].range, (7.0, 6.0))
+    assert "1 rows are older than one before them: sorted by time" in log.warnings[0]
+    assert "1 rows see a landmark that a later row sees" in log.warnings[1]
+
+
+def test_plaza_duplicate_odometry_the_last_wins(read_plaza):
+    log = read_plaza(DR=np.array([[10.1, 0.5, 0.0], [10.1, 0.25, 0.0]]))
+    np.testing.assert_array_equal(log.streams["odometry"].dx, (0.0, 0.25))
+    assert ":DR: 1 rows" in log.warnings[0]
+
+
+PLAZA_BAD = {
+    "field missing": ({"DR": None}, "DR is missing"),
+    "shape": ({"TL": np.zeros((2, 2))}, "TL has shape (2, 2)"),
+    "nan": ({"DR": np.array([[10.1, 0, 0], [10.2, np.nan, 0]])}, "DR:2: distance is nan"),
+    "infinite beacon": ({"TL": np.array([[1.0, np.inf, 0]])}, "TL:1: row"),
+    "time going back": ({"GT": np.array([[2.0, 0, 0, 0], [1, 0, 0, 0]])}, "GT:2: time"),
+    "negative range": ({"TD": np.array([[10.0, 2, 1, -1]])}, "TD:1: range is -1.0"),
+    "no rows": ({"DR": np.zeros((0, 3))}, "DR"),
+}
+
+
+@pytest.mark.parametrize(("changes", "fragment"), PLAZA_BAD.values(), ids=list(PLAZA_BAD))
+def test_bad_plaza(tmp_path, refused, changes, fragment):
+    savemat(tmp_path / "small.mat", plaza(**changes))
+    refused(tmp_path / "small.mat", "small.mat", fragment, reader="plaza", options={"run": 1})
+
+
+@pytest.mark.parametrize("content", [b"", b"t_ns,v,w\n1,2,3\n", bytes(range(256)) * 8])
+def test_what_is_no_matlab_file(tmp_path, refused, content):
+    (tmp_path / "x.mat").write_bytes(content)
+    refused(tmp_path / "x.mat", "x.mat: is not a MATLAB file", reader="plaza", options={"run": 1})
+
+
+@pytest.mark.parametrize(("run", "rows", "ranges"), [(1, 9658, 3527), (2, 4091, 1816)])
+def test_recorded_plaza(run, rows, ranges):
+    (log,) = load(f"plaza{run}")
+    assert log.rig.name == "plaza"
+    assert len(log.streams["odometry"].t) == rows
+    assert len(log.streams["bearing_range"].t) == ranges
+    assert set(log.world.landmarks) == set(log.streams["bearing_range"].landmark)
+    assert log.reference.has_heading == (run == 2)
+    # a positive distance drives forward: the heading is that of the motion
+    poses = log.reference.poses
+    motion = poses[5:, :2] - poses[:-5, :2]
+    ahead = np.column_stack((np.cos(poses[2:-3, 2]), np.sin(poses[2:-3, 2])))
+    moving = np.hypot(*motion.T) > 0.5
+    assert np.median(np.sum(motion * ahead, axis=1)[moving]) > 0.5
+
+
+def test_recorded_plaza_ranges_match_the_beacons():
+    assert set(loadmat(gtsam.findExampleDataFile("Plaza2_.mat"))) >= {"DR", "TD", "GT", "TL"}
+    (log,) = load("plaza2")
+    stream = log.streams["bearing_range"]
+    points = np.array([log.world.position(name) for name in stream.landmark])
+    distance = np.hypot(*(points - log.reference.at(stream.t)[:, :2]).T)
+    assert np.nanmedian(stream.range / distance) == pytest.approx(1.07, abs=0.005)
+
+
+def test_woods(read_woods):
+    log = read_woods()
+    assert log.streams["bearing_range"].landmark == ["1", "17"]
+    np.testing.assert_array_equal(log.streams["bearing_range"].range, (0.5, 2.0))
+    np.testing.assert_array_equal(log.reference.t, (0.0, 0.2))  # the gap stays
+    assert log.reference.poses[0, 2] == pytest.approx(4.0 - 2 * np.pi)
+    assert log.world.position("2").tolist() == [2.0, 3.0]
+
+
+def test_woods_keep_what_is_near(read_woods):
+    assert read_woods(max_range=2.0).streams["bearing_range"].landmark == ["1"]
+    log = read_woods(max_range=0.5)
+    assert "bearing_range" not in log.streams
+    assert "no landmark is nearer than max_range" in log.warnings[0]
+
+
+WOODS_BAD = {
+    "nan": ({"v": np.array([[0.0], [np.nan], [0.0]])}, ":2: v is nan"),
+    "infinite range": ({"r": np.full((3, 17), np.inf)}, ":1: r is inf"),
+    "negative range": ({"r": np.full((3, 17), -1.0)}, ":1: r of landmark 1 is -1.0"),
+    "time going back": ({"t": np.array([[0.0], [0.2], [0.1]])}, ":3: time"),
+    "lengths differ": ({"om": np.zeros((2, 1))}, "om has 2 rows, expected 3"),
+    "field missing": ({"true_valid": None}, "true_valid is missing"),
+    "a landmark short": ({"l": np.zeros((16, 2))}, "l is '16 rows'"),
+    "nan in the truth": ({"x_true": np.array([[0.0], [0.0], [np.nan]])}, ":3: x_true is nan"),
+}
+
+
+@pytest.mark.parametrize(("changes", "fragment"), WOODS_BAD.values(), ids=list(WOODS_BAD))
+def test_bad_woods(tmp_path, refused, changes, fragment):
+    savemat(tmp_path / "small.mat", woods(**changes))
+    refused(tmp_path / "small.mat", "small.mat", fragment, reader="utias_woods")
+
+
+@pytest.mark.parametrize(("name", "sightings"), [("woods-r1", 7598), ("woods-r3", 40118), ("woods-r5", 58135)])
+def test_recorded_woods(data_root, name, sightings):
+    (log,) = load(name, data_root=data_root)
+    assert (len(log.streams["bearing_range"].t), len(log.world.landmarks)) == (sightings, 17)
+    assert (len(log.reference), log.rig.name) == (12278, "woods")

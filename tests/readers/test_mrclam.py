@@ -1,0 +1,111 @@
+"""MRCLAM folders: one robot's run, with what is left out and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.readers import load
+
+
+@pytest.fixture
+def read(one):
+    return lambda folder, **kwargs: one(folder, reader="mrclam", **{"options": {"robot": "1"}, **kwargs})
+
+
+@pytest.fixture
+def refuse(refused):
+    return lambda folder, *fragments: refused(folder, *fragments, reader="mrclam", options={"robot": 1})
+
+
+def test_what_is_read(mrclam, read):
+    log = read(mrclam)
+    assert (log.name, log.rig.name, log.t0_ns) == ("set-robot1", "default", 1248444187_156_000_000)
+    np.testing.assert_array_equal(log.streams["odometry"].t, (0.0, 0.03, 0.041))
+    np.testing.assert_array_equal(log.streams["odometry"].w, (-0.398, 0.0, 0.2))
+    sightings = log.streams["bearing_range"]
+    assert sightings.landmark == ["6", "7"]
+    np.testing.assert_array_equal(sightings.t, (0.004, 0.004))
+    np.testing.assert_array_equal(sightings.range, (3.787, 2.0))
+    assert len(list(sightings.measurements(0.0))) == 1
+    assert log.world.landmarks["6"].sigma == 0.0002
+    np.testing.assert_array_equal(log.reference.t, (-0.056, 0.044))
+    left_out, no_rig = log.warnings
+    assert "left out 1 sightings of other robots and 1 of unknown barcodes" in left_out
+    assert "no rig is given" in no_rig
+
+
+def test_only_odometry_and_map_are_needed(mrclam, read):
+    for name in ("Robot1_Measurement.dat", "Robot1_Groundtruth.dat", "Barcodes.dat"):
+        (mrclam / name).unlink()
+    log = read(mrclam)
+    assert list(log.streams) == ["odometry"]
+    assert log.reference is None
+
+
+def test_duplicate_odometry_stamps_the_last_wins(mrclam, read):
+    (mrclam / "Robot1_Odometry.dat").write_text("1.0 1 0\n1.0 2 0\n1.5 3 0\n")
+    log = read(mrclam)
+    np.testing.assert_array_equal(log.streams["odometry"].v, (2.0, 3.0))
+    assert "Robot1_Odometry.dat: 1 rows" in log.warnings[0]
+
+
+def test_files_without_rows(mrclam, read):
+    (mrclam / "Robot1_Measurement.dat").write_text("# only a comment\n")
+    (mrclam / "Robot1_Groundtruth.dat").write_text("# only a comment\n")
+    log = read(mrclam)
+    assert log.reference is None
+    assert [w.rpartition("/")[2] for w in log.warnings[:2]] == [
+        "Robot1_Measurement.dat: holds no rows",
+        "Robot1_Groundtruth.dat: holds no rows",
+    ]
+
+
+BAD = {
+    "nan": ("Robot1_Odometry.dat", "# c\n1 0 0\n2 nan 0\n", ":3: forward velocity is nan", "finite"),
+    "infinity": ("Robot1_Groundtruth.dat", "1 0 inf 0\n", ":1: y is inf", "finite"),
+    "word": ("Robot1_Odometry.dat", "1 0 0\n\n2 0 x\n", ":3: angular velocity is 'x'", "a number"),
+    "short row": ("Robot1_Odometry.dat", "# c\n1 0 0\n2 0\n", ":3: row is '2 0'", "3 values"),
+    "time going back": ("Robot1_Odometry.dat", "2 0 0\n1 0 0\n", ":2: time is '1000000000 ns'"),
+    "reference going back": ("Robot1_Groundtruth.dat", "2 0 0 0\n1 0 0 0\n", ":2: time"),
+    "too late": ("Robot1_Measurement.dat", "2.0 63 1 0\n1.4 63 1 0\n", ":2: time", "at most 0.5 s older"),
+    "range of zero": ("Robot1_Measurement.dat", "2.0 63 0 0\n", ":1: range is 0.0", "more than 0"),
+    "half a barcode": ("Robot1_Measurement.dat", "2.0 63.5 1 0\n", ":1: barcode is 63.5", "whole number"),
+    "empty odometry": ("Robot1_Odometry.dat", "", "Robot1_Odometry.dat: is empty", "expected rows of time"),
+    "no odometry": ("Robot1_Odometry.dat", "# c\n", "has no odometry"),
+    "empty barcodes": ("Barcodes.dat", "", "Barcodes.dat: is empty"),
+    "barcode twice": ("Barcodes.dat", "6 63\n7 63\n", "Barcodes.dat:2: barcode is 63", "once"),
+    "landmark twice": ("Landmark_Groundtruth.dat", "6 0 0 0 0\n6 1 1 0 0\n", ":2: subject is '6'", "once"),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "fragments"), [(n, t, f) for n, t, *f in BAD.values()], ids=list(BAD))
+def test_bad_input(mrclam, refuse, name, text, fragments):
+    (mrclam / name).write_text(text)
+    refuse(mrclam, name, *fragments)
+
+
+@pytest.mark.parametrize("name", ["Robot1_Odometry.dat", "Landmark_Groundtruth.dat", "Barcodes.dat"])
+def test_missing_files(mrclam, refuse, name):
+    (mrclam / name).unlink()
+    refuse(mrclam, f"{name}: cannot be read: No such file")
+
+
+def test_a_file_is_no_folder(mrclam, refuse):
+    refuse(mrclam / "Barcodes.dat", "is not a folder")
+
+
+@pytest.mark.parametrize(("robot", "rows", "sightings"), [(1, 61785, 1534), (3, 61150, 4348), (5, 60563, 4239)])
+def test_recorded_logs(data_root, robot, rows, sightings):
+    (log,) = load(f"mrclam6-robot{robot}", data_root=data_root)
+    assert len(log.streams["odometry"].t) == rows
+    assert len(log.streams["bearing_range"].t) == sightings
+    assert (len(log.world.landmarks), log.rig.name) == (15, "mrclam")
+    # a sighting is where the map says, but for the noise: names and frames are right
+    stream = log.streams["bearing_range"]
+    poses = log.reference.at(stream.t, max_gap=0.1)
+    points = np.array([log.world.position(name) for name in stream.landmark])
+    offset = points - poses[:, :2]
+    bearing = np.arctan2(offset[:, 1], offset[:, 0]) - poses[:, 2] - stream.bearing
+    assert np.nanmedian(np.abs(np.hypot(*offset.T) - stream.range)) < 0.2
+    assert np.nanmedian(np.abs((bearing + math.pi) % (2 * math.pi) - math.pi)) < 0.03

@@ -1,0 +1,104 @@
+"""Trajectories: interpolation along the arc, and the TUM format."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.trajectory import Trajectory, nanoseconds, read_tum, write_tum
+
+
+def quarter_circle():
+    return Trajectory(np.array((0.0, 1.0)), np.array(((0.0, 0.0, 0.0), (1.0, 1.0, math.pi / 2))))
+
+
+def test_between_poses_it_follows_the_arc():
+    half = quarter_circle().at(np.array((0.5,)))[0]
+    r = math.sqrt(0.5)
+    np.testing.assert_allclose(half, (r, 1.0 - r, math.pi / 4))
+
+
+def test_at_the_poses_it_is_exact():
+    trajectory = quarter_circle()
+    np.testing.assert_array_equal(trajectory.at(trajectory.t), trajectory.poses)
+
+
+def test_nothing_outside_or_in_gaps():
+    trajectory = Trajectory(np.array((0.0, 1.0, 5.0)), np.zeros((3, 3)))
+    found = trajectory.at(np.array((-0.1, 0.5, 1.0, 3.0, 5.0, 5.1)), max_gap=1.0)
+    assert np.isnan(found[:, 0]).tolist() == [True, False, False, True, False, True]
+    assert np.isnan(Trajectory(np.empty(0), np.empty((0, 3))).at(np.array((0.0,)))).all()
+
+
+def test_the_turn_across_pi_is_the_short_one():
+    trajectory = Trajectory(np.array((0.0, 1.0)), np.array(((0, 0, 3.0), (0, 0, -3.0))))
+    assert abs(trajectory.at(np.array((0.5,)))[0, 2]) == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize(("t", "poses"), [((0.0, 0.0), np.zeros((2, 3))), ((0.0,), np.zeros((2, 3)))])
+def test_what_is_no_trajectory(t, poses):
+    with pytest.raises(ValueError, match=r"stamps|shape"):
+        Trajectory(np.array(t), poses)
+
+
+@given(
+    st.lists(st.integers(-(10**12), 10**12), min_size=1, max_size=5, unique=True).map(sorted),
+    st.integers(-2 * 10**18, 2 * 10**18),
+    st.floats(-math.pi, math.pi),
+)
+def test_tum_comes_back_to_the_nanosecond(tmp_path_factory, stamps, t0_ns, heading):
+    trajectory = Trajectory(np.array(stamps) / 1e9, np.tile((1.5, -2.25, heading), (len(stamps), 1)))
+    file = tmp_path_factory.mktemp("tum") / "a.tum"
+    write_tum(trajectory, file, t0_ns)
+    back = read_tum(file, t0_ns)
+    np.testing.assert_array_equal(back.t, trajectory.t)
+    np.testing.assert_allclose(np.cos(back.poses[:, 2] - heading), 1.0)
+    np.testing.assert_array_equal(back.poses[:, :2], trajectory.poses[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1248444187.156000001", 1248444187156000001),
+        ("-0.5", -500000000),
+        ("+2", 2 * 10**9),
+        ("1.0000000019", 1000000001),
+        ("1.5e3", 1500 * 10**9),
+    ],
+)
+def test_stamps(text, expected):
+    assert nanoseconds(text) == expected
+
+
+def test_tilted_poses_and_comments(tmp_path):
+    (tmp_path / "a.tum").write_text("\ufeff# t x y z qx qy qz qw\r\n\r\n1.0 1 2 3 0.70710678 0 0 0.70710678\r\n")
+    trajectory = read_tum(tmp_path / "a.tum", has_heading=False)
+    np.testing.assert_allclose(trajectory.poses, ((1, 2, 0),), atol=1e-7)
+    assert not trajectory.has_heading
+
+
+BAD = {
+    "empty": ("", "holds no poses"),
+    "short": ("# c\n1 0 0 0\n", ":2: row is '1 0 0 0'"),
+    "word": ("1 0 0 0 0 0 zero 1\n", ":1: row"),
+    "nan": ("1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", ":2: row"),
+    "infinite stamp": ("inf 0 0 0 0 0 0 1\n", ":1: row"),
+    "huge stamp": ("1e30 0 0 0 0 0 0 1\n", ":1: row"),
+    "no rotation": ("1 0 0 0 0 0 0 0\n", ":1: length of qx qy qz qw is 0.0"),
+    "same stamp": ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: t is"),
+    "going back": ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: t is"),
+    "binary": (b"\xff\xfe\x00", "is not text in UTF-8"),
+}
+
+
+@pytest.mark.parametrize(("text", "fragment"), BAD.values(), ids=list(BAD))
+def test_bad_tum(tmp_path, text, fragment):
+    file = tmp_path / "a.tum"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as caught:
+        read_tum(file)
+    assert f"{file}" in str(caught.value)
+    assert fragment in str(caught.value)
