@@ -104,7 +104,7 @@ def test_a_log_without_measurements(log):
 def test_priors(log):
     prior, source = resolve_prior(log, None)
     assert source == "reference"
-    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.05, 0.05, 0.05))
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.02, 0.02, 0.01))
     vague = replace(log, reference=Trajectory(log.reference.t, log.reference.poses, has_heading=False))
     assert resolve_prior(vague, "reference")[0].covariance[2, 2] == pytest.approx(0.01)
     stated = replace(log, start=StartPose(0.3, np.ones(3), np.array((0.1, 0.2, 0.3))))
@@ -113,6 +113,7 @@ def test_priors(log):
     assert np.diag(prior.covariance) == pytest.approx((0.01, 0.04, 0.09))
     prior, source = resolve_prior(log, "1, -2, 0.5")
     assert (prior.pose.tolist(), prior.t, source) == ([1.0, -2.0, 0.5], 0.0, "1, -2, 0.5")
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.05, 0.05, 0.05))
     assert resolve_prior(replace(log, reference=None), None) == (None, "unknown")
 
 
