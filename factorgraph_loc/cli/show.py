@@ -33,19 +33,19 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     out = Table(box=None, pad_edge=False, header_style="bold")
     for i, name in enumerate(header):
         numeric = i > 0 and all(_is_number(row[i]) for row in rows)
-        out.add_column(name, justify="right" if numeric else "left", overflow="fold", no_wrap=i == 0)
+        out.add_column(name, justify="right" if numeric else "left", no_wrap=True)
     for row in rows:
         out.add_row(*row)
     rich_table(out)
 
 
 def rich_table(content: Table) -> None:
-    """A table of rich's on stdout. In a narrow terminal its cells are folded, but never cut off."""
+    """A table of rich's on stdout. In a narrow terminal its lines are broken, but nothing is cut off."""
     from rich.console import Console
 
-    console = Console(markup=False, highlight=False)
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1000
-    console.width = max(width, console.measure(content).minimum)
+    console = Console(markup=False, highlight=False, width=1000)
+    if sys.stdout.isatty():
+        console.width = max(shutil.get_terminal_size().columns, console.measure(content).maximum)
     console.print(content)
 
 
@@ -69,7 +69,7 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[[float, float], N
     amount = MofNCompleteColumn() if counted else TaskProgressColumn()
     columns = (TextColumn(what), BarColumn(), amount, TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what)
+        task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 

@@ -63,7 +63,8 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     header, lines = comparison_cells(rows)
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     for i, name in enumerate(header):
-        table.add_column(Text(name), justify="left" if i < 2 else "right", no_wrap=i < 2)
+        # a word a line, so that the table is narrow; folded or cut numbers would be worse than broken lines
+        table.add_column(Text(name.replace(" ", "\n")), justify="left" if i < 2 else "right", no_wrap=True)
     for line, after in zip(lines, [*lines[1:], None], strict=True):
         table.add_row(*line, end_section=after is None or after[0] != line[0])
     return table

@@ -1,6 +1,7 @@
 """Every command of `fgloc`, from the arguments to the files."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,9 @@ import polars as pl
 import pytest
 
 from factorgraph_loc import __version__
+from factorgraph_loc.cli import show
 from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.evaluation.tables import COLUMNS, comparison_cells, comparison_table
 from factorgraph_loc.trajectory import read_tum
 
 RUN_FILES = {"final.tum", "causal.tum", "estimates.parquet", "metrics.json", "config.toml"}
@@ -213,3 +216,16 @@ def test_a_pipe_gets_plain_text(short_log, tmp_path):
     assert "\x1b" not in done.stdout + done.stderr
     assert done.stderr == ""
     assert Path(tmp_path / "out/results.csv").is_file()
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+def test_a_narrow_terminal_cuts_nothing_off(columns, capsys, monkeypatch):
+    scores = {key: 31.494 for key, _, _ in COLUMNS.values()}
+    row = {"log": "plaza2", "estimator": "dead_reckoning", "seed": 0, "status": "ok", "time_to_localized": 0.0} | scores
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((columns, 24)))
+    show.rich_table(comparison_table([row]))
+    text = capsys.readouterr().out
+    assert "…" not in text
+    line = next(line for line in text.splitlines() if "plaza2" in line).split()
+    assert line == ["plaza2", "dead_reckoning", *comparison_cells([row])[1][0][2:]]

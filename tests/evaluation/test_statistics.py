@@ -121,4 +121,4 @@ def test_table_as_markdown_and_for_the_terminal():
     assert len({len(line) for line in lines}) == 1
     table = comparison_table(rows)
     assert table.row_count == 3
-    assert "causal pos [m]" in [str(column.header) for column in table.columns]
+    assert "causal\npos\n[m]" in [str(column.header) for column in table.columns]
