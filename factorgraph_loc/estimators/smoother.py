@@ -7,8 +7,8 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, cast
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
 
 import gtsam
 import numpy as np
@@ -18,15 +18,12 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
 from factorgraph_loc.estimators.problem import PARAMETERS_KEY
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.solvers import FullHistory, Node, Solver, Window
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range import BearingRangeFactor
-from factors.graph import custom_factor, pose_array, read_pose, read_vector
 from factors.odometry import OdometryFactor, between_factor
 from factors.se2 import Array
-
-MAX_FINAL_UPDATES = 20
-CONVERGED_STEP = 1e-4  # m, rad
 
 
 class SmootherSettings(GraphSettings):
@@ -47,51 +44,46 @@ class Smoother(GraphEstimator):
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
         super().__init__(setup, settings)
         self._settings = settings
+        self._failed: list[str] = []
         self._solver = self._new_solver(settings.factorization)
         # of each keyframe: its causal estimate, and the final one where it has left the window
         self._filtered: list[tuple[Array, Array]] = []
         self._left: list[tuple[Array, Array]] = []
-        self._failed: list[str] = []
 
     def trajectory(self) -> Trajectory:
         """Full history: the solution of the whole graph. With a window: each pose as it left the window."""
         if not self._settings.smooth:
             estimates = self._filtered
-        elif self._settings.lag is not None:
-            estimates = self._left + [self._marginal(k) for k in self._keyframes[len(self._left) :]]
-        else:
-            poses = self._converge()
+        elif isinstance(self._solver, FullHistory):
+            self._solver.converge()
+            poses = np.array([self._solver.pose(k.key) for k in self._keyframes])
+            self._read(self._keyframes[-1])
             covariances, self._parameter_covariance = self._problem().covariances(poses, self._parameters)
             return self._between(poses, covariances)
+        else:
+            estimates = self._left + [self._marginal(k) for k in self._keyframes[len(self._left) :]]
         return self._between(np.array([p for p, _ in estimates]), np.array([c for _, c in estimates]))
 
     def _begin(self, first: Keyframe) -> None:
-        self._extend(first, self._pose, self._covariance)
+        self._filtered.append((self._pose, self._covariance))
+        self._start_again(first)
 
     def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(keyframe.key, gtsam.Pose2(*guess))
-        if keyframe.index == 0:
-            self._add_prior(graph, values, keyframe, self._pose, self._covariance)
-        else:
-            graph.add(self._odometry_factor(keyframe))
-        for factor in keyframe.factors:
-            graph.add(self._landmark_factor(keyframe, factor))
         self._filtered.append((guess, spread))
         self._leave(keyframe.t)
-        self._update(graph, values, keyframe)
+        nodes = [self._odometry_node(keyframe), *(self._landmark_node(keyframe, f) for f in keyframe.factors)]
+        self._update(nodes, {keyframe.key: guess})
 
     def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
         if keyframe.index < len(self._left):
             self.diagnostics.drop_late("bearing_range")
-            return
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(self._landmark_factor(keyframe, factor))
-        self._update(graph, gtsam.Values(), self._keyframes[-1])
+        else:
+            self._update([self._landmark_node(keyframe, factor)], {})
 
-    def _update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: Keyframe) -> None:
+    def _update(self, nodes: Sequence[Node], poses: Mapping[int, Array]) -> None:
+        newest = self._keyframes[-1]
         try:
-            self._advance(graph, values, {newest.key: newest.t} if values.size() else {})
+            self._solver.update(nodes, poses, None, newest.t)
             self._read(newest)
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {str(error).strip().splitlines()[0]}"))
@@ -99,25 +91,16 @@ class Smoother(GraphEstimator):
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
-    def _advance(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float]) -> None:
-        if isinstance(self._solver, gtsam.ISAM2):
-            self._solver.update(graph, values)
-            return
-        if len(self._parameters):
-            stamps = {**stamps, PARAMETERS_KEY: self._keyframes[-1].t}  # constants never leave the window
-        self._solver.update(graph, values, cast("Mapping[Any, Any]", stamps))
-
     def _read(self, newest: Keyframe) -> None:
         """Bring the newest pose, its covariance and the constants up to date."""
         self._pose, self._covariance = self._marginal(newest)
         self._filtered[newest.index] = (self._pose, self._covariance)
         if len(self._parameters):
-            self._parameters = np.asarray(self._solver.calculateEstimateVector(PARAMETERS_KEY))
-            self._parameter_covariance = self._solver.marginalCovariance(PARAMETERS_KEY)
+            self._parameters = self._solver.parameters()
+            self._parameter_covariance = self._solver.covariance(PARAMETERS_KEY)
 
     def _marginal(self, keyframe: Keyframe) -> tuple[Array, Array]:
-        pose = pose_array(self._solver.calculateEstimatePose2(keyframe.key))
-        covariance = self._solver.marginalCovariance(keyframe.key)
+        pose, covariance = self._solver.pose(keyframe.key), self._solver.covariance(keyframe.key)
         if not np.all(np.isfinite(pose)) or not np.all(np.isfinite(covariance)):
             raise RuntimeError("the solution is not finite")
         return pose, covariance
@@ -144,83 +127,53 @@ class Smoother(GraphEstimator):
             self._rebuild(newest)
 
     def _start_again(self, newest: Keyframe) -> None:
-        """A new solver with what is in the graph; the oldest keyframe of the window carries its causal estimate as prior."""
+        """A new solver with what is in the graph.
+
+        The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of.
+        """
         self._solver = self._new_solver("QR")
-        oldest = self._keyframes[len(self._left)]
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        stamps: dict[int, float] = {}
-        for keyframe in self._keyframes[oldest.index :]:
-            pose, covariance = self._filtered[keyframe.index]
-            values.insert(keyframe.key, gtsam.Pose2(*pose))
-            stamps[keyframe.key] = keyframe.t
-            if keyframe is not oldest:
-                graph.add(self._odometry_factor(keyframe))
-            elif keyframe.index == 0:
-                assert self._prior is not None
-                prior = se2.world_to_body(self._prior.pose, self._prior.covariance)
-                self._add_prior(graph, values, keyframe, self._prior.pose, prior)
-            else:
-                self._add_prior(graph, values, keyframe, pose, covariance)
-            if keyframe is not oldest or keyframe.index == 0:  # the prior of another oldest one holds its own factors
-                for factor in keyframe.factors:
-                    graph.add(self._landmark_factor(keyframe, factor))
-        self._advance(graph, values, stamps)
+        oldest, *others = self._keyframes[len(self._left) :]
+        pose, spread = self._filtered[oldest.index]
+        nodes: list[Node] = []
+        if oldest.index == 0:
+            assert self._prior is not None
+            pose, spread = np.asarray(self._prior.pose), se2.world_to_body(self._prior.pose, self._prior.covariance)
+            nodes += [self._landmark_node(oldest, f) for f in oldest.factors]
+        nodes += self._prior_nodes(oldest, pose, spread)
+        for keyframe in others:
+            nodes.append(self._odometry_node(keyframe))
+            nodes += [self._landmark_node(keyframe, f) for f in keyframe.factors]
+        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)}
+        self._solver.update(nodes, guesses, self._parameters if len(self._parameters) else None, newest.t)
         self._read(newest)
 
-    def _converge(self) -> Array:
-        """Poses (M, 3) after updates without news, until the solution stands still."""
-        poses = self._all_poses()
-        nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for _ in range(MAX_FINAL_UPDATES):
-            if isinstance(self._solver, gtsam.ISAM2):
-                self._solver.update(*nothing, force_relinearize=True)
-            before, poses = poses, self._all_poses()
-            if np.abs(se2.log(se2.between(before, poses))).max() < CONVERGED_STEP:
-                break
-        return poses
-
-    def _all_poses(self) -> Array:
-        values = self._solver.calculateEstimate()
-        return np.array([read_pose(values, k.key) for k in self._keyframes])
-
-    def _add_prior(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        keyframe: Keyframe,
-        pose: Array,
-        covariance: Array,
-    ) -> None:
+    def _prior_nodes(self, keyframe: Keyframe, pose: Array, covariance: Array) -> list[Node]:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        graph.add(gtsam.PriorFactorPose2(keyframe.key, gtsam.Pose2(*pose), noise))
+        prior = gtsam.PriorFactorPose2(keyframe.key, gtsam.Pose2(*pose), noise)
+        nodes = [Node((keyframe.key,), native=prior)]
         if len(self._parameters):
-            values.insert(PARAMETERS_KEY, self._parameters)
             noise = gtsam.noiseModel.Gaussian.Covariance(self._parameter_covariance)
-            graph.add(gtsam.PriorFactorVector(PARAMETERS_KEY, self._parameters, noise))
+            constants = gtsam.PriorFactorVector(PARAMETERS_KEY, self._parameters, noise)
+            nodes.append(Node((PARAMETERS_KEY,), native=constants))
+        return nodes
 
-    def _odometry_factor(self, keyframe: Keyframe) -> gtsam.NonlinearFactor:
+    def _odometry_node(self, keyframe: Keyframe) -> Node:
         increment, before = keyframe.from_previous, self._keyframes[keyframe.index - 1].key
         assert increment is not None
         if not len(self._parameters):
-            return between_factor(before, keyframe.key, increment)
-        return custom_factor(
-            OdometryFactor(increment, self._estimated.indices),
-            (before, keyframe.key, PARAMETERS_KEY),
-            (read_pose, read_pose, read_vector),
-            (3, 3, len(self._parameters)),
-            3,
-            self._failed.append,
-        )
+            return Node((before, keyframe.key), native=between_factor(before, keyframe.key, increment))
+        factor = OdometryFactor(increment, self._estimated.indices)
+        return Node((before, keyframe.key, PARAMETERS_KEY), factor=factor, rows=3)
 
-    def _landmark_factor(self, keyframe: Keyframe, factor: BearingRangeFactor) -> gtsam.NonlinearFactor:
-        return custom_factor(factor, (keyframe.key,), (read_pose,), (3,), 2 * len(factor.points), self._failed.append)
+    def _landmark_node(self, keyframe: Keyframe, factor: BearingRangeFactor) -> Node:
+        return Node((keyframe.key,), factor=factor, rows=2 * len(factor.points))
 
-    def _new_solver(self, factorization: str) -> gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother:
+    def _new_solver(self, factorization: str) -> Solver:
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization(factorization)
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
         parameters.relinearizeSkip = self._settings.relinearize_skip
         if self._settings.lag is None:
-            return gtsam.ISAM2(parameters)
+            return FullHistory(parameters)
         parameters.findUnusedFactorSlots = True
-        return gtsam.IncrementalFixedLagSmoother(self._settings.lag, parameters)
+        return Window(parameters, self._settings.lag, self._failed.append)
