@@ -25,6 +25,7 @@ COLUMNS = {
 }
 ALL = "(all logs)"
 BASELINE = "dead_reckoning"
+ALIKE = 0.01  # share by which errors may differ without one being called the least alone
 
 Row = Mapping[str, Any]
 
@@ -73,7 +74,8 @@ def comparison_table(rows: Sequence[Row]) -> Table:
 def verdict(rows: Sequence[Row]) -> list[str]:
     """In words: the estimator with the least position error, causal and final, beside dead reckoning where that ran.
 
-    Pooled over logs and seeds. An estimator of which a run failed, or has no such score, is out: it cannot be compared.
+    Pooled over logs and seeds; those nearly as good are named too. An estimator of which a run failed, or has no such score,
+    is out: it cannot be compared.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -91,6 +93,9 @@ def verdict(rows: Sequence[Row]) -> list[str]:
         if found:
             best = min(found, key=found.__getitem__)
             line = f"least {kind} position error: {best}, {found[best]:.3f} m"
+            near = [name for name in found if name != best and found[name] <= (1.0 + ALIKE) * found[best]]
+            if near:
+                line += f", within {ALIKE:.0%} of it {', '.join(near)}"
             if BASELINE in found and best != BASELINE:
                 line += f" ({BASELINE}: {found[BASELINE]:.3f} m)"
             lines.append(line)

@@ -112,6 +112,8 @@ def test_verdict_names_the_best_that_can_be_compared():
     lines = verdict(rows)
     assert f"least {METRIC.partition('.')[0]} position error: b, 0.200 m (dead_reckoning: 3.536 m)" in lines
     assert verdict(rows_of({("one", "a", 0): None})) == []
+    (line,) = verdict(rows_of({("one", "a", 0): 0.201, ("one", "b", 0): 0.2, ("one", "c", 0): 0.203}))
+    assert line == "least causal position error: b, 0.200 m, within 1% of it a"
 
 
 def test_table_as_markdown_and_for_the_terminal():
