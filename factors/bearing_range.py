@@ -118,7 +118,7 @@ def whitened(
     return error, jacobian
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _whitened(
     pose: Array,
     mounting: tuple[float, float, float],

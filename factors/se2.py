@@ -152,7 +152,7 @@ def arc_coefficients(phi: float) -> tuple[float, float]:
     """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle."""
     if abs(phi) < _SMALL_ANGLE:
         return 1.0 - phi * phi / 6.0, phi / 2.0
-    return math.sin(phi) / phi, (1.0 - math.cos(phi)) / phi
+    return math.sin(phi) / phi, 2.0 * math.sin(phi / 2.0) ** 2 / phi
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
@@ -160,7 +160,8 @@ def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
     small = np.abs(phi) < _SMALL_ANGLE
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, phi / 2.0, (1.0 - np.cos(safe)) / safe)
+    # 1 - cos(phi) by the half angle: the difference would lose its digits
+    b = np.where(small, phi / 2.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     return a, b
 
 

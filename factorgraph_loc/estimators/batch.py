@@ -69,6 +69,6 @@ class Batch(GraphEstimator):
 
     def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
         if keyframe.index == len(self._guesses) - 1:
-            delta, self._covariance, _ = robust_update(factor, self._pose, self._covariance, ITERATIONS_OF_GUESS)
-            self._pose = se2.compose(self._pose, se2.exp(delta))
+            update = robust_update(factor, self._pose, self._covariance, ITERATIONS_OF_GUESS)
+            self._pose, self._covariance = se2.compose(self._pose, se2.exp(update.delta)), update.covariance
             self._guesses[-1] = self._pose

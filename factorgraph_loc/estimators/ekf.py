@@ -119,9 +119,9 @@ class Ekf(Filter):
         prior = self._state
         if self._predicted is None:
             self._predicted = prior
-        delta, covariance, innovation = robust_update(seen, prior.pose, prior.covariance, self._iterations)
-        self._landmarks.report(m.t, seen, innovation)
-        self._state = prior.plus(delta, covariance)
+        update = robust_update(seen, prior.pose, prior.covariance, self._iterations)
+        self.diagnostics.innovation("bearing_range", m.t, update.nis, update.dof)
+        self._state = prior.plus(update.delta, update.covariance)
 
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance[:3, :3])

@@ -29,7 +29,7 @@ from factors.bearing_range import BearingRangeFactor
 from factors.odometry import PARAMETERS, ChainState, Increment, OdometryFactor, recalibrated
 from factors.se2 import Array
 
-ITERATIONS_OF_GUESS = 5
+ITERATIONS_OF_GUESS = 1
 
 
 class GraphSettings(FileModel):
@@ -116,9 +116,11 @@ class GraphEstimator(ABC):
         """The newest keyframe, moved along the odometry since."""
         if self._prior is None:
             return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
-        since = self._since(self._keyframes[-1], self._t)
-        pose = se2.compose(self._pose, since.delta)
-        return PoseEstimate(self._t, pose, se2.body_to_world(pose, propagate(self._covariance, since)), "localized")
+        pose, covariance = self._pose, self._covariance
+        if self._t > self._keyframes[-1].t:
+            since = self._since(self._keyframes[-1], self._t)
+            pose, covariance = se2.compose(pose, since.delta), propagate(covariance, since)
+        return PoseEstimate(self._t, pose, se2.body_to_world(pose, covariance), "localized")
 
     def belief(self) -> Belief:
         """The belief behind :meth:`estimate`."""
@@ -165,8 +167,8 @@ class GraphEstimator(ABC):
         factor = self._landmarks.factor(m, self._since(before, m.t) if m.t > before.t else None)
         if factor is not None:
             if before is newest:
-                _, _, innovation = robust_update(factor, self._pose, self._covariance, 1)
-                self._landmarks.report(m.t, factor, innovation)
+                seen = robust_update(factor, self._pose, self._covariance, iterations=1)
+                self.diagnostics.innovation("bearing_range", m.t, seen.nis, seen.dof)
             before.factors.append(factor)
             self._attach(before, factor)
 
@@ -180,9 +182,9 @@ class GraphEstimator(ABC):
         factor = None if m is None else self._landmarks.factor(m)
         if factor is not None:
             # the guess is where the graph linearises first, and what the robust weights are computed at
-            delta, covariance, innovation = robust_update(factor, pose, covariance, ITERATIONS_OF_GUESS)
-            self._landmarks.report(t, factor, innovation)
-            pose = se2.compose(pose, se2.exp(delta))
+            seen = robust_update(factor, pose, covariance, ITERATIONS_OF_GUESS)
+            self.diagnostics.innovation("bearing_range", t, seen.nis, seen.dof)
+            pose, covariance = se2.compose(pose, se2.exp(seen.delta)), seen.covariance
             keyframe.factors.append(factor)
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)

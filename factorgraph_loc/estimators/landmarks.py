@@ -43,64 +43,65 @@ class KnownLandmarks:
             return BearingRangeFactor(self._model, points, ranges, bearings)
         return BearingRangeFactor(self._model, points, ranges, bearings, offset.delta, offset.covariance)
 
-    def report(self, t: float, factor: BearingRangeFactor, innovation: Innovation) -> None:
-        """Record the normalised innovation squared, over the values that were measured."""
-        used = np.column_stack((~np.isnan(factor.ranges), ~np.isnan(factor.bearings))).ravel()
-        e, s = innovation.error[used], innovation.covariance[np.ix_(used, used)]
-        self._diagnostics.innovation("bearing_range", t, float(e @ np.linalg.solve(s, e)), len(e))
-
 
 @dataclass(frozen=True)
-class Innovation:
-    """Whitened measurement less prediction (2K,), and its covariance (2K, 2K) under prediction and noise."""
+class Update:
+    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and the normalised
+    innovation squared (``nis``) at the prediction with its degrees of freedom."""
 
-    error: Array
+    delta: Array
     covariance: Array
+    nis: float
+    dof: int
 
 
-def robust_update(
-    factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int
-) -> tuple[Array, Array, Innovation]:
-    """Kalman update of ``pose`` (3,) and further states, robust and iterated.
+def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int) -> Update:
+    """Kalman update of ``pose`` (3,) and further states, robust and iterated, in information form.
 
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. At first a
     landmark whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that
     it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
     Cauchy weight at the updated pose (iteratively reweighted least squares).
-    Returns the correction (S,), the updated covariance and the innovation at the prediction.
     """
-    size = len(covariance)
-    delta = np.zeros(size)
+    prior: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
+    delta: Array = np.zeros(len(covariance))
+    nis = 0.0
     for iteration in range(iterations):
-        residual, jacobian = factor.whitened(pose if iteration == 0 else se2.compose(pose, se2.exp(delta[:3])))
-        h = np.zeros((residual.size, size))
-        h[:, :3] = jacobian.reshape(-1, 3)
-        spread = h @ covariance @ h.T
-        error = h @ delta - residual.ravel()
+        residual, blocks = factor.whitened(pose if iteration == 0 else se2.compose(pose, se2.exp(delta[:3])))
+        jacobian = blocks.reshape(-1, 3)
         if iteration == 0:
-            first = Innovation(error, spread + np.eye(len(error)))
-            widening = np.maximum(1.0, _per_landmark(first) / GATE) ** 2
+            nis = _total(residual.ravel(), jacobian, prior)
+            weight = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:3, :3]) / GATE) ** -2
         else:
-            widening = 1.0 / cauchy_weight(np.sum(residual**2, axis=-1), factor.model.robust)
-        noise = np.repeat(widening, 2)
-        gain = np.linalg.solve(spread + np.diag(noise), h @ covariance).T
-        step = gain @ error
+            weight = cauchy_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
+        weighted = jacobian.T * np.repeat(weight, 2)
+        information = prior.copy()
+        information[:3, :3] += weighted @ jacobian
+        updated = np.linalg.inv(information)
+        step = updated[:, :3] @ (weighted @ (jacobian @ delta[:3] - residual.ravel()))
         settled = np.abs(step - delta).max() < CONVERGED
-        delta = step
+        delta = np.asarray(step, dtype=float)
         if settled:
             break
-    keep = np.eye(size) - gain @ h
-    updated = keep @ covariance @ keep.T + (gain * noise) @ gain.T
-    return delta, (updated + updated.T) / 2.0, first
+    dof = int(np.count_nonzero(~np.isnan(factor.ranges)) + np.count_nonzero(~np.isnan(factor.bearings)))
+    return Update(delta, (updated + updated.T) / 2.0, nis, dof)
 
 
-def _per_landmark(innovation: Innovation) -> Array:
+def _total(error: Array, jacobian: Array, prior: Array) -> float:
+    """Normalised innovation squared of all landmarks together, by the matrix inversion lemma."""
+    information = prior.copy()
+    information[:3, :3] += jacobian.T @ jacobian
+    pull = np.zeros(len(prior))
+    pull[:3] = jacobian.T @ error
+    return float(error @ error - pull @ np.linalg.solve(information, pull))
+
+
+def _per_landmark(residual: Array, blocks: Array, covariance: Array) -> Array:
     """Normalised innovation squared (K,) of each landmark by itself."""
-    count = len(innovation.error) // 2
-    i = np.arange(count)
-    blocks = innovation.covariance.reshape(count, 2, count, 2)[i, :, i, :]
-    e = innovation.error.reshape(count, 2)
-    return np.asarray(np.sum(e * np.linalg.solve(blocks, e[:, :, None])[:, :, 0], axis=-1))
+    s = blocks @ covariance @ blocks.transpose(0, 2, 1)
+    a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
+    x, y = residual[:, 0], residual[:, 1]
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
 
 
 def _has_value(m: BearingRange, i: int) -> bool:

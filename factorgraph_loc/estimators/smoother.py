@@ -7,6 +7,7 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
@@ -18,7 +19,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
 from factorgraph_loc.estimators.problem import PARAMETERS_KEY
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.solvers import FullHistory, Node, Solver, Window
+from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Node, Solver, Window
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range import BearingRangeFactor
@@ -106,15 +107,18 @@ class Smoother(GraphEstimator):
         return pose, covariance
 
     def _leave(self, now: float) -> None:
-        """Keep the estimates of the keyframes that the next update marginalises out."""
-        if self._settings.lag is None:
+        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out."""
+        if not isinstance(self._solver, Window) or self._settings.lag is None:
             return
-        while self._keyframes[len(self._left)].t < now - self._settings.lag:
-            keyframe = self._keyframes[len(self._left)]
-            try:
-                self._left.append(self._marginal(keyframe))
-            except RuntimeError:
-                self._left.append(self._filtered[keyframe.index])
+        lag, count = self._settings.lag, len(self._left)
+        if self._keyframes[count].t >= now - lag - MARGIN:
+            return
+        leaving = list(itertools.takewhile(lambda k: k.t < now - lag, itertools.islice(self._keyframes, count, None)))
+        try:
+            covariances = self._solver.covariances([k.key for k in leaving])
+            self._left += [(self._solver.pose(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
+        except RuntimeError:
+            self._left += [self._filtered[k.index] for k in leaving]
 
     def _rebuild(self, newest: Keyframe) -> None:
         try:

@@ -22,6 +22,7 @@ from factors.se2 import Array
 RELINEARIZE_SKIP = 10  # updates between checks of which factors of the full history to linearise anew
 RECENT = 200  # variables that are checked then; older ones hardly move before the end
 MOVED = np.array((0.05, 0.05, 0.03))  # m, m, rad: how far a pose may be from where its factors were linearised
+MARGIN = 1.0  # s that a pose stays longer in a window
 MAX_FINAL_UPDATES = 20
 CONVERGED = 1e-4  # m, rad: of the final updates
 
@@ -114,10 +115,10 @@ class FullHistory:
 
 
 class Window:
-    """Poses older than ``lag`` are marginalised out."""
+    """Poses older than ``lag``, and a margin so that they can be read several at a time, are marginalised out."""
 
     def __init__(self, parameters: gtsam.ISAM2Params, lag: float, on_failure: Callable[[str], None]) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
+        self._smoother = gtsam.IncrementalFixedLagSmoother(lag + MARGIN, parameters)
         self._has_parameters = False
         self._on_failure = on_failure
 
@@ -139,6 +140,11 @@ class Window:
 
     def covariance(self, key: int) -> Array:
         return np.asarray(self._smoother.marginalCovariance(key))
+
+    def covariances(self, keys: Sequence[int]) -> list[Array]:
+        """Marginal covariances of neighbouring poses, together: they share most of the work."""
+        joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
+        return [np.asarray(joint.at(key, key)) for key in keys]
 
     def _custom(self, node: Node, parameters: Array | None) -> gtsam.NonlinearFactor:
         assert node.factor is not None
