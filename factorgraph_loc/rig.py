@@ -83,7 +83,7 @@ class BearingRangeSettings(FileModel):
     range_sigma: Annotated[float, Field(gt=0.0, le=10.0, description="m")]
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
     bearing_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad, not degrees")] = 0.05
-    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of the Cauchy loss, in sigmas")] = 1.0
+    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
 
     def model(self) -> BearingRangeModel:
         return BearingRangeModel(

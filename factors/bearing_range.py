@@ -2,7 +2,8 @@
 
 A sensor sits on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and
 ``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
-eq. 6.40). The noise is Gaussian in its core with the heavy tails of a Cauchy loss, joint over range and bearing of one landmark.
+eq. 6.40). The noise is Gaussian in its core; far from it the loss of Geman and McClure levels off, jointly for range
+and bearing of one landmark.
 """
 
 import math
@@ -22,7 +23,7 @@ class BearingRangeModel:
 
     ``mounting``: (x, y, heading) of the sensor in the robot's frame. ``range_scale``: reported over true. The standard
     deviation of a range r is ``hypot(range_sigma, range_sigma_relative * r)`` [m]; that of a bearing is ``bearing_sigma`` [rad].
-    ``robust``: scale of the Cauchy loss in standard deviations.
+    ``robust``: scale of the Geman-McClure loss in standard deviations.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -31,7 +32,7 @@ class BearingRangeModel:
     range_sigma_relative: float = 0.0
     bearing_bias: float = 0.0
     bearing_sigma: float = 0.05
-    robust: float = 1.0
+    robust: float = 4.0
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
@@ -151,20 +152,23 @@ def _whitened(
             jacobian[k, 1, 2] = (-uy * py - ux * px) * weight
 
 
-def cauchy_weight(squared: Array, scale: float) -> Array:
-    """Weight of a squared whitened residual under the Cauchy loss (Holland and Welsch, 1977)."""
-    return 1.0 / (1.0 + np.asarray(squared) / scale**2)
+def robust_weight(squared: Array, scale: float) -> Array:
+    """Weight of a squared whitened residual under the loss of Geman and McClure (1985)."""
+    return (1.0 + np.asarray(squared) / scale**2) ** -2
 
 
-def cauchy_loss(squared: Array, scale: float) -> Array:
-    """Cauchy loss of a squared whitened residual; a half of it where that is small."""
-    return 0.5 * scale**2 * np.log1p(np.asarray(squared) / scale**2)
+def robust_loss(squared: Array, scale: float) -> Array:
+    """Loss of Geman and McClure of a squared whitened residual: a half of it where that is small, never above ``scale^2 / 2``.
+
+    It forgets what is far off: a landmark that stands elsewhere than the map says does not pull at all.
+    """
+    return 0.5 * np.asarray(squared) / (1.0 + np.asarray(squared) / scale**2)
 
 
 def log_likelihood(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
     """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3)."""
     error = residuals(model, poses[:, None, :], points, ranges, bearings)
-    loss: Array = np.sum(cauchy_loss(np.sum(error**2, axis=-1), model.robust), axis=-1)
+    loss: Array = np.sum(robust_loss(np.sum(error**2, axis=-1), model.robust), axis=-1)
     return -loss
 
 
@@ -186,13 +190,13 @@ class BearingRangeFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, 3) by the pose ``values[0]`` (3,)."""
         error, jacobian = self.whitened(values[0])
-        weight = np.sqrt(cauchy_weight(np.sum(error**2, axis=-1), self.model.robust))
+        weight = np.sqrt(robust_weight(np.sum(error**2, axis=-1), self.model.robust))
         return (weight[:, None] * error).ravel(), [(weight[:, None, None] * jacobian).reshape(-1, 3)]
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss at the pose ``values[0]``."""
         error, _ = self.whitened(values[0])
-        return float(np.sum(cauchy_loss(np.sum(error**2, axis=-1), self.model.robust)))
+        return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
     def widened(self, width: float) -> "BearingRangeFactor":
         """The same with a robust loss that is ``width`` times as wide."""

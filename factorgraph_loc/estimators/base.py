@@ -63,11 +63,13 @@ class Learnt:
 class Diagnostics:
     """Counts and consistency figures of a run.
 
-    ``nis``: by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``:
-    counts by reason. ``events``: (t, what happened), for example a rebuilt graph.
+    ``residuals``: by sensor and value (``bearing_range.range`` in m), measurement less prediction, before the update. ``nis``: by
+    sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by reason.
+    ``events``: (t, what happened), for example a rebuilt graph.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    residuals: dict[str, list[float]] = field(default_factory=dict)
     ignored: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
     late: dict[str, int] = field(default_factory=dict)

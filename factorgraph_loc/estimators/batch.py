@@ -2,7 +2,7 @@
 
 While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
 are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins
-wide and narrows to its own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Cauchy loss).
+wide and narrows to its own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss).
 """
 
 from __future__ import annotations

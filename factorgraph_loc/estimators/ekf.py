@@ -120,7 +120,7 @@ class Ekf(Filter):
         if self._predicted is None:
             self._predicted = prior
         update = robust_update(seen, prior.pose, prior.covariance, self._iterations)
-        self.diagnostics.innovation("bearing_range", m.t, update.nis, update.dof)
+        self._landmarks.report(m.t, seen, update)
         self._state = prior.plus(update.delta, update.covariance)
 
     def _estimate(self) -> PoseEstimate:

@@ -168,7 +168,7 @@ class GraphEstimator(ABC):
         if factor is not None:
             if before is newest:
                 seen = robust_update(factor, self._pose, self._covariance, iterations=1)
-                self.diagnostics.innovation("bearing_range", m.t, seen.nis, seen.dof)
+                self._landmarks.report(m.t, factor, seen)
             before.factors.append(factor)
             self._attach(before, factor)
 
@@ -183,7 +183,7 @@ class GraphEstimator(ABC):
         if factor is not None:
             # the guess is where the graph linearises first, and what the robust weights are computed at
             seen = robust_update(factor, pose, covariance, ITERATIONS_OF_GUESS)
-            self.diagnostics.innovation("bearing_range", t, seen.nis, seen.dof)
+            self._landmarks.report(t, factor, seen)
             pose, covariance = se2.compose(pose, se2.exp(seen.delta)), seen.covariance
             keyframe.factors.append(factor)
         self._keyframes.append(keyframe)

@@ -10,7 +10,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
 from factors import se2
-from factors.bearing_range import BearingRangeFactor, cauchy_weight
+from factors.bearing_range import BearingRangeFactor, robust_weight, sigmas
 from factors.odometry import Increment
 from factors.se2 import Array
 
@@ -43,14 +43,23 @@ class KnownLandmarks:
             return BearingRangeFactor(self._model, points, ranges, bearings)
         return BearingRangeFactor(self._model, points, ranges, bearings, offset.delta, offset.covariance)
 
+    def report(self, t: float, factor: BearingRangeFactor, update: Update) -> None:
+        """Record the innovation of an update at time ``t``."""
+        self._diagnostics.innovation("bearing_range", t, update.nis, update.dof)
+        errors = -update.residual * sigmas(factor.model, factor.ranges)
+        for i, (name, measured) in enumerate((("range", factor.ranges), ("bearing", factor.bearings))):
+            found = errors[~np.isnan(measured), i].tolist()
+            self._diagnostics.residuals.setdefault(f"bearing_range.{name}", []).extend(found)
+
 
 @dataclass(frozen=True)
 class Update:
-    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and the normalised
-    innovation squared (``nis``) at the prediction with its degrees of freedom."""
+    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and at the prediction
+    the whitened ``residual`` (K, 2), predicted less measured, and its normalised square (``nis``) with degrees of freedom."""
 
     delta: Array
     covariance: Array
+    residual: Array
     nis: float
     dof: int
 
@@ -61,19 +70,20 @@ def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, it
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. At first a
     landmark whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that
     it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
-    Cauchy weight at the updated pose (iteratively reweighted least squares).
+    robust weight at the updated pose (iteratively reweighted least squares).
     """
     prior: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     delta: Array = np.zeros(len(covariance))
-    nis = 0.0
+    nis, first = 0.0, np.zeros((0, 2))
     for iteration in range(iterations):
         residual, blocks = factor.whitened(pose if iteration == 0 else se2.compose(pose, se2.exp(delta[:3])))
         jacobian = blocks.reshape(-1, 3)
         if iteration == 0:
+            first = residual
             nis = _total(residual.ravel(), jacobian, prior)
             weight = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:3, :3]) / GATE) ** -2
         else:
-            weight = cauchy_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
+            weight = robust_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
         weighted = jacobian.T * np.repeat(weight, 2)
         information = prior.copy()
         information[:3, :3] += weighted @ jacobian
@@ -84,7 +94,7 @@ def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, it
         if settled:
             break
     dof = int(np.count_nonzero(~np.isnan(factor.ranges)) + np.count_nonzero(~np.isnan(factor.bearings)))
-    return Update(delta, (updated + updated.T) / 2.0, nis, dof)
+    return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
 
 
 def _total(error: Array, jacobian: Array, prior: Array) -> float:

@@ -131,7 +131,7 @@ class ParticleFilter(Filter):
             return
         mean, covariance = pose_moments(self._state.poses, np.exp(self._state.log_weights))
         update = robust_update(seen, mean, se2.world_to_body(mean, covariance), iterations=1)
-        self.diagnostics.innovation("bearing_range", m.t, update.nis, update.dof)
+        self._landmarks.report(m.t, seen, update)
         log_weights = self._state.log_weights + log_likelihood(
             seen.model, self._state.poses, seen.points, seen.ranges, seen.bearings
         )

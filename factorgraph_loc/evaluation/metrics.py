@@ -205,7 +205,8 @@ def _rms(values: Array) -> float | None:
 
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
-    """NIS by sensor (total NIS over total degrees of freedom, ideally 1; share beyond the 95 % bound), and what was left out."""
+    """NIS by sensor (total NIS over total degrees of freedom, ideally 1; share beyond the 95 % bound), residuals at the
+    prediction (m, rad), and what was left out."""
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
@@ -213,6 +214,10 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
             figures[f"nis.{sensor}.mean_per_dof"] = float(nis.sum() / dof.sum())
             figures[f"nis.{sensor}.beyond_95"] = float(np.mean(nis > chi2.ppf(CONFIDENCE, dof)))
         figures[f"nis.{sensor}.count"] = len(rows)
+    for name, errors in sorted(diagnostics.residuals.items()):
+        if errors:
+            figures[f"residual.{name}.rms"] = _rms(np.array(errors))
+            figures[f"residual.{name}.median_abs"] = float(np.median(np.abs(errors)))
     for kind in ("ignored", "rejected", "late"):
         counts: dict[str, int] = getattr(diagnostics, kind)
         figures[f"{kind}.total"] = sum(counts.values())

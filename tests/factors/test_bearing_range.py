@@ -10,12 +10,12 @@ from factors import se2
 from factors.bearing_range import (
     BearingRangeFactor,
     BearingRangeModel,
-    cauchy_loss,
-    cauchy_weight,
     jacobians,
     log_likelihood,
     predict,
     residuals,
+    robust_loss,
+    robust_weight,
     sigmas,
     whitened,
 )
@@ -141,10 +141,10 @@ def test_ranges_with_a_mounting_are_those_of_gtsams_factor(pose, point):
 @given(st.floats(0.0, 100.0), st.floats(0.5, 5.0))
 def test_the_weight_is_the_slope_of_the_loss(squared, scale):
     step = 1e-5
-    slope = (cauchy_loss(squared + step, scale) - cauchy_loss(max(squared - step, 0.0), scale)) / (
+    slope = (robust_loss(squared + step, scale) - robust_loss(max(squared - step, 0.0), scale)) / (
         squared + step - max(squared - step, 0.0)
     )
-    assert 2.0 * slope == pytest.approx(float(cauchy_weight(np.array(squared), scale)), rel=1e-3)
+    assert 2.0 * slope == pytest.approx(float(robust_weight(np.array(squared), scale)), rel=1e-3)
 
 
 def test_the_likelihood_of_particles_is_the_cost_of_the_factor():
