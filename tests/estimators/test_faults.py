@@ -1,0 +1,350 @@
+"""Every estimator on a simulated run, clean and with what goes wrong on real ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.solvers import FullHistory, Window
+from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import StartPose, VelocityStream
+from factorgraph_loc.trajectory import Trajectory
+
+CONFIGS = {
+    "ekf": RunConfig("ekf"),
+    "particle_filter": RunConfig("particle_filter", {"particles": 500}),
+    "smoother": RunConfig("smoother"),
+    "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
+    "batch": RunConfig("batch"),
+}
+DEAD_RECKONING = RunConfig("dead_reckoning")
+EXACT = ("ekf", "smoother", "smoother_lag", "batch")  # no random numbers
+CAUSAL = ("ekf", "particle_filter", "smoother", "smoother_lag")
+
+
+@pytest.fixture(scope="module")
+def log(simulate):
+    return simulate(seconds=30.0)
+
+
+@pytest.fixture(scope="module")
+def clean(log):
+    """``clean(name)``: the result on the undisturbed log, computed once."""
+    known = {}
+
+    def of(name):
+        if name not in known:
+            known[name] = run(log, DEAD_RECKONING if name == "dead_reckoning" else CONFIGS[name])
+        return known[name]
+
+    return of
+
+
+def with_sightings(log, **columns):
+    return replace(log, streams={**log.streams, "bearing_range": replace(log.streams["bearing_range"], **columns)})
+
+
+def rows_of(stream, rows):
+    """The rows of a landmark stream, in that order."""
+    names = [stream.landmark[i] for i in rows]
+    return {"t": stream.t[rows], "landmark": names, "range": stream.range[rows], "bearing": stream.bearing[rows]}
+
+
+def silent(log, sensor, start, end):
+    """The log without the rows of a sensor from ``start`` to ``end``."""
+    stream = log.streams[sensor]
+    rows = np.flatnonzero((stream.t < start) | (stream.t >= end))
+    if sensor == "bearing_range":
+        return with_sightings(log, **rows_of(stream, rows))
+    cut = VelocityStream(stream.t[rows], stream.v[rows], stream.w[rows])
+    return replace(log, streams={**log.streams, sensor: cut})
+
+
+def distance(a, b):
+    """Largest distance [m] between two trajectories or results."""
+    return np.hypot(*(a.poses - b.poses)[:, :2].T).max()
+
+
+def rmse(result, log):
+    """Position errors [m] of a result: causal (None for batch) and final."""
+    scores = score(result, log)
+    return scores["causal.position_rmse"], scores["final.position_rmse"]
+
+
+def sigma(result, t):
+    """Largest standard deviation [m] of the causal position at a tick."""
+    (i,) = np.flatnonzero(np.isclose(result.t, t))
+    return np.sqrt(np.linalg.eigvalsh(result.covariances[i][:2, :2])[-1])
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_clean(name, log, clean):
+    """The bounds are false alarms in less than one run of a thousand, taken as normal.
+
+    Over 40 other seeds causal errors are 0.031 m with a deviation of 0.003 m, and ANEES lie from 2.1 (particle filter, final)
+    to 2.9 (EKF, causal) with deviations of 0.32 to 0.40.
+    """
+    scores = score(clean(name), log)
+    lost = score(clean("dead_reckoning"), log)
+    for kind in ("final",) if name == "batch" else ("causal", "final"):
+        assert scores[f"{kind}.position_rmse"] < 0.05
+        assert scores[f"{kind}.position_rmse"] < 0.2 * lost[f"{kind}.position_rmse"]
+        assert scores[f"{kind}.heading_rmse"] < 0.05
+        assert 1.0 < scores[f"{kind}.anees"] < 4.5
+        assert scores[f"{kind}.invalid_covariances"] == 0
+
+
+def test_final_is_better_than_causal(log, clean):
+    for name in CAUSAL:
+        causal, final = rmse(clean(name), log)
+        assert final < 0.9 * causal
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.025, 0.02)], ids=["stands", "creeps"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_gap_in_all_sensors(name, motion, simulate):
+    """In the gap the robot stands, or moves by 1.5 m and 1.2 rad: about the sigmas that the rig gives to unknown motion."""
+
+    def speeds(t):
+        gap = (t >= 10.0) & (t < 70.0)
+        return np.where(gap, motion[0], 0.3), np.where(gap, motion[1], 0.15)
+
+    log = simulate(seconds=80.0, speeds=speeds)
+    for sensor in log.streams:
+        log = silent(log, sensor, 10.0, 70.0)
+    # 500 particles are too few for a cloud as wide as that
+    result = run(log, RunConfig(name) if name == "particle_filter" else CONFIGS[name])
+    assert np.all(np.isfinite(result.poses))
+    assert np.all(np.isfinite(result.final.covariances))
+    late = errors(result.final, log.reference).position[result.final.t > 75.0]
+    assert late.max() < 0.3
+    if name != "batch":
+        assert sigma(result, 10.0) < 0.1
+        assert sigma(result, 40.0) > 0.5
+        assert sigma(result, 69.9) > 1.2 * sigma(result, 40.0)
+        causal = errors(result.causal(), log.reference)
+        assert causal.position[result.t > 75.0].max() < 0.3
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_gap_in_odometry_alone(name, simulate):
+    """The robot drives on at 0.3 m/s for 60 s without odometry, and sees landmarks all the while."""
+    log = silent(simulate(seconds=75.0), "odometry", 8.0, 68.0)
+    result = run(log, CONFIGS[name])
+    assert errors(result.final, log.reference).position.max() < 0.5
+    if name != "batch":
+        assert errors(result.causal(), log.reference).position[result.t > 73.0].max() < 0.3
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_unknown_landmarks_are_ignored(name, log, clean):
+    """A ghost joins each stamp."""
+    stream = log.streams["bearing_range"]
+    first = np.flatnonzero(np.diff(stream.t, prepend=-1.0))
+    haunted = with_sightings(
+        log,
+        t=np.insert(stream.t, first, stream.t[first]),
+        landmark=np.insert(np.array(stream.landmark, dtype=object), first, "ghost").tolist(),
+        range=np.insert(stream.range, first, 1.0),
+        bearing=np.insert(stream.bearing, first, 0.0),
+    )
+    result = run(haunted, CONFIGS[name])
+    assert result.diagnostics.ignored == {"landmark not in the map": len(first)}
+    assert distance(result, clean(name)) == 0.0
+    assert distance(result.final, clean(name).final) == 0.0
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_only_unknown_landmarks_is_dead_reckoning(name, log, clean):
+    stream = log.streams["bearing_range"]
+    result = run(with_sightings(log, landmark=["ghost"] * len(stream.t)), CONFIGS[name])
+    assert result.diagnostics.ignored == {"landmark not in the map": len(stream.t)}
+    np.testing.assert_allclose(result.final.poses, clean("dead_reckoning").final.poses, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("how", ["not asked for", "no rows"])
+def test_no_landmarks_is_dead_reckoning(name, how, log, clean):
+    if how == "no rows":
+        blind = with_sightings(log, t=np.empty(0), landmark=[], range=np.empty(0), bearing=np.empty(0))
+        result = run(blind, CONFIGS[name])
+    else:
+        result = run(log, replace(CONFIGS[name], sensors=("odometry",)))
+    expected = clean("dead_reckoning")
+    n = len(result.t)
+    assert n > 290
+    np.testing.assert_allclose(result.poses, expected.poses[:n], atol=1e-6)
+    np.testing.assert_allclose(result.final.poses, expected.final.poses[:n], atol=1e-6)
+
+
+@pytest.mark.parametrize("pair", ["ae", "bh", "cd"])
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_two_landmarks_swapped(name, pair, log, clean):
+    landmarks = dict(log.world.landmarks)
+    one, other = pair
+    landmarks[one], landmarks[other] = landmarks[other], landmarks[one]
+    world = log.world.model_copy(update={"landmarks": landmarks})
+    result = run(replace(log, world=world), CONFIGS[name])
+    assert distance(result.final, clean(name).final) > 1e-4
+    assert rmse(result, log)[1] < 2.0 * rmse(clean(name), log)[1]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_gross_outliers(name, log, clean):
+    """A tenth of the rows says anything."""
+    rng = np.random.default_rng(5)
+    stream = log.streams["bearing_range"]
+    wrong = rng.random(len(stream.t)) < 0.1
+    worse = with_sightings(
+        log,
+        range=np.where(wrong, rng.uniform(0.0, 10.0, len(wrong)), stream.range),
+        bearing=np.where(wrong, rng.uniform(-np.pi, np.pi, len(wrong)), stream.bearing),
+    )
+    for disturbed, normal in zip(rmse(run(worse, CONFIGS[name]), log), rmse(clean(name), log), strict=True):
+        if normal is not None:
+            assert disturbed < 2.5 * normal + 0.05
+
+
+def delayed(stream, delay):
+    """The rows in order of arrival, each ``delay`` (N,) [s] after its stamp."""
+    return rows_of(stream, np.argsort(stream.t + delay, kind="stable"))
+
+
+@pytest.fixture(scope="module")
+def frequent(simulate):
+    return simulate(rate=8.0, seconds=15.0)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_late_rows(name, frequent):
+    """Each row arrives up to 0.4 s late, also behind others of its stamp."""
+    stream = frequent.streams["bearing_range"]
+    late = with_sightings(frequent, **delayed(stream, np.random.default_rng(3).uniform(0.0, 0.4, len(stream.t))))
+    assert np.min(np.diff(late.streams["bearing_range"].t)) < -0.3
+    result, expected = run(late, CONFIGS[name]), run(frequent, CONFIGS[name])
+    assert not result.diagnostics.late
+    if name == "particle_filter":
+        assert rmse(result, frequent)[1] < 1.5 * rmse(expected, frequent)[1]
+        return
+    # a window is seldom linearised anew, so that the order of its factors shows
+    assert 0.0 < distance(result.final, expected.final) < (0.02 if name == "smoother_lag" else 0.01)
+    if name != "batch":
+        assert np.hypot(*(result.poses[-1] - expected.poses[-1])[:2]) < 0.01
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_too_late_rows_are_dropped(name, frequent):
+    """All rows of every tenth stamp arrive 1 s late."""
+    stream = frequent.streams["bearing_range"]
+    stamps = np.unique(stream.t)
+    chosen = stamps[:-20:10]
+    slow = np.isin(stream.t, chosen)
+    result = run(with_sightings(frequent, **delayed(stream, np.where(slow, 1.0, 0.0))), CONFIGS[name])
+    assert sum(result.diagnostics.late.values()) == len(chosen)
+    expected = run(with_sightings(frequent, **rows_of(stream, np.flatnonzero(~slow))), CONFIGS[name])
+    assert distance(result, expected) < 1e-9
+    assert distance(result.final, expected.final) < 1e-9
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_landmarks_before_the_first_odometry(name, log, clean):
+    """With a known start they count; with the reference's they lie before it and are ignored."""
+    first = 1.0
+    late = silent(log, "odometry", 0.0, first)
+    known = replace(late, start=StartPose(0.0, log.reference.poses[0], np.array((0.02, 0.02, 0.01))))
+    result = run(known, CONFIGS[name])
+    assert result.t[0] == 0.0
+    assert result.diagnostics.ignored == {}
+    assert rmse(result, log)[1] < 1.5 * rmse(clean(name), log)[1] + 0.02
+    result = run(late, CONFIGS[name])
+    t = log.streams["bearing_range"].t
+    assert result.t[0] == pytest.approx(first)
+    assert result.diagnostics.ignored == {"before the start": len(np.unique(t[t < first]))}
+    assert rmse(result, log)[1] < 1.5 * rmse(clean(name), log)[1]
+
+
+@pytest.mark.parametrize("missing", ["range", "bearing", "either"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_range_or_bearing_missing(name, missing, log):
+    stream = log.streams["bearing_range"]
+    coin = np.random.default_rng(2).random(len(stream.t)) < 0.5
+    no_range = {"range": np.ones_like(coin), "bearing": np.zeros_like(coin), "either": coin}[missing]
+    no_bearing = {"range": np.zeros_like(coin), "bearing": np.ones_like(coin), "either": ~coin}[missing]
+    partial = with_sightings(
+        log, range=np.where(no_range, np.nan, stream.range), bearing=np.where(no_bearing, np.nan, stream.bearing)
+    )
+    result = run(partial, CONFIGS[name])
+    assert result.diagnostics.ignored == {}
+    assert max(e for e in rmse(result, log) if e is not None) < 0.12
+    if name != "batch":
+        assert sum(dof for _, _, dof in result.diagnostics.nis["bearing_range"]) == len(stream.t)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
+def test_neither_range_nor_bearing_is_ignored(name, log):
+    stream = log.streams["bearing_range"]
+    empty = np.arange(len(stream.t)) % 7 == 3
+    holed = with_sightings(
+        log, range=np.where(empty, np.nan, stream.range), bearing=np.where(empty, np.nan, stream.bearing)
+    )
+    result = run(holed, CONFIGS[name])
+    expected = run(with_sightings(log, **rows_of(stream, np.flatnonzero(~empty))), CONFIGS[name])
+    assert sum(result.diagnostics.ignored.values()) == empty.sum()
+    assert distance(result.final, expected.final) == 0.0
+
+
+def test_particle_filter_repeats_with_its_seed(log, clean):
+    again = run(log, CONFIGS["particle_filter"])
+    np.testing.assert_array_equal(again.poses, clean("particle_filter").poses)
+    np.testing.assert_array_equal(again.final.poses, clean("particle_filter").final.poses)
+    other = run(log, replace(CONFIGS["particle_filter"], seed=1))
+    assert distance(other, again) > 1e-3
+    assert distance(other.final, again.final) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "solver", "tolerance"), [("smoother", FullHistory, 1e-3), ("smoother_lag", Window, 0.02)]
+)
+def test_solver_fails_in_mid_run(name, solver, tolerance, log, clean, monkeypatch):
+    """The failing update has been applied when it raises."""
+    update, calls = solver.update, []
+
+    def failing(self, *arguments):
+        update(self, *arguments)
+        calls.append(None)
+        if len(calls) == 60:
+            raise RuntimeError("made to fail\nwith a second line")
+
+    monkeypatch.setattr(solver, "update", failing)
+    result = run(log, CONFIGS[name])
+    ((t, event),) = result.diagnostics.events
+    assert 10.0 < t < 20.0
+    assert "rebuilt" in event
+    assert "made to fail" in event
+    assert clean(name).diagnostics.events == []
+    assert result.diagnostics.rejected == {}
+    assert distance(result.final, clean(name).final) < tolerance
+    assert distance(result, clean(name)) < tolerance
+
+
+def test_long_way_without_landmarks(simulate):
+    log = simulate(seconds=300.0, speeds=lambda t: (np.full(len(t), 0.3), np.zeros(len(t))))
+    settings = {"keyframe_max_interval": 0.05}
+    result = run(log, RunConfig("smoother", settings, sensors=("odometry",)))
+    assert len(result.t) == 3001
+    assert result.diagnostics.events == []
+    expected = Trajectory(result.t, np.column_stack((0.3 * result.t, 0.0 * result.t, 0.0 * result.t)))
+    assert distance(result.final, expected) < 1e-4
+
+
+def test_unknown_estimator_names_the_nearest(log):
+    with pytest.raises(InputError, match=r"'smother'.*smoother"):
+        run(log, RunConfig("smother"))
+
+
+@pytest.mark.parametrize("config", [DEAD_RECKONING, *CONFIGS.values()], ids=lambda c: c.estimator)
+def test_unknown_setting(config, log):
+    with pytest.raises(InputError, match="wheels"):
+        run(log, replace(config, settings={"wheels": 4}))
