@@ -1,0 +1,70 @@
+"""Estimators on recorded logs: accuracy that must not get lost, and maps that are wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import BearingRangeStream, VelocityStream
+from factorgraph_loc.readers import load
+
+
+@pytest.fixture(scope="module")
+def plaza2():
+    return load("plaza2")[0]
+
+
+@pytest.fixture(scope="module")
+def mrclam(data_root):
+    """The first 250 s of a robot among landmarks."""
+    (log,) = load("mrclam6-robot3", data_root=data_root)
+    odometry, seen = log.streams["odometry"], log.streams["bearing_range"]
+    moved, looked = odometry.t < 250.0, seen.t < 250.0
+    names = np.array(seen.landmark)[looked].tolist()
+    streams = {
+        "odometry": VelocityStream(odometry.t[moved], odometry.v[moved], odometry.w[moved]),
+        "bearing_range": BearingRangeStream(seen.t[looked], names, seen.range[looked], seen.bearing[looked]),
+    }
+    return replace(log, streams=streams)
+
+
+def scores(log, estimator, **settings):
+    return score(run(log, RunConfig(estimator, settings)), log)
+
+
+def test_plaza2_is_as_accurate_as_the_reference_implementation(plaza2):
+    """0.333 m, 0.028 rad causal for an EKF; 0.259 m, 0.017 rad final for iSAM2; within 10 %."""
+    ekf, smoother = scores(plaza2, "ekf"), scores(plaza2, "smoother")
+    assert ekf["causal.position_rmse"] < 1.1 * 0.333
+    assert ekf["causal.heading_rmse"] < 1.1 * 0.028
+    assert smoother["final.position_rmse"] < 1.1 * 0.259
+    assert smoother["final.heading_rmse"] < 1.1 * 0.017
+    batch = scores(plaza2, "batch")
+    assert smoother["final.position_rmse"] == pytest.approx(batch["final.position_rmse"], rel=0.02)
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "batch"])
+def test_two_swapped_landmarks_of_the_map_do_not_double_the_error(mrclam, estimator):
+    landmarks = dict(mrclam.world.landmarks)
+    landmarks["6"], landmarks["15"] = landmarks["15"], landmarks["6"]
+    wrong = replace(mrclam, world=mrclam.world.model_copy(update={"landmarks": landmarks}))
+    seen = set(mrclam.streams["bearing_range"].landmark)
+    assert {"6", "15"} <= seen
+    normal = scores(mrclam, estimator)["final.position_rmse"]
+    assert scores(wrong, estimator)["final.position_rmse"] < 2.0 * normal
+
+
+def test_a_tenth_of_gross_outliers_does_not_double_the_error(mrclam):
+    rng = np.random.default_rng(2)
+    seen = mrclam.streams["bearing_range"]
+    bad = rng.random(len(seen.t)) < 0.1
+    ranges = np.where(bad, rng.uniform(0.3, 10.0, len(seen.t)), seen.range)
+    bearings = np.where(bad, rng.uniform(-np.pi, np.pi, len(seen.t)), seen.bearing)
+    dirty = replace(
+        mrclam, streams={**mrclam.streams, "bearing_range": BearingRangeStream(seen.t, seen.landmark, ranges, bearings)}
+    )
+    for estimator, kind in (("ekf", "causal"), ("particle_filter", "causal"), ("smoother", "final")):
+        normal = scores(mrclam, estimator)[f"{kind}.position_rmse"]
+        assert scores(dirty, estimator)[f"{kind}.position_rmse"] < 2.0 * normal, estimator
