@@ -81,8 +81,8 @@ class Diagnostics:
     def reject(self, reason: str, count: int = 1) -> None:
         self.rejected[reason] = self.rejected.get(reason, 0) + count
 
-    def drop_late(self, sensor: str) -> None:
-        self.late[sensor] = self.late.get(sensor, 0) + 1
+    def drop_late(self, sensor: str, count: int = 1) -> None:
+        self.late[sensor] = self.late.get(sensor, 0) + count
 
     def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
         self.nis.setdefault(sensor, []).append((t, nis, dof))

@@ -67,7 +67,7 @@ class Filter(ABC):
         elif measurement.t >= self._t:
             self._take(measurement)
         elif measurement.t < self._t - self._max_delay or not self._events:
-            self.diagnostics.drop_late(type(measurement).__name__)
+            self._drop_late(measurement)
         else:
             self._take_late(measurement)
 
@@ -131,11 +131,15 @@ class Filter(ABC):
             again.append(m)
             self._go_back(checkpoint)
         if self._t > late.t:
-            self.diagnostics.drop_late(type(late).__name__)
+            self._drop_late(late)
         else:
             again.append(late)
         for m in sorted(again, key=lambda m: m.t):
             self._take(m)
+
+    def _drop_late(self, m: BearingRange | Tick) -> None:
+        if isinstance(m, BearingRange):
+            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
 
     def _go_back(self, checkpoint: tuple[Any, ...]) -> None:
         self._state, self._t, self._odometry, records, ticks = checkpoint

@@ -105,7 +105,8 @@ class GraphEstimator(ABC):
         elif self._prior is None:
             self.diagnostics.ignore("before the start")
         elif measurement.t < max(self._t - self._graph_settings.max_delay, self._prior.t):
-            self.diagnostics.drop_late(type(measurement).__name__)
+            if isinstance(measurement, BearingRange):
+                self.diagnostics.drop_late("bearing_range", len(measurement.landmarks))
         elif isinstance(measurement, Tick):
             self._pass_time(measurement.t)
         else:

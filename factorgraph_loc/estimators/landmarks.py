@@ -32,9 +32,12 @@ class KnownLandmarks:
         if self._model is None:
             self._diagnostics.ignore("bearing_range", len(m.landmarks))
             return None
-        rows = [i for i, name in enumerate(m.landmarks) if name in self._positions and _has_value(m, i)]
-        if len(rows) < len(m.landmarks):
-            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(rows))
+        known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
+        rows = [i for i in known if not (np.isnan(m.range[i]) and np.isnan(m.bearing[i]))]
+        if len(known) < len(m.landmarks):
+            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
+        if len(rows) < len(known):
+            self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
         if not rows:
             return None
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
@@ -112,7 +115,3 @@ def _per_landmark(residual: Array, blocks: Array, covariance: Array) -> Array:
     a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
     x, y = residual[:, 0], residual[:, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
-
-
-def _has_value(m: BearingRange, i: int) -> bool:
-    return not (np.isnan(m.range[i]) and np.isnan(m.bearing[i]))

@@ -77,7 +77,7 @@ class Smoother(GraphEstimator):
 
     def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
         if keyframe.index < len(self._left):
-            self.diagnostics.drop_late("bearing_range")
+            self.diagnostics.drop_late("bearing_range", len(factor.points))
         else:
             self._update([self._landmark_node(keyframe, factor)], {})
 
