@@ -99,9 +99,9 @@ class FullHistory:
     def _relinearize(self, linears: Iterable[_Linear], moved: Array) -> bool:
         """Replace the factors whose poses are farther than ``moved`` from where they were linearised; whether there were any."""
         graph, slots, changed = gtsam.NonlinearFactorGraph(), [], []
-        estimate = self._isam.calculateEstimate()
+        nothing_new = gtsam.Values()
         for linear in linears:
-            point = _point(linear.node.keys, estimate, self._isam)
+            point = _point(linear.node.keys, nothing_new, self._isam)
             if linear.is_off(point, moved):
                 linear.point = point
                 slots.append(linear.slot)
