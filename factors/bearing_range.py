@@ -190,7 +190,7 @@ class BearingRangeFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, 3) by the pose ``values[0]`` (3,)."""
         error, jacobian = self.whitened(values[0])
-        weight = np.sqrt(robust_weight(np.sum(error**2, axis=-1), self.model.robust))
+        weight = np.sqrt(robust_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
         return (weight[:, None] * error).ravel(), [(weight[:, None, None] * jacobian).reshape(-1, 3)]
 
     def cost(self, values: Sequence[Array]) -> float:

@@ -75,38 +75,35 @@ def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, it
     it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
     robust weight at the updated pose (iteratively reweighted least squares).
     """
-    prior: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
-    delta: Array = np.zeros(len(covariance))
-    nis, first = 0.0, np.zeros((0, 2))
-    for iteration in range(iterations):
-        residual, blocks = factor.whitened(pose if iteration == 0 else se2.compose(pose, se2.exp(delta[:3])))
-        jacobian = blocks.reshape(-1, 3)
-        if iteration == 0:
-            first = residual
-            nis = _total(residual.ravel(), jacobian, prior)
-            weight = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:3, :3]) / GATE) ** -2
-        else:
-            weight = robust_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
-        weighted = jacobian.T * np.repeat(weight, 2)
-        information = prior.copy()
-        information[:3, :3] += weighted @ jacobian
-        updated = np.linalg.inv(information)
-        step = updated[:, :3] @ (weighted @ (jacobian @ delta[:3] - residual.ravel()))
-        settled = np.abs(step - delta).max() < CONVERGED
-        delta = np.asarray(step, dtype=float)
-        if settled:
+    prior = np.asarray(np.linalg.inv(covariance), dtype=float)
+    residual, blocks = factor.whitened(pose)
+    widening = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:3, :3]) / GATE)
+    delta, updated = _solve(prior, blocks, residual, np.ones(len(residual)), np.zeros(3))
+    # by the matrix inversion lemma
+    pull = np.einsum("kij,ki->j", blocks, residual)
+    nis = float(np.vdot(residual, residual) - pull @ updated[:3, :3] @ pull)
+    if widening.max() > 1.0:
+        delta, updated = _solve(prior, blocks, residual, widening**-2, np.zeros(3))
+    first = residual
+    for _ in range(iterations - 1):
+        residual, blocks = factor.whitened(se2.compose(pose, se2.exp(delta[:3])))
+        weight = robust_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
+        before = delta
+        delta, updated = _solve(prior, blocks, residual, weight, delta[:3])
+        if np.abs(delta - before).max() < CONVERGED:
             break
     dof = int(np.count_nonzero(~np.isnan(factor.ranges)) + np.count_nonzero(~np.isnan(factor.bearings)))
     return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
 
 
-def _total(error: Array, jacobian: Array, prior: Array) -> float:
-    """Normalised innovation squared of all landmarks together, by the matrix inversion lemma."""
+def _solve(prior: Array, blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
+    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (3,)."""
+    jacobian = blocks.reshape(-1, 3)
+    weighted = jacobian.T * np.repeat(weight, 2)
     information = prior.copy()
-    information[:3, :3] += jacobian.T @ jacobian
-    pull = np.zeros(len(prior))
-    pull[:3] = jacobian.T @ error
-    return float(error @ error - pull @ np.linalg.solve(information, pull))
+    information[:3, :3] += weighted @ jacobian
+    updated = np.asarray(np.linalg.inv(information), dtype=float)
+    return updated[:, :3] @ (weighted @ (jacobian @ at - residual.ravel())), updated
 
 
 def _per_landmark(residual: Array, blocks: Array, covariance: Array) -> Array:
