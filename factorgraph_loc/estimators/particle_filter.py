@@ -33,7 +33,7 @@ class ParticleFilterSettings(FilterSettings):
     """``particles``: their number. ``resample_below``: effective sample size, as a share, below which they are resampled.
     ``smoothing_trajectories``: drawn backwards for the final result, through clouds ``smoothing_interval`` seconds apart."""
 
-    particles: Annotated[int, Field(ge=10, le=1_000_000)] = 2000
+    particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     resample_below: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0)] = 1.0
