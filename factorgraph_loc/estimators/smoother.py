@@ -7,7 +7,6 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
@@ -113,7 +112,10 @@ class Smoother(GraphEstimator):
         lag, count = self._settings.lag, len(self._left)
         if self._keyframes[count].t >= now - lag - MARGIN:
             return
-        leaving = list(itertools.takewhile(lambda k: k.t < now - lag, itertools.islice(self._keyframes, count, None)))
+        end = count
+        while self._keyframes[end].t < now - lag:
+            end += 1
+        leaving = self._keyframes[count:end]
         try:
             covariances = self._solver.covariances([k.key for k in leaving])
             self._left += [(self._solver.pose(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
