@@ -13,9 +13,13 @@ from factors.se2 import Array
 
 
 class Motion:
-    """Odometry rows in, relative motion between any two recent times out."""
+    """Odometry rows in, relative motion between any two recent times out.
+
+    A gyro replaces the rotation of wheels that report velocities; increments hold their own, and then it is ignored.
+    """
 
     def __init__(self, rig: Rig, sensors: tuple[str, ...], diagnostics: Diagnostics) -> None:
+        self._rig = rig
         self._use_gyro = "imu" in sensors and rig.imu is not None
         self._use_wheels = "odometry" in sensors
         self._chain = OdometryChain(rig.odometry_model(use_gyro=self._use_gyro), use_gyro=self._use_gyro)
@@ -23,6 +27,9 @@ class Motion:
 
     def add(self, m: Odometry) -> None:
         """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
+        if isinstance(m, IncrementOdometry) and self._use_gyro:
+            self._use_gyro = False
+            self._chain = OdometryChain(self._rig.odometry_model())
         if isinstance(m, YawRate) and not self._use_gyro:
             self._diagnostics.ignore("yaw rate")
         elif not isinstance(m, YawRate) and not self._use_wheels:
