@@ -160,9 +160,6 @@ class OdometryChain:
         self._times: list[float] = []
         self._forgotten = False
 
-    def __bool__(self) -> bool:
-        return bool(self._knots)
-
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
         return self._insert(_Row(t + self.model.delay, "velocity", (v, w)))

@@ -41,7 +41,6 @@ class Filter(ABC):
 
     def __init__(self, setup: Setup, settings: FilterSettings) -> None:
         self.diagnostics = Diagnostics()
-        self._setup = setup
         self._max_delay = settings.max_delay
         self._smooth = settings.smooth
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)

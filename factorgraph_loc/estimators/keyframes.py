@@ -72,7 +72,6 @@ class GraphEstimator(ABC):
 
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
         self.diagnostics = Diagnostics()
-        self._setup = setup
         self._graph_settings = settings
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
         self._landmarks = KnownLandmarks(setup, self.diagnostics)

@@ -8,7 +8,7 @@ graph is also kept here, and the solver is rebuilt from it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import gtsam
 import numpy as np
@@ -34,7 +34,6 @@ class SmootherSettings(GraphSettings):
     lag: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     relinearize_threshold: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
-    factorization: Literal["QR", "CHOLESKY"] = "QR"
     smooth: bool = True
 
 
@@ -45,7 +44,7 @@ class Smoother(GraphEstimator):
         super().__init__(setup, settings)
         self._settings = settings
         self._failed: list[str] = []
-        self._solver = self._new_solver(settings.factorization)
+        self._solver = self._new_solver()
         # of each keyframe: its causal estimate, and the final one where it has left the window
         self._filtered: list[tuple[Array, Array]] = []
         self._left: list[tuple[Array, Array]] = []
@@ -137,7 +136,7 @@ class Smoother(GraphEstimator):
 
         The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of.
         """
-        self._solver = self._new_solver("QR")
+        self._solver = self._new_solver()
         oldest, *others = self._keyframes[len(self._left) :]
         pose, spread = self._filtered[oldest.index]
         nodes: list[Node] = []
@@ -174,9 +173,9 @@ class Smoother(GraphEstimator):
     def _landmark_node(self, keyframe: Keyframe, factor: BearingRangeFactor) -> Node:
         return Node((keyframe.key,), factor=factor, rows=2 * len(factor.points))
 
-    def _new_solver(self, factorization: str) -> Solver:
+    def _new_solver(self) -> Solver:
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization(factorization)
+        parameters.setFactorization("QR")  # Cholesky loses long stretches of dead reckoning as indeterminate
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
         parameters.relinearizeSkip = self._settings.relinearize_skip
         if self._settings.lag is None:
