@@ -56,7 +56,12 @@ def info(
 ) -> None:
     """Show what a log holds, and what looks wrong with it."""
     from factorgraph_loc.evaluation.inspect import inspect
+    from factorgraph_loc.readers import manifests, read_manifest, verify
 
+    known = manifests()
+    if reader is None and log in known:
+        for fault in verify(read_manifest(known[log]), data_root):
+            show.note(f"warning: {fault}")
     logs = LogOptions(reader, reader_option, data_root, rig, world).load([log])
     inspections = [inspect(loaded) for loaded in logs]
     if json:

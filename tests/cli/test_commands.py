@@ -229,3 +229,13 @@ def test_a_narrow_terminal_cuts_nothing_off(columns, capsys, monkeypatch):
     assert "…" not in text
     line = next(line for line in text.splitlines() if "plaza2" in line).split()
     assert line == ["plaza2", "dead_reckoning", *comparison_cells([row])[1][0][2:]]
+
+
+def test_info_says_when_a_file_is_not_the_one_of_the_manifest(fgloc, data_root, tmp_path):
+    shutil.copytree(data_root / "mrclam6", tmp_path / "mrclam6")
+    with (tmp_path / "mrclam6" / "Barcodes.dat").open("a") as file:
+        file.write("# changed\n")
+    result = fgloc("info", "mrclam6-robot1", "--data-root", str(tmp_path))
+    assert result.exit_code == 0
+    assert "Barcodes.dat: is not the file that the manifest describes" in result.stderr
+    assert "sha256" not in fgloc("info", "mrclam6-robot1", "--data-root", str(data_root)).stderr
