@@ -6,6 +6,7 @@ Every number has its unit in the description; the bounds are there to catch wron
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,8 +15,9 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
+from factors import bearing_range, odometry
 from factors.bearing_range import BearingRangeModel
-from factors.odometry import PARAMETERS, Growth, OdometryModel
+from factors.odometry import Growth, OdometryModel
 from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
@@ -45,6 +47,17 @@ class OdometryNoise(FileModel):
     heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05)
 
 
+class OdometryUncertainty(FileModel):
+    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
+
+    Those of the scales are shares of the scale; that of the heading-rate bias is in rad/s.
+    """
+
+    scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s")] = 0.0
+
+
 class OdometrySettings(FileModel):
     """Wheel odometry. See :class:`factors.odometry.OdometryModel` for the model."""
 
@@ -53,7 +66,6 @@ class OdometrySettings(FileModel):
     scale_rotation: Scale = 1.0
     speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
     heading_rate_bias: Rate = 0.0
-    heading_rate_bias_sigma: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s; above 0 it is estimated")] = 0.0
     direction: Angle = 0.0
     delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
     lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
@@ -61,6 +73,7 @@ class OdometrySettings(FileModel):
     unknown_distance: Noise = 0.2
     unknown_rotation: Noise = 0.2
     noise: OdometryNoise = OdometryNoise()
+    uncertainty: OdometryUncertainty = OdometryUncertainty()
 
 
 class ImuSettings(FileModel):
@@ -69,6 +82,16 @@ class ImuSettings(FileModel):
     time_offset: Seconds = 0.0
     bias: Rate = 0.0
     heading: GrowthSettings = GrowthSettings(per_time=0.005)
+
+
+class BearingRangeUncertainty(FileModel):
+    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way."""
+
+    x: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
+    y: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
+    bearing_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
 
 class BearingRangeSettings(FileModel):
@@ -84,6 +107,7 @@ class BearingRangeSettings(FileModel):
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
     bearing_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad, not degrees")] = 0.05
     robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
+    uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
 
     def model(self) -> BearingRangeModel:
         return BearingRangeModel(
@@ -98,16 +122,27 @@ class BearingRangeSettings(FileModel):
 
 
 @dataclass(frozen=True)
-class EstimatedParameters:
-    """The odometry's constants that an estimator learns: positions in ``factors.odometry.PARAMETERS``, prior sigmas (P,)."""
+class Estimated:
+    """Constants of a sensor that an estimator learns, as changes from the rig's values.
 
+    ``names`` (P,): of the constants; ``indices`` (P,): their places among all that could be; ``sigmas`` (P,): their priors'.
+    """
+
+    names: tuple[str, ...]
     indices: tuple[int, ...]
     sigmas: Array
 
-    def full(self, values: Array) -> Array:
-        """All constants (3,), zero where not estimated."""
-        out = np.zeros(len(PARAMETERS))
-        out[list(self.indices)] = values
+    @staticmethod
+    def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
+        """Those of ``names`` whose uncertainty is above zero."""
+        sigmas = np.array([getattr(uncertainty, name, 0.0) for name in names])
+        indices = tuple(np.flatnonzero(sigmas).tolist())
+        return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
+
+    def full(self, values: Array, count: int) -> Array:
+        """``values`` (..., P) among all ``count`` constants, the others zero."""
+        out = np.zeros((*np.shape(values)[:-1], count))
+        out[..., list(self.indices)] = values
         return out
 
 
@@ -141,11 +176,13 @@ class Rig(FileModel):
             heading=imu.heading.model() if use_gyro else s.noise.heading.model(),
         )
 
-    def estimated_parameters(self) -> EstimatedParameters:
-        """Which constants of the odometry are estimated on the way, as changes from the rig's values."""
-        sigmas = np.array((0.0, 0.0, self.odometry.heading_rate_bias_sigma))
-        indices = np.flatnonzero(sigmas)
-        return EstimatedParameters(tuple(indices.tolist()), sigmas[indices])
+    def estimated_odometry(self) -> Estimated:
+        """Which of ``factors.odometry.PARAMETERS`` are estimated on the way."""
+        return Estimated.of(odometry.PARAMETERS, self.odometry.uncertainty)
+
+    def estimated_bearing_range(self) -> Estimated:
+        """Which of ``factors.bearing_range.PARAMETERS`` are estimated on the way."""
+        return Estimated.of(bearing_range.PARAMETERS, self.bearing_range and self.bearing_range.uncertainty)
 
     def time_offset(self, sensor: str) -> float:
         """Seconds to add to the stamps of a sensor's stream."""

@@ -16,6 +16,9 @@ import numpy as np
 from factors import se2
 from factors.se2 import Array
 
+# the constants of a sensor that can be estimated: those of its model, and how much later it saw than its stamp says [s]
+PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "time_offset")
+
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeModel:

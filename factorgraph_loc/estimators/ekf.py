@@ -62,7 +62,7 @@ class Ekf(Filter):
         super().__init__(setup, settings)
         self._iterations = settings.iterations
         self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_parameters()
+        self._estimated = setup.rig.estimated_odometry()
         self._predicted: _State | None = None
         self._transition = np.eye(3)
 
@@ -71,8 +71,12 @@ class Ekf(Filter):
         if self._state is None:
             return Learnt()
         sigmas = np.sqrt(np.diag(self._state.covariance)[3:])
-        names = [PARAMETERS[i] for i in self._estimated.indices]
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, self._state.parameters, sigmas, strict=True)})
+        return Learnt(
+            {
+                n: (float(v), float(s))
+                for n, v, s in zip(self._estimated.names, self._state.parameters, sigmas, strict=True)
+            }
+        )
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
@@ -102,7 +106,7 @@ class Ekf(Filter):
         s = self._state
         delta, by_parameter = increment.delta, np.zeros((3, 0))
         if len(s.parameters):
-            delta, jacobian = recalibrated(increment, self._estimated.full(s.parameters))
+            delta, jacobian = recalibrated(increment, self._estimated.full(s.parameters, len(PARAMETERS)))
             by_parameter = jacobian[:, list(self._estimated.indices)]
         transition = np.eye(len(s.covariance))
         transition[:3, :3] = se2.adjoint(se2.inverse(delta))

@@ -75,7 +75,7 @@ class GraphEstimator(ABC):
         self._graph_settings = settings
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
         self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_parameters()
+        self._estimated = setup.rig.estimated_odometry()
         self._parameters = np.zeros(len(self._estimated.indices))
         self._parameter_covariance = np.diag(self._estimated.sigmas**2)
         self._keyframes: list[Keyframe] = []
@@ -128,9 +128,10 @@ class GraphEstimator(ABC):
 
     def learnt(self) -> Learnt:
         """The odometry's constants that are estimated."""
-        names = [PARAMETERS[i] for i in self._estimated.indices]
         sigmas = np.sqrt(np.diag(self._parameter_covariance))
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, self._parameters, sigmas, strict=True)})
+        return Learnt(
+            {n: (float(v), float(s)) for n, v, s in zip(self._estimated.names, self._parameters, sigmas, strict=True)}
+        )
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
@@ -199,7 +200,7 @@ class GraphEstimator(ABC):
     def _recalibrated(self, increment: Increment) -> Increment:
         if not len(self._parameters):
             return increment
-        delta, _ = recalibrated(increment, self._estimated.full(self._parameters))
+        delta, _ = recalibrated(increment, self._estimated.full(self._parameters, len(PARAMETERS)))
         return Increment(delta, increment.covariance, increment.duration)
 
     def _problem(self, width: float = 1.0) -> Problem:

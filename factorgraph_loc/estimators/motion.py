@@ -8,7 +8,8 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.measurements import IncrementOdometry, Odometry, VelocityOdometry, YawRate
 from factorgraph_loc.rig import Rig
 from factors import se2
-from factors.odometry import ChainState, Increment, OdometryChain
+from factors.odometry import ChainState, Increment
+from factors.odometry_chain import OdometryChain
 from factors.se2 import Array
 
 

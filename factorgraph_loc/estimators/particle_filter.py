@@ -70,7 +70,7 @@ class ParticleFilter(Filter):
         self._settings = settings
         self._rng = setup.rng
         self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_parameters()
+        self._estimated = setup.rig.estimated_odometry()
 
     def belief(self) -> Belief:
         """The particles with their weights, and the Gaussian with their moments."""
@@ -83,8 +83,7 @@ class ParticleFilter(Filter):
             return Learnt()
         mean, covariance = _vector_moments(self._state.parameters, np.exp(self._state.log_weights))
         sigmas = np.sqrt(np.diag(covariance))
-        names = [PARAMETERS[i] for i in self._estimated.indices]
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, mean, sigmas, strict=True)})
+        return Learnt({n: (float(v), float(s)) for n, v, s in zip(self._estimated.names, mean, sigmas, strict=True)})
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
@@ -121,9 +120,9 @@ class ParticleFilter(Filter):
         """Poses (N, 3) after the increment, each under its own constants, without noise."""
         if not cloud.parameters.shape[1]:
             return se2.compose(cloud.poses, increment.delta)
-        full = np.zeros((len(cloud.poses), len(PARAMETERS)))
-        full[:, list(self._estimated.indices)] = cloud.parameters
-        return se2.compose(cloud.poses, recalibrated(increment, full)[0])
+        return se2.compose(
+            cloud.poses, recalibrated(increment, self._estimated.full(cloud.parameters, len(PARAMETERS)))[0]
+        )
 
     def _update(self, m: BearingRange) -> None:
         seen = self._landmarks.factor(m)

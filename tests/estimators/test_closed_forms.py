@@ -6,7 +6,14 @@ import pytest
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.measurements import BearingRange, IncrementOdometry, Tick
-from factorgraph_loc.rig import BearingRangeSettings, GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.rig import (
+    BearingRangeSettings,
+    GrowthSettings,
+    OdometryNoise,
+    OdometrySettings,
+    OdometryUncertainty,
+    Rig,
+)
 from factorgraph_loc.world import Landmark, World
 from factors import se2
 from factors.bearing_range import log_likelihood
@@ -140,7 +147,7 @@ def test_a_heading_rate_bias_is_learnt_by_all_that_estimate_it():
         heading=GrowthSettings(per_distance=0.01),
     )
     rig = Rig(
-        odometry=OdometrySettings(noise=noise, heading_rate_bias_sigma=0.05),
+        odometry=OdometrySettings(noise=noise, uncertainty=OdometryUncertainty(heading_rate_bias=0.05)),
         bearing_range=BearingRangeSettings(range_sigma=0.1, bearing_sigma=0.03, robust=3.0),
     )
     step = np.array((0.05, 0.0, 0.03))

@@ -13,12 +13,12 @@ from factors.graph import read_pose
 from factors.odometry import (
     Growth,
     Increment,
-    OdometryChain,
     OdometryFactor,
     OdometryModel,
     between_factor,
     recalibrated,
 )
+from factors.odometry_chain import OdometryChain
 
 NOISY = OdometryModel(
     along=Growth(0.1, 0.02, 0.01), lateral=Growth(0.03, 0.01, 0.0), heading=Growth(0.05, 0.1, 0.002), direction=0.1
