@@ -6,18 +6,33 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
 from factors.se2 import Array
 
 
 class Landmark(FileModel):
-    """A point landmark: position [m] in the world's frame and the standard deviation of its survey in x and y [m]."""
+    """A point landmark: position [m] in the world's frame, and how well it is known.
+
+    ``sigma``: standard deviation of its survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], in place of ``sigma``, where
+    the map was made from a log and the errors in x and y differ or go together.
+    """
 
     x: float
     y: float
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: tuple[float, float, float] | None = None
+
+    @field_validator("covariance")
+    @classmethod
+    def _is_positive_semidefinite(cls, value: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if value is not None:
+            xx, xy, yy = value
+            # of a singular matrix the determinant may round to a little below zero
+            if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + 1e-9):
+                raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
+        return value
 
 
 class World(FileModel):
@@ -43,4 +58,4 @@ def read_world(path: Path) -> World:
 
 def write_world(world: World, path: Path) -> None:
     """Write ``NAME.world.toml``."""
-    write_toml(path, world.model_dump(mode="json"))
+    write_toml(path, world.model_dump(mode="json", exclude_none=True))

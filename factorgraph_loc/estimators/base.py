@@ -53,10 +53,24 @@ class Belief:
 
 
 @dataclass(frozen=True)
+class LearntPoint:
+    """A landmark's estimated ``position`` (2,) [m] with ``covariance`` (2, 2) of (x, y), in the world's frame."""
+
+    position: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
 class Learnt:
-    """Constants that an estimator has estimated on the way: name to (value, standard deviation), SI units."""
+    """What an estimator has estimated on the way, beside the poses.
+
+    ``values``: constants, name to (value, standard deviation), SI units. Those of the odometry have plain names
+    (``scale_distance``), those of another sensor its name before them (``bearing_range.x``). ``landmarks``: by the map's or the
+    measurements' name.
+    """
 
     values: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    landmarks: Mapping[str, LearntPoint] = field(default_factory=dict)
 
 
 @dataclass
