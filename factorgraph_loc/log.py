@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Protocol
+from dataclasses import dataclass, field, fields, replace
+from itertools import compress, pairwise
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.measurements import BearingRange, IncrementOdometry, Measurement, VelocityOdometry, YawRate
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
@@ -18,10 +20,12 @@ from factors.se2 import Array
 
 
 class Stream(Protocol):
-    """The rows of one sensor, as arrays; ``t`` (N,) in seconds from the log's start, by the sensor's own clock.
+    """The rows of one sensor: a dataclass of columns; ``t`` (N,) in seconds from the log's start, by the sensor's own clock.
 
     Rows stand in the order in which they arrived; a stamp may be a little older than the one before (a late measurement).
     """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def t(self) -> Array: ...
@@ -129,3 +133,95 @@ class Log:
         order = sorted((s for s in self.streams if s in sensors), key=lambda s: (s != "odometry", s != "imu", s))
         for _, _, _, m in heapq.merge(*(arrivals(rank, name) for rank, name in enumerate(order))):
             yield m
+
+
+def cut(log: Log, start: float, end: float) -> Log:
+    """The part of a log with stamps in [start, end) seconds, each sensor's by its own clock; the reference's likewise.
+
+    Stamps and name stay as they are; a known start is dropped. A velocity from before ``start`` is not held into the part, and the
+    first increment of odometry still is the motion since the row before it. InputError if no measurement is left.
+    """
+
+    def inside(t: Array) -> NDArray[np.bool_]:
+        return np.asarray((t >= start) & (t < end))
+
+    streams = {name: _selected(stream, inside(stream.t)) for name, stream in log.streams.items()}
+    if not any(len(stream.t) for stream in streams.values()):
+        first, last = log.span()
+        raise InputError(
+            f"{log.name}: has no measurements in {start:g} to {end:g} s, expected times in {first:g} to {last:g} s"
+        )
+    reference = log.reference
+    if reference is not None:
+        keep = inside(reference.t)
+        covariances = None if reference.covariances is None else reference.covariances[keep]
+        reference = replace(reference, t=reference.t[keep], poses=reference.poses[keep], covariances=covariances)
+    return replace(log, streams=streams, reference=reference if reference and len(reference) else None, start=None)
+
+
+def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
+    """A kidnapped robot: ``second`` begins ``gap`` seconds after the end of ``first``, wherever the robot is then.
+
+    All stamps of ``second`` are shifted alike, those of the reference too. The last velocity of ``first`` is held until the first
+    row of ``second``. The first increment of ``second`` becomes zero: wheels do not feel how they are carried. Start, metadata and
+    absolute time are those of ``first``. InputError if rig, map or kind of odometry differ, or if ``gap`` is not above zero.
+    """
+    if gap <= 0.0:
+        raise InputError(f"the gap between {first.name} and {second.name} is {gap:g} s, expected more than 0")
+    for what, same in (("rig", first.rig == second.rig), ("map", first.world == second.world)):
+        if not same:
+            raise InputError(f"{first.name} and {second.name} differ in their {what}, expected one robot in one map")
+    shift = _extent(first)[1] + gap - _extent(second)[0]
+    streams = dict(first.streams)
+    for name, stream in second.streams.items():
+        later = replace(stream, t=stream.t + shift)
+        if isinstance(later, IncrementStream):
+            moves = np.arange(len(later.t)) > 0
+            later = replace(later, dx=later.dx * moves, dy=later.dy * moves, dtheta=later.dtheta * moves)
+        streams[name] = _joined(streams[name], later) if name in streams else later
+    return replace(
+        first,
+        name=f"{first.name}+{second.name}",
+        streams=streams,
+        reference=_joined_references(first.reference, second.reference, shift),
+        warnings=(*first.warnings, *second.warnings),
+    )
+
+
+def _selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
+    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    kept = {k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns.items()}
+    return replace(stream, **kept)
+
+
+def _joined(first: Stream, second: Stream) -> Stream:
+    if type(first) is not type(second):
+        kinds = f"{type(first).__name__} and one with {type(second).__name__}"
+        raise InputError(f"a log with {kinds} cannot be joined, expected tables of one kind")
+    columns = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(first)}
+    both = {k: np.concatenate((a, b)) if isinstance(a, np.ndarray) else [*a, *b] for k, (a, b) in columns.items()}
+    return replace(first, **both)
+
+
+def _joined_references(first: Trajectory | None, second: Trajectory | None, shift: float) -> Trajectory | None:
+    """Covariances are kept only if both parts have them, the heading only counts if it does in both."""
+    later = None if second is None else replace(second, t=second.t + shift)
+    if first is None or later is None:
+        return first or later
+    covariances = None
+    if first.covariances is not None and later.covariances is not None:
+        covariances = np.concatenate((first.covariances, later.covariances))
+    return Trajectory(
+        np.concatenate((first.t, later.t)),
+        np.concatenate((first.poses, later.poses)),
+        covariances,
+        first.has_heading and later.has_heading,
+    )
+
+
+def _extent(log: Log) -> tuple[float, float]:
+    """First and last stamp of streams and reference [s]."""
+    first, last = log.span()
+    if log.reference is None or not len(log.reference):
+        return first, last
+    return min(first, float(log.reference.t[0])), max(last, float(log.reference.t[-1]))

@@ -1,11 +1,26 @@
 """The measurements of a log, in the order in which they arrived."""
 
-import numpy as np
+from dataclasses import replace
 
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream, YawRateStream
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.log import (
+    BearingRangeStream,
+    IncrementStream,
+    Log,
+    StartPose,
+    VelocityStream,
+    YawRateStream,
+    cut,
+    join,
+)
 from factorgraph_loc.measurements import BearingRange, IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.readers import load, write_native
 from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.world import World
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World, read_world
 
 
 def column(*values):
@@ -75,3 +90,91 @@ def test_a_late_measurement_keeps_its_stamp_and_its_place():
 def test_span():
     assert make_log(bearing_range=sightings((-1, "A", 2, 0)), odometry=ODOMETRY).span() == (-1.0, 2.0)
     assert make_log().span() == (0.0, 0.0)
+
+
+def drive(kind):
+    """Ten seconds with all sensors, one late sighting, a reference and a start."""
+    t = np.arange(100) * 0.1
+    ones = np.ones(100)
+    odometry = VelocityStream(t, ones, 0.1 * ones) if kind == "velocity" else IncrementStream(t, ones, 0 * ones, ones)
+    log = make_log(
+        odometry=odometry,
+        imu=YawRateStream(t + 0.05, 0.1 * ones),
+        bearing_range=sightings(
+            (1, "A", 2, 0.5), (1, "B", 3, np.nan), (5.2, "A", 2, 0.1), (4.9, "B", 2, 0), (9, "A", 1, 0)
+        ),
+    )
+    truth = Trajectory(t + 0.02, np.stack((t, t, 0 * t), axis=1), np.tile(np.eye(3), (100, 1, 1)))
+    covariance = (0.04, -0.01, 0.09)
+    world = World(landmarks={"A": Landmark(x=1, y=2, covariance=covariance), "B": Landmark(x=3, y=4, sigma=0.1)})
+    start = StartPose(0.0, np.zeros(3), np.ones(3))
+    return replace(log, name="drive", reference=truth, start=start, t0_ns=10**18, world=world)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "increments"])
+def test_parts_of_a_log_joined_again_hold_what_it_held(kind):
+    log = drive(kind)
+    parts = cut(log, 0.0, 5.0), cut(log, 5.0, 10.0)
+    assert [len(part.streams["odometry"].t) for part in parts] == [50, 50]
+    assert [list(part.streams["bearing_range"].landmark) for part in parts] == [["A", "B", "B"], ["A", "A"]]
+    assert parts[1].streams["imu"].t[0] == pytest.approx(5.05)
+    assert [len(part.reference) for part in parts] == [50, 50]
+    assert parts[0].start is parts[1].start is None
+    again = join(*parts, gap=0.5)
+    for name, stream in log.streams.items():
+        assert len(again.streams[name].t) == len(stream.t)
+    assert sorted(again.streams["bearing_range"].landmark) == sorted(log.streams["bearing_range"].landmark)
+    # the last stamp of the first part is that of the gyro at 4.95 s, the first of the second that of the odometry at 5 s
+    np.testing.assert_allclose(np.diff(again.streams["odometry"].t)[49], 4.95 + 0.5 - 4.9)
+    np.testing.assert_allclose(np.diff(again.reference.t)[49], 4.95 + 0.5 + 0.02 - 4.92)
+    np.testing.assert_array_equal(again.reference.poses, log.reference.poses)
+    assert again.reference.covariances.shape == (100, 3, 3)
+    assert (again.name, again.t0_ns) == ("drive+drive", log.t0_ns)
+
+
+def test_a_kidnapped_robot_keeps_its_velocity_and_feels_no_increment():
+    log = drive("increments")
+    odometry = join(cut(log, 0.0, 5.0), cut(log, 2.0, 4.0)).streams["odometry"]
+    assert len(odometry.t) == 70
+    assert (odometry.dx == 0.0).nonzero()[0].tolist() == (odometry.dtheta == 0.0).nonzero()[0].tolist() == [50]
+    log = drive("velocity")
+    odometry = join(cut(log, 0.0, 5.0), cut(log, 2.0, 4.0)).streams["odometry"]
+    assert (odometry.v == 1.0).all()
+
+
+@pytest.mark.parametrize("kind", ["velocity", "increments"])
+def test_a_joined_log_survives_the_native_format(kind, tmp_path):
+    log = drive(kind)
+    log = join(cut(log, 0.0, 5.0), replace(cut(log, 2.0, 4.0), name="again"))
+    write_native(log, tmp_path / "log")
+    (read,) = load(str(tmp_path / "log"))
+    assert (read.name, read.world, read.t0_ns) == ("drive+again", log.world, log.t0_ns)
+    assert "sigma = 0.1" in (world := (tmp_path / "log/drive_again.world.toml").read_text())
+    assert world.count("covariance") == 1
+    assert len(list(read.measurements(read.streams))) == len(list(log.measurements(log.streams)))
+    for name, stream in log.streams.items():
+        np.testing.assert_allclose(read.streams[name].t, stream.t, atol=1e-9)
+    np.testing.assert_allclose(read.reference.poses, log.reference.poses, atol=1e-9)
+
+
+def test_parts_that_are_none_and_logs_that_do_not_fit():
+    log = drive("velocity")
+    with pytest.raises(InputError, match="drive: has no measurements in 20 to 30 s, expected times in 0 to 9.95 s"):
+        cut(log, 20.0, 30.0)
+    assert cut(replace(log, reference=None), 2.0, np.inf).reference is None
+    for other, message in (
+        (replace(log, rig=Rig()), "differ in their rig"),
+        (replace(log, world=World()), "differ in their map"),
+        (drive("increments"), "a log with VelocityStream and one with IncrementStream"),
+    ):
+        with pytest.raises(InputError, match=message):
+            join(log, other)
+    with pytest.raises(InputError, match="gap between drive and drive is 0 s"):
+        join(log, log, gap=0.0)
+
+
+@pytest.mark.parametrize("covariance", [(1.0, 2.0, 1.0), (-1.0, 0.0, 1.0), (0.0, 0.1, 1.0)])
+def test_a_landmark_takes_no_covariance_that_is_none(covariance, tmp_path):
+    (tmp_path / "a.world.toml").write_text(f"[landmarks.A]\nx = 1\ny = 2\ncovariance = {list(covariance)}\n")
+    with pytest.raises(InputError, match=r"landmarks.A.covariance is \[.*expected .* positive semi-definite"):
+        read_world(tmp_path / "a.world.toml")
