@@ -159,7 +159,7 @@ def test_a_joined_log_survives_the_native_format(kind, tmp_path):
 
 def test_parts_that_are_none_and_logs_that_do_not_fit():
     log = drive("velocity")
-    with pytest.raises(InputError, match="drive: has no measurements in 20 to 30 s, expected times in 0 to 9.95 s"):
+    with pytest.raises(InputError, match=r"drive: has no measurements in 20 to 30 s, .* in 0 to 9\.95 s"):
         cut(log, 20.0, 30.0)
     assert cut(replace(log, reference=None), 2.0, np.inf).reference is None
     for other, message in (
