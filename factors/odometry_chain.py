@@ -2,69 +2,31 @@
 
 Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9).
 Commanded velocities act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
+
+The step from knot to knot is compiled: an estimator takes hundreds of rows a second, a calibration integrates whole logs
+many times.
 """
 
-import bisect
 import math
-from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from factors import se2
 from factors.odometry import ChainState, Increment, OdometryModel, relative_motion
+from factors.se2 import Array
 
+# columns of a row: when it takes effect, its kind, and its values
+_ROW = 5
+_VELOCITY, _INCREMENT, _GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
+# columns of a knot: state at the time of a row, the velocity in the robot's frame then, and the velocity that it tends to
+_T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _VX, _VY, _W, _UX, _UY, _UW = range(13)
+_KNOT, _STATE = 13, 7
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    t: float  # when it takes effect
-    kind: str  # velocity, increment or gyro
-    values: tuple[float, ...]
+# scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
+_Constants = tuple[tuple[float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]]
 
-
-class _Knot:
-    """State at the time of a row, and the motion that follows until the next one."""
-
-    __slots__ = ("heading", "path", "t", "turn", "unknown", "uw", "ux", "uy", "vx", "vy", "w", "x", "y")
-
-    def __init__(self, t: float) -> None:
-        self.t = t
-        self.x = self.y = self.heading = 0.0
-        self.path = self.turn = self.unknown = 0.0
-        self.vx = self.vy = self.w = 0.0  # velocity in the robot's frame, now
-        self.ux = self.uy = self.uw = 0.0  # the velocity that it tends to
-
-    def state(self) -> ChainState:
-        return ChainState(self.t, self.x, self.y, self.heading, self.path, self.turn, self.unknown)
-
-    def after(self, duration: float, lag: float, hold: float) -> "_Knot":
-        """The state ``duration`` seconds on: the motion goes on for at most ``hold`` of them, then it is unknown."""
-        k = _Knot(self.t + duration)
-        k.ux, k.uy, k.uw = self.ux, self.uy, self.uw
-        moving = min(duration, hold)
-        if lag > 0.0:
-            decay = math.exp(-moving / lag)
-            settling = lag * (1.0 - decay)
-            dx = self.ux * moving + (self.vx - self.ux) * settling
-            dy = self.uy * moving + (self.vy - self.uy) * settling
-            dtheta = self.uw * moving + (self.w - self.uw) * settling
-            k.vx = self.ux + (self.vx - self.ux) * decay
-            k.vy = self.uy + (self.vy - self.uy) * decay
-            k.w = self.uw + (self.w - self.uw) * decay
-        else:
-            k.vx, k.vy, k.w = self.ux, self.uy, self.uw
-            dx, dy, dtheta = self.ux * moving, self.uy * moving, self.uw * moving
-        if duration > hold:
-            k.vx = k.vy = k.w = 0.0
-        a, b = se2.arc_coefficients(dtheta)
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
-        k.x = self.x + c * chord_x - s * chord_y
-        k.y = self.y + s * chord_x + c * chord_y
-        k.heading = self.heading + dtheta
-        k.path = self.path + math.hypot(dx, dy)
-        k.turn = self.turn + abs(dtheta)
-        k.unknown = self.unknown + duration - moving
-        return k
+_arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
 
 
 class OdometryChain:
@@ -78,33 +40,47 @@ class OdometryChain:
         self.model = model
         self._use_gyro = use_gyro
         self._horizon = horizon
-        self._rows: list[_Row] = []
-        self._knots: list[_Knot] = []
-        self._times: list[float] = []
+        self._rows = np.zeros((256, _ROW))
+        self._knots = np.zeros((256, _KNOT))
+        self._count = 0
         self._forgotten = False
+        m = model
+        self._constants = (
+            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias),
+            (math.cos(m.direction), math.sin(m.direction)),
+            (m.lag, m.max_hold),
+            (m.gyro_bias, use_gyro),
+        )
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
-        return self._insert(_Row(t + self.model.delay, "velocity", (v, w)))
+        return self._insert(t + self.model.delay, _VELOCITY, v, w, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
         """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row."""
-        return self._insert(_Row(t, "increment", (dx, dy, dtheta)))
+        return self._insert(t, _INCREMENT, *se2.log(np.array((dx, dy, dtheta))).tolist())
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
         """A gyro's row [rad/s], held from ``t`` until the next; it replaces the rotation that the wheels tell."""
-        return self._insert(_Row(t, "gyro", (w,)))
+        return self._insert(t, _GYRO, w, 0.0, 0.0)
+
+    def add_velocities(self, t: Array, v: Array, w: Array) -> None:
+        """Rows (N,) at once, in time order and after all others."""
+        self._extend(t + self.model.delay, _VELOCITY, np.column_stack((v, w, np.zeros(len(t)))))
+
+    def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
+        """Rows (N,) at once, in time order and after all others."""
+        self._extend(t, _INCREMENT, se2.log(np.column_stack((dx, dy, dtheta))))
 
     def state(self, t: float) -> ChainState:
         """The state of the chain at ``t``; before the first kept knot the robot is taken to stand, its motion unknown."""
-        if not self._knots:
-            return ChainState(t, 0.0, 0.0, 0.0, 0.0, 0.0, t)
-        i = bisect.bisect_right(self._times, t) - 1
-        if i >= 0:
-            knot = self._knots[i]
-            return knot.after(t - knot.t, self.model.lag, self.model.max_hold).state()
-        first = self._knots[0]
-        return ChainState(t, first.x, first.y, first.heading, first.path, first.turn, first.unknown - (first.t - t))
+        return ChainState(*_state(self._knots, self._count, t, self._constants[2]))
+
+    def states(self, t: Array) -> Array:
+        """The states (M, 7) at times (M,): t, x, y, heading, path, turn, unknown, as in :class:`ChainState`."""
+        out = np.empty((len(t), _STATE))
+        _states(self._knots, self._count, np.asarray(t, dtype=float), self._constants[2], out)
+        return out
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """The motion from ``start`` to ``end``.
@@ -113,61 +89,131 @@ class OdometryChain:
         """
         return relative_motion(self.model, start, end)
 
-    def _insert(self, row: _Row) -> bool:
-        if self._forgotten and row.t < self._times[0]:
+    def _insert(self, *row: float) -> bool:
+        t = row[0]
+        if self._forgotten and t < self._knots[0, _T]:
             return False
-        i = bisect.bisect_right(self._times, row.t)
-        if i < len(self._rows):
-            self._rows.insert(i, row)
-            self._rebuild(i)
-        else:
-            self._append(row)
+        self._reserve(1)
+        n = i = self._count
+        if n and t < self._knots[n - 1, _T]:
+            i = int(np.searchsorted(self._knots[:n, _T], t, side="right"))
+            self._rows[i + 1 : n + 1] = self._rows[i:n]
+        self._rows[i] = row
+        self._count += 1
+        _integrate(self._rows, self._knots, i, self._count, self._constants)
+        if i == n:
             self._forget()
         return True
 
-    def _rebuild(self, i: int) -> None:
-        rows = self._rows[i:]
-        del self._rows[i:], self._knots[i:], self._times[i:]
-        for row in rows:
-            self._append(row)
+    def _extend(self, t: Array, kind: float, values: Array) -> None:
+        self._reserve(len(t))
+        n, end = self._count, self._count + len(t)
+        self._rows[n:end, 0], self._rows[n:end, 1], self._rows[n:end, 2:] = t, kind, values
+        self._count = end
+        _integrate(self._rows, self._knots, n, end, self._constants)
+        if len(t):
+            self._forget()
 
-    def _append(self, row: _Row) -> None:
-        previous = self._knots[-1] if self._knots else _Knot(row.t)
-        duration = row.t - previous.t
-        m = self.model
-        if row.kind == "increment":
-            knot = self._after_increment(previous, row)
-        else:
-            knot = previous.after(duration, m.lag, m.max_hold)
-            if row.kind == "velocity":
-                speed = m.scale_distance * (row.values[0] - m.speed_bias)
-                knot.ux, knot.uy = speed * math.cos(m.direction), speed * math.sin(m.direction)
-                if not self._use_gyro:
-                    knot.uw = m.scale_rotation * (row.values[1] - m.heading_rate_bias)
-            else:
-                knot.uw = knot.w = row.values[0] - m.gyro_bias
-        self._rows.append(row)
-        self._knots.append(knot)
-        self._times.append(knot.t)
-
-    def _after_increment(self, previous: _Knot, row: _Row) -> _Knot:
-        duration = row.t - previous.t
-        if duration <= 0.0:
-            return _Knot(row.t)  # the first row: when its motion began is not known
-        m = self.model
-        rho_x, rho_y, phi = (float(v) for v in se2.log(np.array(row.values)) / duration)
-        rho_x -= m.speed_bias
-        c, s = math.cos(m.direction), math.sin(m.direction)
-        previous.ux = m.scale_distance * (c * rho_x - s * rho_y)
-        previous.uy = m.scale_distance * (s * rho_x + c * rho_y)
-        previous.uw = m.scale_rotation * (phi - m.heading_rate_bias)
-        knot = previous.after(duration, 0.0, duration)
-        knot.unknown += max(0.0, duration - m.max_hold)
-        return knot
+    def _reserve(self, rows: int) -> None:
+        capacity = len(self._rows)
+        if self._count + rows > capacity:
+            more = max(capacity, rows)
+            self._rows = np.concatenate((self._rows, np.zeros((more, _ROW))))
+            self._knots = np.concatenate((self._knots, np.zeros((more, _KNOT))))
 
     def _forget(self) -> None:
-        # seldom, and many at a time: removing from the front of a list costs its length
-        if self._times[-1] - self._times[0] > 2.0 * self._horizon:
-            keep = bisect.bisect_right(self._times, self._times[-1] - self._horizon) - 1
-            del self._rows[:keep], self._knots[:keep], self._times[:keep]
+        # seldom, and many at a time: moving what is kept to the front costs its length
+        n = self._count
+        newest = self._knots[n - 1, _T]
+        if newest - self._knots[0, _T] > 2.0 * self._horizon:
+            keep = int(np.searchsorted(self._knots[:n, _T], newest - self._horizon, side="right")) - 1
+            for table in (self._rows, self._knots):
+                table[: n - keep] = table[keep:n].copy()
+            self._count = n - keep
             self._forgotten = True
+
+
+@numba.njit(cache=True)
+def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Constants) -> None:
+    """The knots of the rows from ``begin`` to ``end``, each from the knot before it."""
+    (scale_distance, scale_rotation, speed_bias, heading_rate_bias), (c, s), (lag, hold), gyro = constants
+    gyro_bias, use_gyro = gyro
+    for i in range(begin, end):
+        t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
+        knot = knots[i]
+        if i == 0:
+            knot[:] = 0.0
+            knot[_T] = t
+        elif kind == _INCREMENT:
+            previous = knots[i - 1]
+            duration = t - previous[_T]
+            if duration > 0.0:  # else it has no time to happen in
+                forward, sideways = a / duration - speed_bias, b / duration
+                previous[_UX] = scale_distance * (c * forward - s * sideways)
+                previous[_UY] = scale_distance * (s * forward + c * sideways)
+                previous[_UW] = scale_rotation * (phi / duration - heading_rate_bias)
+            _move(previous, duration, 0.0, duration, knot)
+            knot[_UNKNOWN] += max(0.0, duration - hold)
+        else:
+            previous = knots[i - 1]
+            _move(previous, t - previous[_T], lag, hold, knot)
+        if kind == _VELOCITY:
+            speed = scale_distance * (a - speed_bias)
+            knot[_UX], knot[_UY] = speed * c, speed * s
+            if not use_gyro:
+                knot[_UW] = scale_rotation * (b - heading_rate_bias)
+        elif kind == _GYRO:
+            knot[_UW] = knot[_W] = a - gyro_bias
+
+
+@numba.njit(cache=True)
+def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
+    """The knot ``duration`` seconds on: the motion goes on for at most ``hold`` of them, then it is unknown."""
+    ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
+    moving = min(duration, hold)
+    if lag > 0.0:
+        decay = math.exp(-moving / lag)
+        settling = lag * (1.0 - decay)
+        behind_x, behind_y, behind_w = knot[_VX] - ux, knot[_VY] - uy, knot[_W] - uw
+        dx, dy = ux * moving + behind_x * settling, uy * moving + behind_y * settling
+        dtheta = uw * moving + behind_w * settling
+        out[_VX], out[_VY], out[_W] = ux + behind_x * decay, uy + behind_y * decay, uw + behind_w * decay
+    else:
+        dx, dy, dtheta = ux * moving, uy * moving, uw * moving
+        out[_VX], out[_VY], out[_W] = ux, uy, uw
+    if duration > hold:
+        out[_VX] = out[_VY] = out[_W] = 0.0
+    out[_UX], out[_UY], out[_UW] = ux, uy, uw
+    a, b = _arc_coefficients(dtheta)
+    c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
+    chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
+    out[_T] = knot[_T] + duration
+    out[_X] = knot[_X] + c * chord_x - s * chord_y
+    out[_Y] = knot[_Y] + s * chord_x + c * chord_y
+    out[_HEADING] = knot[_HEADING] + dtheta
+    out[_PATH] = knot[_PATH] + math.hypot(dx, dy)
+    out[_TURN] = knot[_TURN] + abs(dtheta)
+    out[_UNKNOWN] = knot[_UNKNOWN] + duration - moving
+
+
+@numba.njit(cache=True)
+def _state(
+    knots: Array, count: int, t: float, settling: tuple[float, float]
+) -> tuple[float, float, float, float, float, float, float]:
+    """t, x, y, heading, path, turn and unknown at ``t``, from the last knot before it."""
+    if count == 0:
+        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t
+    i = np.searchsorted(knots[:count, _T], t, side="right") - 1
+    if i < 0:
+        k = knots[0]
+        return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[_T] - t)
+    k = np.empty(_KNOT)
+    lag, hold = settling
+    _move(knots[i], t - knots[i, _T], lag, hold, k)
+    return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN]
+
+
+@numba.njit(cache=True)
+def _states(knots: Array, count: int, times: Array, settling: tuple[float, float], out: Array) -> None:
+    for j in range(len(times)):
+        out[j, :] = _state(knots, count, times[j], settling)
