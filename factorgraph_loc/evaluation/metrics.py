@@ -1,9 +1,10 @@
 """How far a trajectory is from the reference, and whether its covariances say so.
 
-No alignment: the map's frame is known. The reference is taken at the estimates' stamps; where its neighbours lie more than 0.1 s
-apart there is a gap, and nothing is scored. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
-Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", 2012, section IV.A, taken over path length instead of time.
+No alignment, as the map's frame is known; where the map was free, aligned figures stand beside the others. The reference is
+taken at the estimates' stamps; where its neighbours lie more than 0.1 s apart there is a gap, and nothing is scored. NEES and its
+bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Relative pose
+error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012, section IV.A, taken over path length instead of
+time.
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.base import Diagnostics, Learnt
+from factorgraph_loc.evaluation import alignment
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.se2 import Array
 
-MAX_REFERENCE_GAP = 0.1  # s
 RPE_DISTANCE = 1.0  # m
 CONFIDENCE = 0.95
+FREE_MAP = "unknown"  # of an estimator's setting ``landmarks``: their positions are estimated
 
 _ACCURACY = (
     *(f"{what}_{how}" for what in ("position", "heading") for how in ("rmse", "median", "p95", "max")),
@@ -93,7 +96,9 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
 
     ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
     a reference. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
-    ``time_to_localized`` [s] counts from the first tick. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
+    ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
+    :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
+    ``learnt.NAME.sigma`` are there for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` are always there.
     """
     causal = result.causal()
@@ -105,7 +110,11 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference)
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
-    return scores | _counts(result.diagnostics) | _timing(result.timings)
+    if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
+        scores |= alignment.free_map_figures(final, result.learnt.landmarks, log)
+    else:
+        scores |= dict.fromkeys(alignment.FIGURES)
+    return scores | _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, Any]:
@@ -127,8 +136,8 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, 
         figures |= {f"{name}_{how}": value for how, value in _spread(values).items()}
     if reference.has_heading:
         position, heading = relative_errors(trajectory.poses, e.reference)
-        figures["rpe_position_per_m"] = _rms(position)
-        figures["rpe_heading_per_m"] = _rms(heading)
+        figures["rpe_position_per_m"] = rms(position)
+        figures["rpe_heading_per_m"] = rms(heading)
         figures["rpe_pieces"] = len(position)
     nees = e.nees[np.isfinite(e.nees)]
     if len(nees):
@@ -193,15 +202,18 @@ def _spread(values: Array) -> dict[str, float | None]:
     if not len(values):
         return dict.fromkeys(("rmse", "median", "p95", "max"))
     return {
-        "rmse": _rms(values),
+        "rmse": rms(values),
         "median": float(np.median(values)),
         "p95": float(np.percentile(values, 95)),
         "max": float(np.max(values)),
     }
 
 
-def _rms(values: Array) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+def _constants(learnt: Learnt) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    for name, (value, sigma) in learnt.values.items():
+        figures |= {f"learnt.{name}.value": value, f"learnt.{name}.sigma": sigma}
+    return figures
 
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
@@ -216,7 +228,7 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
         figures[f"nis.{sensor}.count"] = len(rows)
     for name, errors in sorted(diagnostics.residuals.items()):
         if errors:
-            figures[f"residual.{name}.rms"] = _rms(np.array(errors))
+            figures[f"residual.{name}.rms"] = rms(np.array(errors))
             figures[f"residual.{name}.median_abs"] = float(np.median(np.abs(errors)))
     for kind in ("ignored", "rejected", "late"):
         counts: dict[str, int] = getattr(diagnostics, kind)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.metrics import MAX_REFERENCE_GAP, Errors, errors
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory

@@ -9,6 +9,7 @@ from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt
+from factorgraph_loc.evaluation.alignment import FIGURES
 from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.log import Log
@@ -32,11 +33,12 @@ def drive(n=600, dt=0.1, speed=0.4):
     return t, np.array(truth), np.array(estimate)
 
 
-def result_of(t, poses, status, final=None, diagnostics=None):
+def result_of(t, poses, status, final=None, diagnostics=None, learnt=None, config=None):
     covariances = np.tile(np.eye(3), (len(t), 1, 1))
     final = Trajectory(t, poses, covariances) if final is None else final
     diagnostics = Diagnostics() if diagnostics is None else diagnostics
-    return RunResult("log", {}, t, poses, covariances, status, final, diagnostics, Learnt(), TIMINGS, {})
+    learnt = Learnt() if learnt is None else learnt
+    return RunResult("log", config or {}, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
 
 
 def test_constant_offset():
@@ -187,3 +189,27 @@ def test_without_a_reference_nis_counts_and_times_are_reported():
     assert scores["late.total"] == 0
     assert scores["timing.update_ms_median"] == 2.0
     assert scores["timing.real_time_factor"] == 10.0
+
+
+def test_learnt_constants_are_scores():
+    t = np.arange(5) * 0.1
+    learnt = Learnt({"scale_distance": (1.02, 0.01), "bearing_range.x": (0.2, 0.003)})
+    scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, learnt=learnt), log_of(t, None))
+    assert (scores["learnt.scale_distance.value"], scores["learnt.scale_distance.sigma"]) == (1.02, 0.01)
+    assert (scores["learnt.bearing_range.x.value"], scores["learnt.bearing_range.x.sigma"]) == (0.2, 0.003)
+
+
+@pytest.mark.parametrize("landmarks", ["known", "unknown"])
+def test_aligned_figures_only_where_the_map_was_free(landmarks):
+    t, truth, _ = drive()
+    frame = np.array((5.0, -2.0, 1.0))
+    result = result_of(
+        t, se2.compose(frame, truth), ("localized",) * len(t), config={"settings": {"landmarks": landmarks}}
+    )
+    scores = score(result, log_of(t, truth))
+    assert scores["final.position_rmse"] > 1.0
+    if landmarks == "unknown":
+        assert scores["aligned.position_rmse"] == pytest.approx(0.0, abs=1e-9)
+        assert scores["landmarks.count"] == 0
+    else:
+        assert all(scores[name] is None for name in FIGURES)

@@ -1,0 +1,88 @@
+"""Scores of a run whose map was free: its frame is its own, so the estimate is first brought onto the reference.
+
+The alignment is that of Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991,
+equations 40 to 42 with the scale kept at 1. In the plane its rotation is one angle, and no reflection can come out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import LearntPoint
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.se2 import Array
+
+MAX_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
+FIGURES = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
+
+
+def align(trajectory: Trajectory, reference: Trajectory) -> Array:
+    """The pose (3,) of the estimate's frame in the reference's: composed with the estimated poses, it brings their positions onto
+    the reference in least squares. NaN if no pose has a reference."""
+    return align_points(trajectory.poses[:, :2], reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)[:, :2])
+
+
+def align_points(points: Array, targets: Array) -> Array:
+    """The pose (3,) that brings ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are left out.
+
+    NaN without a pair. Points that all coincide leave the rotation open; it is then 0.
+    """
+    known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
+    if not known.any():
+        return np.full(3, np.nan)
+    centre, target_centre = points[known].mean(axis=0), targets[known].mean(axis=0)
+    a, b = points[known] - centre, targets[known] - target_centre
+    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    rotation = np.array((0.0, 0.0, angle))
+    return np.array((*(target_centre - se2.transform_from(rotation, centre)), angle))
+
+
+def free_map_figures(trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log) -> dict[str, Any]:
+    """``FIGURES`` of a run with a free map.
+
+    ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
+    learnt landmarks that the log's map also has, after the same alignment: their ``count``, root mean square distance ``rmse`` [m]
+    and mean NEES ``anees``, ideally 2. Without a reference the landmarks themselves are aligned, and errors are a little too
+    small for their covariances. None where there is nothing to say.
+    """
+    figures: dict[str, Any] = dict.fromkeys(FIGURES)
+    names = [name for name in landmarks if name in log.world.landmarks]
+    figures["landmarks.count"] = len(names)
+    positions = np.array([landmarks[name].position for name in names]).reshape(-1, 2)
+    truth = np.array([log.world.position(name) for name in names]).reshape(-1, 2)
+    if log.reference is None:
+        pose = align_points(positions, truth)
+    else:
+        pose = align(trajectory, log.reference)
+        moved = se2.compose(pose, trajectory.poses)
+        error = moved - log.reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)
+        figures["aligned.position_rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
+        if log.reference.has_heading:
+            figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))
+    if names and np.isfinite(pose).all():
+        # in the estimate's own frame, where the covariances are
+        error = positions - se2.transform_to(pose, truth)
+        figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
+        figures["landmarks.anees"] = _anees(error, np.array([landmarks[name].covariance for name in names]))
+    return figures
+
+
+def rms(values: Array) -> float | None:
+    """Root of the mean of the squares of those that are finite, None without any."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def _anees(errors: Array, covariances: Array) -> float | None:
+    """Mean of the squared errors (N, 2) in units of their covariances (N, 2, 2), of those that are positive definite."""
+    good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    good[good] = np.linalg.eigvalsh(covariances[good])[:, 0] > 0.0
+    if not good.any():
+        return None
+    whitened = np.linalg.solve(covariances[good], errors[good, :, None])[..., 0]
+    return float(np.mean(np.sum(errors[good] * whitened, axis=1)))
