@@ -1,4 +1,4 @@
-"""The files of one run: ``final.tum``, ``causal.tum``, ``estimates.parquet``, ``metrics.json``, ``config.toml``."""
+"""The files of one run: trajectories, estimates, what was learnt, events, scores, and the configuration."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Learnt
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.files import write_text, write_toml
@@ -25,6 +26,8 @@ FILES = (
     "final.tum",
     "causal.tum",
     "estimates.parquet",
+    "learnt.json",
+    "events.csv",
     "config.toml",
     "metrics.json",
 )  # the last says that all are there
@@ -44,7 +47,9 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     ``estimates.parquet`` has one row a tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m], ``heading``
     [rad], the covariances in the world's frame, ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``,
     ``update_ms`` (causal: the slowest update since the tick before, null if there was none) and ``status`` (of the causal
-    estimate at that time). ``causal.tum`` holds the estimates from the first localized one on.
+    estimate at that time). ``causal.tum`` holds the estimates from the first localized one on. ``learnt.json``: ``constants`` by
+    name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy) [m^2] in the
+    world's frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and what happened.
 
     Raises InputError if ``out`` holds results and ``overwrite`` is off. Everything is written beside ``out`` first; files in
     ``out`` that are not ours are left alone.
@@ -62,7 +67,9 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
         write_tum(causal, temporary / "causal.tum", log.t0_ns)
         estimates(result, log).write_parquet(temporary / "estimates.parquet")
         write_toml(temporary / "config.toml", result.config)
-        write_text(temporary / "metrics.json", json.dumps(_plain(scores), indent=2, allow_nan=False) + "\n")
+        write_text(temporary / "learnt.json", _json(learnt_tables(result.learnt)))
+        write_text(temporary / "events.csv", events(result, log).write_csv())
+        write_text(temporary / "metrics.json", _json(scores))
         remove_run(out)
         out.mkdir(exist_ok=True)
         for name in FILES:
@@ -100,6 +107,23 @@ def estimates(result: RunResult, log: Log) -> pl.DataFrame:
     )
 
 
+def learnt_tables(learnt: Learnt) -> dict[str, Any]:
+    """The content of ``learnt.json``; see :func:`write_run`."""
+    constants = {name: {"value": value, "sigma": sigma} for name, (value, sigma) in learnt.values.items()}
+    landmarks = {}
+    for name, point in learnt.landmarks.items():
+        x, y = point.position.tolist()
+        (xx, xy), (_, yy) = point.covariance.tolist()
+        landmarks[name] = {"x": x, "y": y, "covariance": [xx, xy, yy]}
+    return {"constants": constants, "landmarks": landmarks}
+
+
+def events(result: RunResult, log: Log) -> pl.DataFrame:
+    """The table of ``events.csv``; see :func:`write_run`."""
+    rows = [(log.t0_ns + round(t * 1e9), t, text) for t, text in result.diagnostics.events]
+    return pl.DataFrame(rows, schema={"t_ns": pl.Int64, "t": pl.Float64, "event": pl.String}, orient="row")
+
+
 def _rows(
     kind: str, trajectory: Trajectory, log: Log, update_ms: Array, status: np.typing.NDArray[np.object_]
 ) -> pl.DataFrame:
@@ -135,6 +159,14 @@ def _slowest_update(result: RunResult) -> Array:
     return slowest
 
 
-def _plain(scores: Mapping[str, Any]) -> dict[str, Any]:
+def _json(content: Mapping[str, Any]) -> str:
+    return json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
+
+
+def _plain(content: Any) -> Any:
     """JSON has no NaN and no infinity: null."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in scores.items()}
+    if isinstance(content, Mapping):
+        return {key: _plain(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_plain(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -17,7 +17,15 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.tables import COLUMNS, comparison_cells, comparison_table
 from factorgraph_loc.trajectory import read_tum
 
-RUN_FILES = {"final.tum", "causal.tum", "estimates.parquet", "metrics.json", "config.toml"}
+RUN_FILES = {
+    "final.tum",
+    "causal.tum",
+    "estimates.parquet",
+    "learnt.json",
+    "events.csv",
+    "metrics.json",
+    "config.toml",
+}
 
 
 def test_version_and_help(fgloc):

@@ -2,12 +2,14 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.experiments.output import FILES, write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.trajectory import read_tum
@@ -69,6 +71,22 @@ def test_json_has_no_nan(result, log, tmp_path):
     text = (write_run(result, log, tmp_path / "out"), (tmp_path / "out" / "metrics.json").read_text())[1]
     assert "NaN" not in text
     assert "Infinity" not in text
+
+
+def test_what_was_learnt_and_what_happened(result, log, tmp_path):
+    point = LearntPoint(np.array((5.0, 1.0)), np.array(((0.04, 0.01), (0.01, np.nan))))
+    result = replace(result, learnt=replace(result.learnt, landmarks={"a": point}))
+    result.diagnostics.events.append((0.75, "moved, or lost"))
+    write_run(result, log, tmp_path / "out")
+    assert json.loads((tmp_path / "out/learnt.json").read_text()) == {
+        "constants": {"scale": {"value": 1.0, "sigma": 0.1}},
+        "landmarks": {"a": {"x": 5.0, "y": 1.0, "covariance": [0.04, 0.01, None]}},
+    }
+    table = pl.read_csv(tmp_path / "out/events.csv")
+    assert table.rows() == [(log.t0_ns + 750_000_000, 0.75, "moved, or lost")]
+    result.diagnostics.events.clear()
+    write_run(result, log, tmp_path / "none")
+    assert (tmp_path / "none/events.csv").read_text() == "t_ns,t,event\n"
 
 
 def test_results_are_not_overwritten_unless_told(result, log, tmp_path):
