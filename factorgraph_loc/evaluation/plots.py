@@ -1,19 +1,16 @@
-"""Plots of one log run by several estimators, as PNG files 1600 px wide.
-
-Colours: Okabe and Ito, "Color Universal Design", 2008, which colour-blind readers can tell apart.
-"""
+"""Plots of one log run by several estimators, or by one."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.evaluation.consistency import consistency
+from factorgraph_loc.evaluation.figures import COLOURS, Track, grid, legend, mark_events, save, styles
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
@@ -24,40 +21,63 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
-_WIDTH, _DPI = 16.0, 100
-
-
-@dataclass(frozen=True)
-class Track:
-    """What is plotted of one run: ``causal`` (None if it never was localized), ``final``, and ``update_ms`` (M,) of each update."""
-
-    causal: Trajectory | None
-    final: Trajectory
-    update_ms: Array
-
-    def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
-        return ("causal", self.causal), ("final", self.final)
+_FILES = (
+    "*-trajectories.png",
+    "*-update-time.png",
+    "*-error-distribution.png",
+    "*-errors-*.png",
+    "*-consistency-*.png",
+)
 
 
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
     """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
 
-    ``NAME-trajectories.png``, ``NAME-update-time.png``; with a reference also ``NAME-error-distribution.png`` and
-    ``NAME-errors-ESTIMATOR.png`` for each estimator.
+    Those of :func:`plot_run` for each estimator, but with all trajectories in one plot, and ``NAME-update-time.png``; with a
+    reference also ``NAME-error-distribution.png``.
     """
     figures = {"trajectories": trajectories(log, tracks), "update-time": update_times(log, tracks)}
     if log.reference is not None:
         figures["error-distribution"] = error_distribution(log, log.reference, tracks)
-        for estimator, track in tracks.items():
-            figures[f"errors-{estimator}"] = error_bands(log, log.reference, estimator, track)
+    for estimator, track in tracks.items():
+        figures |= _of_one(log, estimator, track)
+    return _write(figures, folder, name)
+
+
+def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) -> list[Path]:
+    """Write the plots of one run into ``folder`` and return their paths.
+
+    ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or where the estimator tells innovations;
+    with a reference ``NAME-errors-ESTIMATOR.png``.
+    """
+    figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
+    return _write(figures, folder, name)
+
+
+def remove_plots(folder: Path) -> None:
+    """Remove the plots of an earlier run or comparison, and nothing else."""
+    for pattern in _FILES:
+        for plot in folder.glob(pattern):
+            plot.unlink()
+
+
+def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
+    figures = {}
+    if log.reference is not None:
+        figures[f"errors-{estimator}"] = error_bands(log, log.reference, estimator, track)
+    figure = consistency(log, estimator, track)
+    if figure is not None:
+        figures[f"consistency-{estimator}"] = figure
+    return figures
+
+
+def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for what, figure in figures.items():
         path = folder / f"{name}-{what}.png"
         with replacing(path) as temporary:
-            _save(figure, temporary)
+            save(figure, temporary)
         paths.append(path)
     return paths
 
@@ -67,14 +87,14 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     landmarks = log.world.positions()
     view = _view(landmarks, log.reference)
     height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
-    figure, axes = _figure(1, 2, height, f"{log.name}: trajectories")
+    figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         if log.reference is not None:
             line = _with_gaps(log.reference.t, log.reference.poses)
             axis.plot(line[:, 0], line[:, 1], color="0.75", linewidth=4.0, label="reference", zorder=1)
         if len(landmarks):
             axis.plot(*landmarks.T, "k^", markersize=7, markerfacecolor="none", label="landmarks", zorder=4)
-        for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+        for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
             kind, trajectory = track.kinds()[i]
             if trajectory is not None:
                 axis.plot(*trajectory.poses[:, :2].T, label=estimator, linewidth=1.2, zorder=3, **style)
@@ -86,7 +106,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
         if view is not None:
             axis.set_xlim(view[0, 0], view[1, 0])
             axis.set_ylim(view[0, 1], view[1, 1])
-    _legend(figure, axes[0])
+    legend(figure, axes[0])
     # with a fixed aspect the layout needs a second pass: after the first the axes change, and their labels reach below the legend
     figure.draw_without_rendering()
     return figure
@@ -95,7 +115,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
     """Signed errors in x, y and heading over time, causal and final, with bands of two stated standard deviations."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
-    figure, axes = _figure(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
+    figure, axes = grid(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
     found = [None if trajectory is None else errors(trajectory, reference) for _, trajectory in track.kinds()]
     for column, (kind, trajectory) in enumerate(track.kinds()):
         axes[0, column].set_title(kind)
@@ -107,6 +127,7 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
             continue
         for row in range(len(rows)):
             _band(axes[row, column], trajectory, e, row)
+            mark_events(axes[row, column], track.events)
     for row, (what, unit) in enumerate(rows):
         limit = max(
             (_extent(e, t, row) for e, (_, t) in zip(found, track.kinds(), strict=True) if e and t), default=1.0
@@ -114,15 +135,15 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
         for axis in axes[row]:
             axis.set_ylim(-limit, limit)
             axis.set_ylabel(f"error in {what} [{unit}]")
-    _legend(figure, axes[0])
+    legend(figure, axes[0])
     return figure
 
 
 def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Track]) -> Figure:
     """Cumulative distribution of position and heading errors, causal and final, on a logarithmic axis."""
     rows = (("position", "m"), ("heading", "rad"))[: 2 if reference.has_heading else 1]
-    figure, axes = _figure(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
-    for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+    figure, axes = grid(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
+    for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
         for column, (kind, trajectory) in enumerate(track.kinds()):
             axes[0, column].set_title(kind)
             if trajectory is None:
@@ -135,74 +156,23 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
             axis.set_xlabel(f"{what} error [{unit}]")
             axis.set_ylabel("share of times below")
         _same_range(axes[row])
-    _legend(figure, axes[0])
+    legend(figure, axes[0])
     return figure
 
 
 def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
     """Cumulative distribution of the time per update on a logarithmic axis."""
-    figure, axes = _figure(1, 1, 6.0, f"{log.name}: time per update")
+    figure, axes = grid(1, 1, 6.0, f"{log.name}: time per update")
     axis = axes[0, 0]
-    for (estimator, track), style in zip(tracks.items(), _styles(), strict=False):
+    for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
         if track.causal is None:  # nothing is estimated while the log runs: its updates only collect
             axis.plot([], [], label=f"{estimator} (offline)", **style)
         else:
             _distribution(axis, track.update_ms, label=estimator, **style)
     axis.set_xlabel("time per update [ms]")
     axis.set_ylabel("share of updates below")
-    _legend(figure, axes[0])
+    legend(figure, axes[0])
     return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Write a PNG with a palette: few colours are used, and the file is a third of what it is in full colour.
-
-    An octree keeps the colours of thin lines, which the default, the median cut, mixes.
-    """
-    from PIL import Image  # noqa: PLC0415
-
-    full = io.BytesIO()
-    figure.savefig(full, format="png", dpi=_DPI)
-    with Image.open(full) as image:
-        image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-            path, format="PNG", optimize=True
-        )
-
-
-def _figure(rows: int, columns: int, height: float, title: str) -> tuple[Figure, Any]:
-    # Figure without pyplot: no global state, no display, and matplotlib is loaded only where something is plotted
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=16)
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for axis in axes.flat:
-        axis.grid(color="0.9")
-        axis.set_axisbelow(True)
-        axis.tick_params(labelsize=12)
-        axis.xaxis.label.set_size(13)
-        axis.yaxis.label.set_size(13)
-        axis.title.set_size(14)
-    return figure, axes
-
-
-def _styles() -> Iterator[dict[str, Any]]:
-    i = 0
-    while True:
-        yield {"color": COLOURS[i % len(COLOURS)], "linestyle": _STYLES[i % len(_STYLES)]}
-        i += 1
-
-
-def _legend(figure: Figure, axes: Any) -> None:
-    """One legend below the axes, of all that is drawn in any of them."""
-    entries: dict[str, Any] = {}
-    for axis in axes:
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    if entries:
-        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), fontsize=13)
 
 
 def _with_gaps(t: Array, poses: Array) -> Array:

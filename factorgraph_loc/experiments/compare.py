@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,10 +14,11 @@ import polars as pl
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.evaluation.plots import Track, plot_log
+from factorgraph_loc.evaluation.figures import Track
+from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import comparison_cells, markdown
-from factorgraph_loc.experiments.output import FILES, remove_run, write_run
+from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.processes import run_each
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -27,7 +27,6 @@ from factorgraph_loc.log import Log
 
 _ERROR = "error.txt"
 _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
-_PLOTS = ("*-trajectories.png", "*-update-time.png", "*-error-distribution.png", "*-errors-*.png")
 
 
 @dataclass(frozen=True)
@@ -98,15 +97,10 @@ def compare(
     return Comparison(rows, [f"{r['log']}, {r['estimator']}, seed {r['seed']}: {r['reason']}" for r in failed])
 
 
-def file_name(text: str) -> str:
-    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore."""
-    return re.sub(r"[^\w.-]", "_", text).lstrip(".") or "_"
-
-
 def _execute(job: _Job) -> _Outcome:
     result = run(job.log, job.config)
     scores = write_run(result, job.log, job.folder)
-    return _Outcome(scores, Track(result.causal(), result.final, result.timings.update_ms))
+    return _Outcome(scores, Track.of(result))
 
 
 def _without_needless_seeds(configs: Sequence[RunConfig]) -> list[RunConfig]:
@@ -167,9 +161,7 @@ def _prepare(out: Path, overwrite: bool) -> None:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     for name in _TABLES:
         (out / name).unlink(missing_ok=True)
-    for pattern in _PLOTS:
-        for plot in out.glob(f"plots/{pattern}"):
-            plot.unlink()
+    remove_plots(out / "plots")
     for folder in _runs(out):
         remove_run(folder)
         (folder / _ERROR).unlink(missing_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -15,7 +16,9 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Learnt
+from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.files import write_text, write_toml
 from factorgraph_loc.log import Log
@@ -77,6 +80,18 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return scores
+
+
+def write_plots(result: RunResult, log: Log, out: Path) -> None:
+    """Write the plots of a run into ``out/plots``, in place of those of an earlier one."""
+    folder = out / "plots"
+    remove_plots(folder)
+    plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
+
+
+def file_name(text: str) -> str:
+    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore."""
+    return re.sub(r"[^\w.-]", "_", text).lstrip(".") or "_"
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:

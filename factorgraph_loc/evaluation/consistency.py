@@ -1,0 +1,115 @@
+"""Whether an estimator's covariances are right, over the time of a log: NEES of its poses, NIS of its predictions.
+
+Both are chi-square distributed where they are (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, section 5.4). Errors of successive poses go together, so the NEES is held against the interval of a single
+value. Innovations are independent, so the running mean of the NIS is held against the interval of the mean.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, mark_events
+from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WINDOW = 20.0  # s, of the running means
+_TAILS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+_BAND: dict[str, Any] = {
+    "color": COLOURS[5],
+    "alpha": 0.3,
+    "linewidth": 0.0,
+    "label": f"{100 * CONFIDENCE:g} % band (of the single NEES, of the mean NIS)",
+}
+_IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
+
+
+def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
+    """NEES of the causal and final poses, if there is a reference, and NIS per degree of freedom of each sensor, over time.
+
+    None if there is neither.
+    """
+    sensors = sorted(sensor for sensor, values in track.nis.items() if len(values))
+    rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
+    rows += [[f"nis.{sensor}"] * 2 for sensor in sensors]
+    if not rows:
+        return None
+    figure = empty(3.5 * len(rows) + 1.0, f"{log.name}, {estimator}: consistency")
+    axes = figure.subplot_mosaic(rows)
+    dress(axes.values())
+    if log.reference is not None:
+        for kind, trajectory in track.kinds():
+            _nees(axes[kind], kind, trajectory, log.reference)
+        limits = np.array([axes[kind].get_ylim() for kind in ("causal", "final")])
+        for kind in ("causal", "final"):
+            axes[kind].set_ylim(limits[:, 0].min(), limits[:, 1].max())
+    for sensor in sensors:
+        _nis(axes[f"nis.{sensor}"], sensor, track.nis[sensor])
+    start, end = track.final.t[0], track.final.t[-1]
+    for axis in axes.values():
+        mark_events(axis, track.events)
+        axis.set_xlim(start, max(end, start + 1e-3))
+        axis.set_xlabel("time [s]")
+    legend(figure, axes.values())
+    return figure
+
+
+def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
+    """Sums of ``values`` over sums of ``weights`` within ``WINDOW`` seconds around each ``t`` (N,), ascending; and the latter sums.
+
+    NaN where a window has no weight.
+    """
+    first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
+    last = np.searchsorted(t, t + WINDOW / 2.0, side="right")
+    sums = [
+        np.diff(np.concatenate(([0.0], np.cumsum(x)))[np.stack((first, last))], axis=0)[0] for x in (values, weights)
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sums[0] / sums[1], sums[1]
+
+
+def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory) -> None:
+    dof = 3 if reference.has_heading else 2
+    axis.set_title(f"{kind} poses")
+    axis.set_ylabel("NEES of x, y, heading" if dof == 3 else "NEES of x, y")
+    axis.set_yscale("log")
+    low, high = chi2.ppf(_TAILS, dof)
+    axis.axhspan(low, high, **_BAND)
+    axis.axhline(dof, **_IDEAL)
+    nees = np.empty(0) if trajectory is None else errors(trajectory, reference).nees
+    known = np.isfinite(nees)
+    if trajectory is None or not known.any():
+        axis.text(0.5, 0.5, f"no {kind} estimate to score", ha="center", transform=axis.transAxes, color="0.4")
+        return
+    mean, _ = running_mean(trajectory.t, np.where(known, nees, 0.0), known.astype(float))
+    _draw(axis, trajectory.t, nees, np.where(known, mean, np.nan), low)
+
+
+def _nis(axis: Axes, sensor: str, rows: Array) -> None:
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    t, nis, dof = rows.T
+    mean, total = running_mean(t, nis, dof)
+    axis.set_title(f"innovations of {sensor}")
+    axis.set_ylabel("NIS per degree of freedom")
+    axis.set_yscale("log")
+    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a blackout
+    low, high = (np.where(np.isnan(mean), np.nan, chi2.ppf(tail, total) / total) for tail in _TAILS)
+    axis.fill_between(t, low, high, **_BAND)
+    axis.axhline(1.0, **_IDEAL)
+    _draw(axis, t, nis / dof, mean, 0.1)
+
+
+def _draw(axis: Axes, t: Array, single: Array, mean: Array, low: float) -> None:
+    axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
+    axis.plot(t, mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
+    # how small the smallest are says nothing
+    axis.set_ylim(low / 4.0, 2.0 * max(float(np.nanmax(single)), 20.0 * low))
