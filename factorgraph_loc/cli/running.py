@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from itertools import islice
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +28,11 @@ from factorgraph_loc.cli.options import (
     parse_seeds,
     parse_settings,
 )
+
+if TYPE_CHECKING:
+    from factorgraph_loc.evaluation.result import RunResult
+
+SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the rest is in the files
 
 # of the table of one run; column: figure of the scores, digits
 COLUMNS = {
@@ -54,10 +60,10 @@ def run(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Run one estimator on one log; write trajectories, estimates and scores."""
+    """Run one estimator on one log; write trajectories, estimates, scores and plots."""
     from factorgraph_loc.estimators.registry import check_names
     from factorgraph_loc.experiments import run as experiment
-    from factorgraph_loc.experiments.output import check_free, write_run
+    from factorgraph_loc.experiments.output import check_free, write_plots, write_run
 
     check_names([estimator])
     check_free(out, overwrite=overwrite)  # now, not when all is computed
@@ -67,12 +73,17 @@ def run(
     with show.progress(estimator, counted=False) as report:
         result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
+    write_plots(result, loaded, out)
     for warning in result.warnings:
         show.note(f"warning: {warning}")
     if json:
         show.document(scores)
         return
-    _print_scores(scores)
+    _print_accuracy(scores)
+    _print_consistency(scores)
+    _print_learnt(result)
+    _print_events(result)
+    _print_effort(scores)
     typer.echo(f"\nresults are in {out}")
 
 
@@ -122,7 +133,7 @@ def compare(
         raise typer.Exit(1)
 
 
-def _print_scores(scores: Mapping[str, Any]) -> None:
+def _print_accuracy(scores: Mapping[str, Any]) -> None:
     if scores["causal.position_rmse"] is not None or scores["final.position_rmse"] is not None:
         rows = [
             (kind, *(show.number(scores[f"{kind}.{figure}"], digits) for figure, digits in COLUMNS.values()))
@@ -131,11 +142,43 @@ def _print_scores(scores: Mapping[str, Any]) -> None:
         show.table(("", *COLUMNS), rows)
     else:
         typer.echo("there is no reference to score against")
-        for name, value in scores.items():
-            if name.startswith("nis.") and name.endswith(".mean_per_dof"):
-                typer.echo(
-                    f"{name.split('.')[1]}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1"
-                )
+    if scores["aligned.position_rmse"] is not None:
+        position, heading = (
+            show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))
+        )
+        typer.echo(f"final, aligned as the map was free: position RMSE {position} m, heading RMSE {heading} rad")
+    if scores["landmarks.count"]:
+        error, anees = (show.number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
+        typer.echo(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideally 2")
+    if scores["time_to_localized"]:
+        typer.echo(f"localized after {scores['time_to_localized']:.1f} s")
+
+
+def _print_consistency(scores: Mapping[str, Any]) -> None:
+    for name, value in scores.items():
+        if name.startswith("nis.") and name.endswith(".mean_per_dof"):
+            sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
+            typer.echo(f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1")
+
+
+def _print_learnt(result: RunResult) -> None:
+    constants = result.learnt.values
+    for name, (value, sigma) in islice(constants.items(), SHOWN_CONSTANTS):
+        typer.echo(f"learnt: {name} {value:.5g} ± {sigma:.2g}")
+    if len(constants) > SHOWN_CONSTANTS:
+        typer.echo(f"learnt: {len(constants) - SHOWN_CONSTANTS} more in learnt.json")
+
+
+def _print_events(result: RunResult) -> None:
+    events = result.diagnostics.events
+    if events:
+        more = f", of which the first {SHOWN_EVENTS}; all are in events.csv" if len(events) > SHOWN_EVENTS else ""
+        typer.echo(f"events: {len(events)}{more}")
+    for t, text in events[:SHOWN_EVENTS]:
+        typer.echo(f"  at {t:.1f} s: {text}")
+
+
+def _print_effort(scores: Mapping[str, Any]) -> None:
     counts = ", ".join(f"{scores[f'{kind}.total']} {kind}" for kind in ("ignored", "rejected", "late"))
     typer.echo(f"measurements: {counts}")
     final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
