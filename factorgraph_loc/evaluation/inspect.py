@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.world import World
 from factors import se2
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
-REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated, as in scoring
 MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
 MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
 MIN_PASSES = 3
@@ -125,7 +125,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
         return {}
     model = log.rig.bearing_range.model()
     t = stream.t + log.rig.time_offset("bearing_range")
-    sensors = se2.compose(log.reference.at(t, max_gap=REFERENCE_GAP), np.array(model.mounting))
+    sensors = se2.compose(log.reference.at(t, max_gap=MAX_REFERENCE_GAP), np.array(model.mounting))
     ranges = stream.range / model.range_scale
     bearings = stream.bearing - model.bearing_bias
     if not log.reference.has_heading:
