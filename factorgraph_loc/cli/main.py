@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from factorgraph_loc import __version__
-from factorgraph_loc.cli import inspecting, running
+from factorgraph_loc.cli import calibrating, inspecting, running
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
@@ -47,6 +47,7 @@ app.command()(inspecting.info)
 app.command()(inspecting.convert)
 app.command()(running.run)
 app.command()(running.compare)
+app.command()(calibrating.calibrate)
 
 
 def _print_version(wanted: bool) -> None:

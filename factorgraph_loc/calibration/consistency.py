@@ -1,0 +1,128 @@
+"""The noise that makes an estimator honest: its stated covariance equal to its error.
+
+Errors of neighbouring sightings are nearly the same, while estimators take them as independent: with their mere scatter as noise
+an estimator is far too sure. One factor on the sigmas of range and bearing makes up for that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.log import Log
+from factorgraph_loc.rig import Rig
+
+Evaluate = Callable[[Log], Mapping[str, Any]]
+"""Runs the EKF on a log, with the log's rig, and gives the scores of :func:`factorgraph_loc.evaluation.metrics.score`."""
+
+FACTORS = (0.5, 30.0)  # between these the factor is sought
+TOLERANCE = 0.05  # of the logarithm of ANEES
+TRIALS = 6
+MAX_FINAL = 1.5  # times the ideal: beyond it the final ANEES has its say too
+MIN_SCORED = 100  # poses below which a score says nothing
+_SLOPE = -1.2  # of log ANEES by log factor, where only one trial is known
+
+
+@dataclass(frozen=True)
+class Trial:
+    """ANEES over its ideal value, causal and final, means over logs; and the scores of each log."""
+
+    factor: float
+    causal: float
+    final: float
+    scores: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """The rig with effective noise, the trial with it, and ``reached``: whether ANEES is ideal within the tolerance.
+
+    ``trial`` is None where no log can be scored: then the rig's noise is the scatter.
+    """
+
+    rig: Rig
+    trial: Trial | None
+    reached: bool
+
+
+def inflated(rig: Rig, factor: float) -> Rig:
+    """The rig with the sigmas of its landmark sensor multiplied."""
+    assert rig.bearing_range is not None
+    s = rig.bearing_range
+    return rig.model_copy(
+        update={
+            "bearing_range": s.model_copy(
+                update={
+                    "range_sigma": min(factor * s.range_sigma, 10.0),
+                    "range_sigma_relative": min(factor * s.range_sigma_relative, 1.0),
+                    "bearing_sigma": min(factor * s.bearing_sigma, 0.5),
+                }
+            )
+        }
+    )
+
+
+def make_consistent(logs: Sequence[Log], rig: Rig, evaluate: Evaluate, guess: float = 3.0) -> Consistency:
+    """The factor for which the EKF's ANEES is ideal on ``logs``; ``guess``: where the search begins.
+
+    First for the causal estimates. Where the final ones are then too sure, for the geometric mean of both.
+    """
+    trials: list[Trial] = []
+
+    def at(factor: float) -> Trial:
+        changed = inflated(rig, factor)
+        trials.append(_trial(factor, [evaluate(replace(log, rig=changed)) for log in logs], logs))
+        return trials[-1]
+
+    if not math.isfinite(at(guess).causal):
+        return Consistency(rig, None, False)
+    trial = _solve(at, trials, lambda t: math.log(t.causal))
+    if trial.final > MAX_FINAL:
+        trial = _solve(at, trials, _both)
+        reached = abs(_both(trial)) < 2.0 * TOLERANCE
+    else:
+        reached = abs(math.log(trial.causal)) < 2.0 * TOLERANCE
+    return Consistency(inflated(rig, trial.factor), trial, reached)
+
+
+def _both(trial: Trial) -> float:
+    return 0.5 * (math.log(trial.causal) + math.log(trial.final))
+
+
+def _solve(at: Callable[[float], Trial], trials: list[Trial], excess: Callable[[Trial], float]) -> Trial:
+    """The trial whose ``excess``, which falls with the factor, is nearest to zero: by secants of logarithms."""
+    low, high = (math.log(f) for f in FACTORS)
+    for _ in range(TRIALS):
+        nearest = sorted(trials, key=lambda t: abs(excess(t)))[:2]
+        best = nearest[0]
+        if abs(excess(best)) < TOLERANCE:
+            break
+        slope = _SLOPE
+        if len(nearest) > 1:
+            step = math.log(nearest[1].factor / best.factor)
+            slope = min((excess(nearest[1]) - excess(best)) / step, -0.2) if abs(step) > 1e-3 else _SLOPE
+        goal = math.log(best.factor) - excess(best) / slope
+        goal = float(np.clip(np.clip(goal, math.log(best.factor) - 1.2, math.log(best.factor) + 1.2), low, high))
+        if any(abs(goal - math.log(t.factor)) < 1e-3 for t in trials):
+            break
+        at(math.exp(goal))
+    return min(trials, key=lambda t: abs(excess(t)))
+
+
+def _trial(factor: float, scores: Sequence[Mapping[str, Any]], logs: Sequence[Log]) -> Trial:
+    causal, final = (relative_anees(scores, logs, kind) for kind in ("causal", "final"))
+    return Trial(factor, causal, final, tuple(scores))
+
+
+def relative_anees(scores: Sequence[Mapping[str, Any]], logs: Sequence[Log], kind: str) -> float:
+    """ANEES over its ideal value, 3 or 2 without the reference's heading: mean over the logs that can be scored, else NaN."""
+    found = [
+        s[f"{kind}.anees"] / (3.0 if log.reference is not None and log.reference.has_heading else 2.0)
+        for s, log in zip(scores, logs, strict=True)
+        if s[f"{kind}.anees"] and s[f"{kind}.scored"] >= MIN_SCORED
+    ]
+    return float(np.mean(found)) if found else math.nan

@@ -1,0 +1,149 @@
+"""Plots of what a calibration left over, as PNG images for its report."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from factorgraph_loc.calibration.learn import Knowledge
+from factorgraph_loc.calibration.noise import BLACKOUT, LENGTHS
+from factorgraph_loc.calibration.windows import cut
+from factorgraph_loc.evaluation.figures import COLOURS
+from factors import bearing_range
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SHOWN = 3000  # dots of a log in a panel
+_VIEW = 5.0  # robust standard deviations; what lies beyond is drawn at the edge
+
+
+def sightings_figure(knowledge: Knowledge) -> bytes:
+    """Residuals of range and bearing: their distribution, over range, and over time."""
+    settings = knowledge.rig.bearing_range
+    assert settings is not None
+    errors = [one.errors(settings) for one in knowledge.seen]
+    rows = [(0, "range", "m"), (1, "bearing", "rad")]
+    rows = [row for row in rows if any(np.isfinite(e[:, row[0]]).any() for e in errors)]
+    figure, axes = _figure(len(rows), 3)
+    for panels, (column, what, unit) in zip(axes, rows, strict=True):
+        typical = np.concatenate(
+            [bearing_range.sigmas(settings.model(), one.ranges)[:, column] for one in knowledge.seen]
+        )
+        limit = _VIEW * float(np.median(typical))
+        edges = np.linspace(-limit, limit, 61)
+        for i, (one, error) in enumerate(zip(knowledge.seen, errors, strict=True)):
+            values = np.clip(error[:, column], -limit, limit)
+            dots = slice(None, None, max(1, len(values) // _SHOWN))
+            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
+            panels[0].hist(values[np.isfinite(values)], edges, density=True, histtype="step", linewidth=1.5, **style)
+            panels[1].plot(one.ranges[dots], values[dots], ".", markersize=2, **style)
+            panels[2].plot(one.t[dots], values[dots], ".", markersize=2, **style)
+        density = np.mean(np.exp(-0.5 * (edges[:, None] / typical) ** 2) / (typical * np.sqrt(2.0 * np.pi)), axis=1)
+        panels[0].plot(edges, density, color="0.3", linestyle="--", label="fitted scatter")
+        far = np.nanmax(np.concatenate([one.ranges for one in knowledge.seen]))
+        distance = np.linspace(0.0, far, 50) if np.isfinite(far) else np.zeros(0)
+        scatter = bearing_range.sigmas(settings.model(), distance)[:, column]
+        for sign in (-2.0, 2.0):
+            panels[1].plot(distance, sign * scatter, color="0.3", linestyle="--", label="2 sigma of the scatter")
+        _name(panels[0], f"{what} residual [{unit}]", f"density [1/{unit}]")
+        _name(panels[1], "measured range [m]", f"{what} residual [{unit}]")
+        _name(panels[2], "time [s]", f"{what} residual [{unit}]")
+    _legend(figure, axes.flat)
+    return _png(figure)
+
+
+def correlation_figure(knowledge: Knowledge) -> bytes:
+    """Autocorrelation of the residuals of one landmark, of each log."""
+    columns = [(0, "range"), (1, "bearing")]
+    columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in knowledge.correlations)]
+    figure, axes = _figure(1, max(1, len(columns)))
+    for axis, (column, what) in zip(axes[0], columns, strict=False):
+        for i, (one, seen) in enumerate(zip(knowledge.correlations, knowledge.seen, strict=True)):
+            known = np.isfinite(one.function[:, column])
+            colour = COLOURS[i % len(COLOURS)]
+            axis.plot(one.lags[known], one.function[known, column], "o-", color=colour, label=seen.log.name)
+        axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
+        axis.axhline(0.0, color="0.5", linewidth=0.8)
+        axis.set_xscale("log")
+        _name(axis, "time between two sightings of a landmark [s]", f"correlation of {what} residuals")
+    _legend(figure, axes.flat)
+    return _png(figure)
+
+
+def odometry_figure(knowledge: Knowledge) -> bytes:
+    """Residuals of the odometry over windows: in time, over distance, and how they grow with the length of the window."""
+    model = knowledge.rig.odometry_model()
+    figure, axes = _figure(3, 3)
+    residuals = [one.residuals(model) for one in knowledge.windows]
+    lengths = (*LENGTHS, BLACKOUT)
+    growth = [_growth([cut(one.log, length) for one in knowledge.windows], model) for length in lengths]
+    for row, (panels, (what, unit)) in enumerate(
+        zip(axes, (("along", "m"), ("lateral", "m"), ("heading", "rad")), strict=True)
+    ):
+        for i, (one, residual) in enumerate(zip(knowledge.windows, residuals, strict=True)):
+            start, end = one.states(model)
+            limit = max(_VIEW * 1.4826 * float(np.median(np.abs(residual[:, row]))), 1e-3)
+            values = np.clip(residual[:, row], -limit, limit)
+            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
+            panels[0].plot(one.begin, values, ".", markersize=3, **style)
+            panels[1].plot((end - start)[:, 4], values, ".", markersize=3, **style)
+        panels[2].plot(
+            lengths, [g[0][row] for g in growth], "o-", color=COLOURS[0], label="residuals, root mean square"
+        )
+        panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
+        panels[2].set_xscale("log")
+        panels[2].set_yscale("log")
+        _name(panels[0], "time [s]", f"{what} [{unit}] in 2 s")
+        _name(panels[1], "distance [m] in 2 s", f"{what} [{unit}] in 2 s")
+        _name(panels[2], "length of the window [s]", f"{what} [{unit}]")
+    _legend(figure, axes.flat)
+    return _png(figure)
+
+
+def _growth(windows: Sequence[Any], model: Any) -> tuple[Array, Array]:
+    """Root mean squares (3,) of the residuals and of what the model says they are."""
+    squares = np.concatenate([one.residuals(model) for one in windows]) ** 2
+    stated = np.concatenate([np.diagonal(one.covariances(model), axis1=1, axis2=2) for one in windows])
+    if not len(squares):
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(stated, axis=0))
+
+
+def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(13.0, 3.2 * rows + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.grid(color="0.9")
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+def _name(axis: Axes, x: str, y: str) -> None:
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+
+
+def _legend(figure: Figure, axes: Any) -> None:
+    entries: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=max(1, len(entries)), markerscale=3
+    )
+
+
+def _png(figure: Figure) -> bytes:
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=80)
+    return out.getvalue()

@@ -1,0 +1,224 @@
+"""The report of a calibration: one HTML page that needs no other file, and the same as a document for programs."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from factorgraph_loc.calibration import figures
+from factorgraph_loc.calibration.calibrate import Calibration, Scores
+from factorgraph_loc.calibration.learn import Learnt
+
+UNITS = {
+    "speed_bias": "m/s",
+    "heading_rate_bias": "rad/s",
+    "direction": "rad",
+    "delay": "s",
+    "lag": "s",
+    "x": "m",
+    "y": "m",
+    "bearing_bias": "rad",
+    "time_offset": "s",
+}
+Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
+"""Header and rows of a table."""
+
+KINDS = ("causal", "final")
+FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
+_STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ddd;text-align:right}
+td:first-child,th:first-child,td:last-child{text-align:left}img{max-width:100%}
+.doubt{background:#fff4d6;padding:.5em 1em;margin:.4em 0}"""
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for a table, a dash where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def constants_table(constants: Sequence[Learnt]) -> Rows:
+    """Each constant before and after, and how well it is known."""
+    header = ("constant", "input rig", "fitted", "standard error", "in the rig")
+    rows: list[tuple[str, ...]] = [
+        (_label(c), number(c.before), number(c.fitted), number(c.error), number(c.value) if c.kept else "as before")
+        for c in constants
+    ]
+    return header, rows
+
+
+def accuracy_table(calibration: Calibration) -> Rows:
+    """The EKF on each log with the input rig, the new one, and one learnt from the other logs."""
+    header = ("log", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
+    rigs: list[tuple[str, tuple[Scores, ...]]] = [("input", calibration.before), ("calibrated", calibration.after)]
+    if calibration.held_out:
+        rigs.append(("from the other logs", calibration.held_out))
+    rows = []
+    for i, log in enumerate(calibration.logs):
+        for name, scores in rigs:
+            found = [number(scores[i][f"{k}.{figure}"], n) for k in KINDS for figure, n in FIGURES.values()]
+            rows.append((log, name, *found))
+    return header, rows
+
+
+def document(calibration: Calibration) -> dict[str, Any]:
+    """Everything of the report as plain values."""
+    noise, trial = calibration.knowledge.noise, calibration.consistency.trial
+    wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
+
+    def scores(found: Sequence[Scores]) -> dict[str, Any]:
+        return {log: {key: s[key] for key in wanted} for log, s in zip(calibration.logs, found, strict=False)}
+
+    return {
+        "logs": list(calibration.logs),
+        "constants": [
+            {
+                "sensor": c.sensor,
+                "name": c.name,
+                "before": c.before,
+                "fitted": c.fitted,
+                "standard_error": c.error,
+                "kept": c.kept,
+                "why": c.why,
+                "per_log": list(c.per_log),
+                "uncertainty": c.uncertainty,
+            }
+            for c in calibration.knowledge.constants
+        ],
+        "odometry_outliers": None if noise is None else noise.outliers,
+        "odometry_widened": None if noise is None else noise.widened,
+        "noise_factor": None if trial is None else trial.factor,
+        "correlation": {
+            log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
+            for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=True)
+        },
+        "before": scores(calibration.before),
+        "after": scores(calibration.after),
+        "held_out": scores(calibration.held_out),
+        "doubts": list(calibration.doubts),
+        "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def page(calibration: Calibration) -> str:
+    """The report as one HTML page, with its plots inside."""
+    knowledge = calibration.knowledge
+    parts = [
+        f"<h1>Calibration of {_text(calibration.rig.name)}</h1>",
+        f"<p>From {_text(', '.join(calibration.logs))}. {_text(_verdict(calibration))}</p>",
+        *(f'<p class="doubt">{_text(doubt)}</p>' for doubt in calibration.doubts),
+        "<h2>Constants</h2>",
+        "<p>A constant is kept if it predicts data better that it was not fitted to: "
+        + ("the other logs" if len(calibration.logs) > 1 else "another fifth of the log")
+        + ". Else the rig keeps the value of the input. "
+        + ("<i>Each log alone</i> says how much it differs between runs." if len(calibration.logs) > 1 else "")
+        + "</p>",
+        _table(*_long_constants(calibration)),
+        "<h2>Noise</h2>",
+        *_noise(calibration),
+        "<h2>How alike neighbouring errors are</h2>",
+        "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
+        "one, and the noise in the rig must be larger than the scatter.</p>",
+        _table(*_correlations(calibration)),
+        "<h2>Accuracy of the EKF</h2>",
+        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the filter is too sure. "
+        + (
+            "The rows <i>from the other logs</i> are the honest ones: nothing in that rig has seen the log."
+            if calibration.held_out
+            else "With one log there is no cross-validation: try the rig on another log before you trust it."
+        )
+        + "</p>",
+        _table(*accuracy_table(calibration)),
+        "<h2>Residuals of the sightings</h2>",
+        _image(figures.sightings_figure(knowledge)),
+        _image(figures.correlation_figure(knowledge)),
+    ]
+    if knowledge.windows:
+        parts += ["<h2>Residuals of the odometry</h2>", _image(figures.odometry_figure(knowledge))]
+    title = f"Calibration of {_text(calibration.rig.name)}"
+    head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
+    return f"{head}<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _verdict(calibration: Calibration) -> str:
+    change = [
+        after["causal.position_rmse"] / before["causal.position_rmse"]
+        for before, after in zip(calibration.before, calibration.after, strict=True)
+        if before["causal.position_rmse"] and after["causal.position_rmse"]
+    ]
+    kept = sum(c.kept for c in calibration.knowledge.constants)
+    text = f"{kept} of {len(calibration.knowledge.constants)} constants were worth changing."
+    if change:
+        mean = math.exp(sum(map(math.log, change)) / len(change))
+        text += f" The EKF's position error is {mean:.2f} times that with the input rig."
+    return text
+
+
+def _long_constants(calibration: Calibration) -> Rows:
+    header, rows = constants_table(calibration.knowledge.constants)
+    parts = calibration.logs if len(calibration.logs) > 1 else ("first half", "second half")
+    long = []
+    for row, c in zip(rows, calibration.knowledge.constants, strict=True):
+        each = [number(v) for v in c.per_log] or ["-"] * len(parts)
+        long.append((*row, *each, number(c.uncertainty), c.why))
+    return (*header, *parts, "differs between logs by", "why"), long
+
+
+def _noise(calibration: Calibration) -> list[str]:
+    noise, trial = calibration.knowledge.noise, calibration.consistency.trial
+    out = []
+    if noise is not None:
+        rows = [
+            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
+            for error, g in noise.growth.items()
+        ]
+        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
+        out.append(_table(header, rows))
+        out.append(
+            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise is {noise.widened:.2f} times "
+            "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
+        )
+    scatter, rig = calibration.knowledge.rig.bearing_range, calibration.rig.bearing_range
+    assert scatter is not None
+    assert rig is not None
+    names = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
+    rows = [(f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(rig, n))) for n, unit in names.items()]
+    out.append(_table(("noise of the sightings", "scatter", "in the rig"), rows))
+    if trial is not None:
+        out.append(
+            f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
+            f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
+        )
+    return out
+
+
+def _correlations(calibration: Calibration) -> Rows:
+    header = ("log", "range: next sighting", "falls to 1/e in [s]", "bearing: next sighting", "falls to 1/e in [s]")
+    rows: list[tuple[str, ...]] = [
+        (log, number(c.next_one[0], 2), number(c.time[0], 1), number(c.next_one[1], 2), number(c.time[1], 1))
+        for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=True)
+    ]
+    return header, rows
+
+
+def _label(c: Learnt) -> str:
+    unit = f" [{UNITS[c.name]}]" if c.name in UNITS else ""
+    return f"{c.sensor}.{c.name}{unit}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    def line(cells: Sequence[str], tag: Callable[[str], str]) -> str:
+        return "<tr>" + "".join(tag(_text(cell)) for cell in cells) + "</tr>"
+
+    body = "".join(line(row, lambda cell: f"<td>{cell}</td>") for row in rows)
+    return f"<table>{line(header, lambda cell: f'<th>{cell}</th>')}{body}</table>"
+
+
+def _image(png: bytes) -> str:
+    return f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

@@ -1,0 +1,177 @@
+"""Robust fits of a few constants, and the choice of those that are worth keeping.
+
+The loss is soft-L1 of whitened residuals, quadratic near zero and linear far from it (Charbonnier et al., "Two deterministic
+half-quadratic regularization algorithms for computed imaging", 1994). Standard errors are those of the sandwich with clusters
+(Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986): residuals within a block of time may be
+correlated in any way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from factors.se2 import Array
+
+LOSS_SCALE = 2.0  # standard deviations at which the loss leaves the parabola
+MAD_TO_SIGMA = 1.4826  # of a Gaussian
+_STEP = 1e-4  # of the numerical derivative, in typical sizes
+_ITERATIONS = 20  # of the reweighted linear fits
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant that may be fitted: its ``neutral`` value (kept where it is not), ``typical`` size of a change, and bounds."""
+
+    name: str
+    neutral: float
+    typical: float
+    low: float
+    high: float
+
+    def is_inside(self, value: float) -> bool:
+        """Whether a value is not at a bound."""
+        margin = 1e-3 * self.typical
+        return self.low + margin < value < self.high - margin
+
+
+@dataclass(frozen=True)
+class Fit:
+    """``values`` (P,) with their ``errors`` (P,); whitened ``residuals`` (M, D) and their ``jacobian`` (M, D, P) there."""
+
+    constants: tuple[Constant, ...]
+    values: Array
+    errors: Array
+    residuals: Array
+    jacobian: Array
+
+    def as_dict(self) -> dict[str, float]:
+        return {c.name: float(v) for c, v in zip(self.constants, self.values, strict=True)}
+
+    def errors_as_dict(self) -> dict[str, float]:
+        return {c.name: float(e) for c, e in zip(self.constants, self.errors, strict=True)}
+
+
+def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array], Array], blocks: Integers) -> Fit:
+    """The constants (P,) that minimise the loss of ``whitened(values)`` (M, D), from a start (P,).
+
+    ``blocks`` (M,): the block of time of each row, for the standard errors.
+    """
+    typical = np.array([c.typical for c in constants])
+    low, high = np.array([c.low for c in constants]), np.array([c.high for c in constants])
+
+    def residual(scaled: Array) -> Array:
+        return whitened(scaled * typical).ravel()
+
+    def jacobian(scaled: Array) -> Array:
+        here = residual(scaled)
+        return np.column_stack([(residual(scaled + step) - here) / _STEP for step in _STEP * np.eye(len(scaled))])
+
+    inside = np.clip(start, low + 1e-9 * typical, high - 1e-9 * typical) / typical
+    found = least_squares(
+        residual,
+        inside,
+        jacobian,
+        bounds=(low / typical, high / typical),
+        loss="soft_l1",
+        f_scale=LOSS_SCALE,
+        xtol=1e-5,
+        ftol=1e-7,
+    )
+    values = np.asarray(found.x * typical)
+    residuals = whitened(values)
+    derivative = jacobian(found.x).reshape(*residuals.shape, -1) / typical
+    errors = np.sqrt(np.diag(_sandwich(residuals, derivative, blocks)))
+    return Fit(tuple(constants), values, errors, residuals, derivative)
+
+
+def gains(found: Fit, folds: Integers) -> Array:
+    """What each constant is worth on data it was not fitted to (P, K), in nats, for K folds; above 0 it helps.
+
+    ``folds`` (M,): the fold of each row. Each fold is predicted by the others with all constants and with all but one, which
+    has its neutral value; the residuals are taken as linear in the constants, about the fit of all data. The constant that helps
+    least is given up for good, if it does not help, and the rest looked at again: of two that do the same only one is needed.
+    One that was stopped by a bound is given up at once.
+    """
+    neutral = np.array([c.neutral for c in found.constants]) - found.values
+    out = np.zeros((len(neutral), int(folds.max()) + 1))
+    kept = [p for p, c in enumerate(found.constants) if c.is_inside(float(found.values[p]))]
+    while kept:
+        complete = _held_out(found, folds, kept, neutral)
+        for p in kept:
+            out[p] = _held_out(found, folds, [q for q in kept if q != p], neutral) - complete
+        useless = [p for p in kept if not is_worth(out[p])]
+        if not useless:
+            break
+        kept.remove(min(useless, key=lambda p: float(np.sum(out[p]))))
+    return out
+
+
+def is_worth(gain: Array) -> bool:
+    """Whether gains (K,) of one constant say that it helps: in sum, and in more than half of the folds."""
+    return bool(np.sum(gain) > 0.0 and np.mean(gain > 0.0) > 0.5)
+
+
+def blocks(times: Sequence[Array], length: float) -> Integers:
+    """A number for each block of ``length`` seconds of each of several logs, one after another."""
+    out: list[Integers] = []
+    for t in times:
+        offset = int(out[-1].max()) + 1 if out and len(out[-1]) else 0
+        out.append(((t - t.min()) // length).astype(np.int64) + offset if len(t) else np.zeros(0, dtype=np.int64))
+    return np.concatenate(out)
+
+
+def folds(times: Sequence[Array], count: int) -> Integers:
+    """Folds of the rows: the logs, where there are several; else ``count`` stretches of time of the only one."""
+    if len(times) > 1:
+        return np.repeat(np.arange(len(times)), [len(t) for t in times])
+    ranks = np.argsort(np.argsort(times[0], kind="stable"), kind="stable")
+    return np.asarray(ranks * count // len(ranks), dtype=np.int64)
+
+
+def loss(residuals: Array) -> float:
+    """The soft-L1 loss of whitened residuals, half their squares where they are small."""
+    return float(np.sum(LOSS_SCALE**2 * (np.sqrt(1.0 + (residuals / LOSS_SCALE) ** 2) - 1.0)))
+
+
+def spread(values: Array) -> Array:
+    """Robust standard deviation (D,) of the columns of ``values`` (M, D) about zero."""
+    return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
+
+
+def _held_out(found: Fit, folds: Integers, free: Sequence[int], neutral: Array) -> Array:
+    """Loss (K,) on each fold of the constants ``free`` fitted on the others; the constants that are not have neutral values.
+
+    ``neutral`` (P,): as changes from the fit of all data.
+    """
+    fixed = neutral.copy()
+    fixed[list(free)] = 0.0
+    shifted = found.residuals + found.jacobian @ fixed
+    derivative = found.jacobian[..., list(free)]
+    out = np.zeros(int(folds.max()) + 1)
+    for k in range(len(out)):
+        train, test = folds != k, folds == k
+        change = np.zeros(len(free))
+        flat = derivative[train].reshape(int(np.sum(train)) * derivative.shape[1], len(free))
+        for _ in range(_ITERATIONS if len(free) else 0):
+            error = shifted[train] + derivative[train] @ change
+            weighted = flat / np.sqrt(1.0 + (error.reshape(-1, 1) / LOSS_SCALE) ** 2)
+            change = -np.linalg.lstsq(weighted.T @ flat, weighted.T @ shifted[train].ravel(), rcond=None)[0]
+        out[k] = loss(shifted[test] + derivative[test] @ change)
+    return out
+
+
+def _sandwich(residuals: Array, jacobian: Array, blocks: Integers) -> Array:
+    """Covariance (P, P) of the constants."""
+    weight = 1.0 / np.sqrt(1.0 + (residuals / LOSS_SCALE) ** 2)
+    bread = np.linalg.pinv(np.einsum("mdp,md,mdq->pq", jacobian, weight**3, jacobian))
+    scores = np.einsum("mdp,md->mp", jacobian, weight * residuals)
+    of_block = np.zeros((int(blocks.max()) + 1, scores.shape[1]))
+    np.add.at(of_block, blocks, scores)
+    return np.asarray(bread @ (of_block.T @ of_block) @ bread)
