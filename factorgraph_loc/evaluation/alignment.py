@@ -47,8 +47,8 @@ def free_map_figures(trajectory: Trajectory, landmarks: Mapping[str, LearntPoint
 
     ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
     learnt landmarks that the log's map also has, after the same alignment: their ``count``, root mean square distance ``rmse`` [m]
-    and mean NEES ``anees``, ideally 2. Without a reference the landmarks themselves are aligned, and errors are a little too
-    small for their covariances. None where there is nothing to say.
+    and mean NEES ``anees``, ideally 2. The covariances also hold how uncertain the start was, which the alignment takes away, so
+    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where there is nothing to say.
     """
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     names = [name for name in landmarks if name in log.world.landmarks]
