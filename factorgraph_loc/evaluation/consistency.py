@@ -88,7 +88,7 @@ def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Traje
     nees = np.empty(0) if trajectory is None else errors(trajectory, reference).nees
     known = np.isfinite(nees)
     if trajectory is None or not known.any():
-        axis.text(0.5, 0.5, f"no {kind} estimate to score", ha="center", transform=axis.transAxes, color="0.4")
+        axis.text(0.5, 0.9, f"no {kind} estimate to score", ha="center", transform=axis.transAxes, color="0.4")
         return
     mean, _ = running_mean(trajectory.t, np.where(known, nees, 0.0), known.astype(float))
     _draw(axis, trajectory.t, nees, np.where(known, mean, np.nan), low)
