@@ -1,0 +1,199 @@
+"""Where the robot is, from identified landmarks alone: for an unknown start, and after being carried elsewhere.
+
+The sightings of the last seconds are chained by odometry to the present. Poses that few of them determine are candidates (one
+landmark: a circle around it; two: the alignment of two points); each is scored against all sightings by the robust likelihood,
+the best are refined by Gauss-Newton, and those that remain apart are hypotheses. Their weights are posterior probabilities
+under a flat prior, by Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6):
+likelihood times the volume of the mode. Hypotheses made from few features and tested by the others: Jensfelt, Kristensen,
+IEEE Transactions on Robotics and Automation 17(5), 2001.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.estimators.base import PosePrior, Status
+from factorgraph_loc.estimators.landmarks import GATE
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.sighting_window import Sighting, Window
+from factors import se2
+from factors.bearing_range import BearingRangeFactor, BearingRangeModel, robust_loss
+from factors.odometry import ChainState
+from factors.se2 import Array
+
+DURATION = 60.0  # s, how far back sightings count
+INTERVAL = 1.0  # s: errors of one landmark's sightings closer than that are nearly the same, so that they count as one
+ROWS = 60  # the newest sightings that count
+REFINED = 24  # candidates
+SAME = 9.0  # Mahalanobis distance squared between poses that are one hypothesis
+NEGLIGIBLE = 1e-3  # weight of a hypothesis
+MARGIN = 5.0  # m, how far beyond the landmarks of the map the robot may be
+REFUTED = 10.0  # in log-likelihood
+
+CLEAR_WEIGHT = 0.99
+# the largest standard deviations of a clear hypothesis: m (or that of a single range, where this is larger), rad
+CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
+CLEAR_SIGHTINGS = 4
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose (3,) with covariance (3, 3) in the world's frame, and its posterior probability.
+
+    ``explained``: how many sightings lie within the gate; ``share``: of all; ``landmarks``: of how many different ones.
+    """
+
+    weight: float
+    pose: Array
+    covariance: Array
+    explained: int
+    share: float
+    landmarks: int
+
+
+class Relocalizer:
+    """Hypotheses of the present pose from the last sightings; see the module. ``positions`` (L, 2): of the map's landmarks."""
+
+    def __init__(self, motion: Motion, positions: Array) -> None:
+        self._motion = motion
+        self._log_volume = math.log(2.0 * math.pi * np.prod(np.ptp(positions, axis=0) + 2.0 * MARGIN))
+        self._model = BearingRangeModel()
+        self._sightings: dict[tuple[float, float], list[Sighting]] = {}
+        self._window: Window | None = None
+        self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._best: PosePrior | None = None
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """Those of the last search, the likeliest first."""
+        return self._hypotheses
+
+    @property
+    def best(self) -> PosePrior | None:
+        """The pose at the last sighting if one hypothesis is clear, else None."""
+        return self._best
+
+    @property
+    def status(self) -> Status:
+        """``unlocalized`` without a hypothesis, ``localized`` if one is clear."""
+        if self._best is not None:
+            return "localized"
+        return "ambiguous" if self._hypotheses else "unlocalized"
+
+    def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
+        """Take the landmarks seen when the odometry was at ``odometry``; late ones, and those taken before, may come again."""
+        self._model = seen.model
+        for point, distance, bearing in zip(seen.points, seen.ranges, seen.bearings, strict=True):
+            rows = self._sightings.setdefault((float(point[0]), float(point[1])), [])
+            rows[:] = [r for r in rows if r.odometry.t != odometry.t]
+            rows.append(Sighting(odometry, point, float(distance), float(bearing)))
+            rows.sort(key=lambda r: r.odometry.t)
+            if len(rows) > 2 and rows[-2].odometry.t < rows[-3].odometry.t + INTERVAL:
+                del rows[-2]
+        self.forget(odometry.t - DURATION)
+
+    def forget(self, before: float) -> None:
+        """Drop the sightings older than ``before`` [s]."""
+        for key, rows in list(self._sightings.items()):
+            rows[:] = [r for r in rows if r.odometry.t >= before]
+            if not rows:
+                del self._sightings[key]
+
+    def search(self) -> None:
+        """Find the hypotheses for the time of the last sighting."""
+        rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
+        earlier, before = self._hypotheses, self._window
+        self._hypotheses, self._best, self._window = (), None, None
+        if not rows:
+            return
+        window = self._window = Window(self._model, rows, self._motion)
+        poses = np.concatenate((window.alignments(), window.circles()))
+        if before is not None and earlier:
+            since = self._motion.relative(before.now, window.now).delta
+            poses = np.concatenate((se2.compose(np.array([h.pose for h in earlier]), since), poses))
+        grain = window.grain()
+        coarse, fine = window.whitener(grain), window.whitener()
+        losses = robust_loss(window.squared(poses, coarse), self._model.robust).sum(axis=1)
+        poses = poses[_apart(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
+        poses, _ = window.refined(poses, coarse, iterations=4)
+        poses, covariances = window.refined(poses, fine, iterations=6)
+        squared = window.squared(poses, fine)
+        self._hypotheses = self._weighed(window, poses, covariances, squared)
+        self._best = self._clear(window)
+
+    def refutes(self, pose: Array, covariance: Array) -> bool:
+        """Whether the clear hypothesis explains the sightings so much better than a track's ``pose`` (3,) at the last sighting,
+        with body-frame ``covariance`` (3, 3), that the track must be wrong."""
+        if self._best is None or self._window is None:
+            return False
+        window, scale = self._window, self._model.robust
+        track = robust_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
+        other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
+        return bool(track - other > REFUTED)
+
+    def _weighed(self, window: Window, poses: Array, covariances: Array, squared: Array) -> tuple[Hypothesis, ...]:
+        """Those that differ, with their posterior probabilities beside that of being elsewhere, where nothing is explained."""
+        volume = np.minimum(0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1] - self._log_volume, 0.0)
+        logs = volume - robust_loss(squared, self._model.robust).sum(axis=1)
+        covariances = se2.body_to_world(poses, covariances)
+        kept: list[int] = []
+        for i in np.argsort(-logs):
+            if all(_distance(poses[i], poses[k], covariances[k]) > SAME for k in kept):
+                kept.append(int(i))
+        logs = np.append(logs[kept], -0.5 * self._model.robust**2 * squared.shape[1])
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        inside = squared < GATE
+        return tuple(
+            Hypothesis(
+                weight=float(weight),
+                pose=poses[i],
+                covariance=covariances[i],
+                explained=int(inside[i].sum()),
+                share=float(inside[i].mean()),
+                landmarks=len(np.unique(window.points[inside[i]], axis=0)),
+            )
+            for i, weight in zip(kept, weights, strict=False)
+            if weight > NEGLIGIBLE
+        )
+
+    def _clear(self, window: Window) -> PosePrior | None:
+        """The likeliest hypothesis if it is clear, with the moments of all its sightings together."""
+        if not self._hypotheses:
+            return None
+        best = self._hypotheses[0]
+        if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
+            return None
+        if best.explained < CLEAR_SIGHTINGS or best.landmarks < 2:
+            return None
+        pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
+        covariance = se2.body_to_world(pose, covariance)
+        if _distance(pose, best.pose, best.covariance) > SAME:
+            return None
+        position = max(CLEAR_POSITION, self._model.range_sigma)
+        if np.linalg.eigvalsh(covariance[:2, :2])[-1] > position**2 or covariance[2, 2] > CLEAR_HEADING**2:
+            return None
+        return PosePrior(window.now.t, pose, covariance)
+
+
+def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
+    """Indices of at most ``count`` poses (N, 3) in the order of their losses (N,), without those near a better one."""
+    kept: list[int] = []
+    losses = losses.copy()
+    while len(kept) < count and np.isfinite(losses).any():
+        kept.append(int(np.argmin(losses)))
+        difference = poses - poses[kept[-1]]
+        difference[:, 2] = se2.wrap(difference[:, 2])
+        losses[np.all(np.abs(difference) < apart, axis=1)] = np.inf
+    return np.array(kept)
+
+
+def _distance(pose: Array, other: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance between two poses (3,) under a covariance (3, 3) in the world's frame."""
+    difference = pose - other
+    difference[2] = se2.wrap_scalar(difference[2])
+    return float(difference @ np.linalg.solve(covariance, difference))

@@ -1,0 +1,45 @@
+"""Whether a track is lost: told by the innovations of the landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.estimators.landmarks import GATE
+from factors.bearing_range import BearingRangeFactor
+from factors.se2 import Array
+
+STAMPS, DURATION = 4, 2.0  # at least as many, over at least so many seconds
+KEPT = 100  # stamps
+BEYOND = 2.0  # times the gate
+SHARE = 0.6  # of the landmarks
+
+
+class TrackMonitor:
+    """Whether the innovations of a track say that it is lost: most landmarks of the last stamps lie far beyond the gate.
+
+    That is a suspicion: landmarks of a wrong map look the same. Whether there is a better place a :class:`Relocalizer` tells.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[tuple[float, int, int]] = []
+
+    def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
+        """Take the landmarks of a stamp, with the ``pose`` (3,) predicted there and its body-frame ``covariance`` (3, 3)."""
+        residual, (jacobian,) = seen.whitened([pose])
+        spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+        squared = np.sum(residual * np.linalg.solve(spread, residual[..., None])[..., 0], axis=1)
+        self._stamps = [s for s in self._stamps if s[0] < t][-KEPT:]
+        self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
+
+    def clear(self) -> None:
+        """Forget the stamps: the track begins anew."""
+        self._stamps.clear()
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """The first of the last stamps, if most landmarks in them lie beyond; None if all is well."""
+        for i in range(len(self._stamps) - STAMPS, -1, -1):
+            if self._stamps[i][0] <= self._stamps[-1][0] - DURATION:
+                beyond, count = (sum(column) for column in list(zip(*self._stamps[i:], strict=True))[1:])
+                return self._stamps[i][0] if beyond > SHARE * count else None
+        return None
