@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +17,9 @@ from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, Veloci
 from factorgraph_loc.rig import BearingRangeSettings, GrowthSettings, OdometryNoise, Rig
 from factors.se2 import Array
 
-MIN_WINDOWS = 30
+MIN_WINDOWS = 20
 MIN_SIGHTINGS = 100
-MOST_SIGHTINGS = 8000  # of a log that have a part in fits
+MOST_SIGHTINGS = 12000  # of a log that have a part in fits
 BLOCKS = 5  # stretches of time of a single log, each predicted by the others
 ROUNDS = 2  # of constants and scatter in turn
 # the constants that an estimator can learn on each run, with the most that the rig takes
@@ -160,14 +160,15 @@ def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -
         sigmas = odometry.scatter(windows, odometry.with_constants(model, start))
         everything = odometry.fit_odometry(windows, model, constants, sigmas, start)
         start = everything.as_dict()
-    gain = gains(everything, folds([one.begin for one in windows], BLOCKS))
+    denied = odometry.denied_at_rest(everything, windows)
+    gain = gains(everything, folds([one.begin for one in windows], BLOCKS), denied)
     kept = [c for c, g in zip(constants, gain, strict=True) if is_worth(g)]
     pooled = odometry.fit_odometry(windows, model, kept, sigmas, start) if kept else None
     model = odometry.with_constants(model, pooled.as_dict() if pooled else {})
     apart = _apart("odometry", constants, start, kept)
     parts = windows if len(windows) > 1 else windows[0].halves()
     alone = [odometry.fit_odometry([one], model, apart, sigmas, start) for one in parts]
-    learnt = _describe("odometry", everything, pooled, alone, gain, len(logs))
+    learnt = _describe("odometry", everything, pooled, alone, gain, len(logs), denied)
     return learnt, fit_noise(logs, model)
 
 
@@ -202,7 +203,13 @@ def _apart(
 
 
 def _describe(
-    sensor: str, everything: Fit, pooled: Fit | None, alone: Sequence[Fit], gain: Array, logs: int
+    sensor: str,
+    everything: Fit,
+    pooled: Fit | None,
+    alone: Sequence[Fit],
+    gain: Array,
+    logs: int,
+    denied: Collection[str] = (),
 ) -> list[Learnt]:
     """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one."""
     values, errors = everything.as_dict(), everything.errors_as_dict()
@@ -230,7 +237,9 @@ def _describe(
                 error=error,
                 gain=float(np.sum(gained)),
                 kept=c.name in kept,
-                why=_why(c, values[c.name], gained),
+                why="not kept: windows in which the robot stood deny it"
+                if c.name in denied
+                else _why(c, values[c.name], gained),
                 per_log=tuple(parts.tolist()),
                 uncertainty=uncertainty,
             )

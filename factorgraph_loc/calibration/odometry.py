@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.calibration.robust import Constant, Fit, blocks, fit, spread
+from factorgraph_loc.calibration.robust import Constant, Fit, blocks, fit, loss, spread
 from factorgraph_loc.calibration.windows import Windows, odometry_of
 from factorgraph_loc.log import VelocityStream
 from factorgraph_loc.rig import OdometrySettings
@@ -22,6 +22,7 @@ LAGGING_START = 0.05  # s; at a lag of zero the derivative says nothing
 
 # of the reference over a window: m, m, rad; residuals are not trusted to be smaller
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
+MIN_STOOD = 5  # windows at rest, below which they have no say
 MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which a window says how large errors are
 
 
@@ -51,6 +52,21 @@ def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant
             Constant("lag", settings.lag, 0.1, 0.0, 5.0),
         ]
     return tuple(found)
+
+
+def denied_at_rest(found: Fit, windows: Sequence[Windows]) -> tuple[str, ...]:
+    """Names of biases that do not fit the windows in which the robot stood: what is reported at rest is known best there.
+
+    ``found``: of all ``windows`` together. Commands, for instance, are zero at rest, whatever is wrong with them on the way.
+    """
+    stood = np.all(np.abs(np.concatenate([one.motion for one in windows])) < REFERENCE_SIGMAS, axis=1)
+    denied = []
+    for p, c in enumerate(found.constants):
+        if c.name in ("speed_bias", "heading_rate_bias") and np.sum(stood) >= MIN_STOOD:
+            without = found.residuals + found.jacobian[..., p] * (c.neutral - found.values[p])
+            if loss(without[stood]) < loss(found.residuals[stood]):
+                denied.append(c.name)
+    return tuple(denied)
 
 
 def with_constants(model: OdometryModel, values: Mapping[str, float]) -> OdometryModel:

@@ -8,7 +8,7 @@ correlated in any way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from factors.se2 import Array
 LOSS_SCALE = 2.0  # standard deviations at which the loss leaves the parabola
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _STEP = 1e-4  # of the numerical derivative, in typical sizes
-_ITERATIONS = 20  # of the reweighted linear fits
+_ITERATIONS = 8  # of the reweighted linear fits
 
 Integers = NDArray[np.int64]
 
@@ -91,17 +91,17 @@ def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array],
     return Fit(tuple(constants), values, errors, residuals, derivative)
 
 
-def gains(found: Fit, folds: Integers) -> Array:
+def gains(found: Fit, folds: Integers, given_up: Collection[str] = ()) -> Array:
     """What each constant is worth on data it was not fitted to (P, K), in nats, for K folds; above 0 it helps.
 
     ``folds`` (M,): the fold of each row. Each fold is predicted by the others with all constants and with all but one, which
     has its neutral value; the residuals are taken as linear in the constants, about the fit of all data. The constant that helps
     least is given up for good, if it does not help, and the rest looked at again: of two that do the same only one is needed.
-    One that was stopped by a bound is given up at once.
+    One that was stopped by a bound, or is ``given_up`` by name, is so from the beginning.
     """
     neutral = np.array([c.neutral for c in found.constants]) - found.values
     out = np.zeros((len(neutral), int(folds.max()) + 1))
-    kept = [p for p, c in enumerate(found.constants) if c.is_inside(float(found.values[p]))]
+    kept = [p for p, c in enumerate(found.constants) if c.is_inside(float(found.values[p])) and c.name not in given_up]
     while kept:
         complete = _held_out(found, folds, kept, neutral)
         for p in kept:

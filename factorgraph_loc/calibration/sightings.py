@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from factorgraph_loc.calibration.robust import Constant, Fit, Integers, blocks, fit, spread
@@ -36,13 +37,15 @@ class Sightings:
     track: Integers
 
     def thinned(self, count: int) -> Sightings:
-        """At most about ``count`` of them, spread evenly."""
-        return self._part(slice(None, None, max(1, len(self.t) // count)))
+        """About ``count`` of them, all of a stamp or none: every so many stamps."""
+        _, stamp = np.unique(self.t, return_inverse=True)
+        return self._part(stamp % max(1, round(len(self.t) / count)) == 0)
 
     def halves(self) -> tuple[Sightings, Sightings]:
         """The first and the second half in time."""
         half = len(self.t) // 2
-        return self._part(slice(None, half)), self._part(slice(half, None))
+        early = np.arange(len(self.t)) < half
+        return self._part(early), self._part(~early)
 
     def residuals(self, settings: BearingRangeSettings) -> Array:
         """Range and bearing (K, 2), predicted less measured, in standard deviations; zero where not measured."""
@@ -57,7 +60,7 @@ class Sightings:
         out[np.isnan(self.bearings), 1] = np.nan
         return out
 
-    def _part(self, rows: slice) -> Sightings:
+    def _part(self, rows: NDArray[np.bool_]) -> Sightings:
         ranges, bearings = self.ranges[rows], self.bearings[rows]
         return Sightings(self.log, self.t[rows], self.points[rows], ranges, bearings, self.track[rows])
 

@@ -14,7 +14,6 @@ from factors.se2 import Array
 
 REFERENCE_GAP = 0.35  # s between reference poses that may be interpolated
 BEFORE = 1.0  # s before a window in which the odometry must be complete too: commands act late
-REPEAT = 0.5  # s after which a velocity is repeated, for it is held only so long
 
 
 @dataclass(frozen=True)
@@ -77,14 +76,12 @@ def odometry_of(log: Log) -> VelocityStream | IncrementStream:
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """The whole odometry of a log as a chain; velocities that only repeat the row before are left out, which changes nothing."""
+    """The whole odometry of a log as a chain."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")
     if isinstance(stream, VelocityStream):
-        columns = np.column_stack((stream.v, stream.w, t // REPEAT))
-        news = np.any(np.diff(columns, axis=0, prepend=np.nan) != 0.0, axis=1)
-        chain.add_velocities(t[news], stream.v[news], stream.w[news])
+        chain.add_velocities(t, stream.v, stream.w)
     else:
         chain.add_increments(t, stream.dx, stream.dy, stream.dtheta)
     return chain

@@ -1,0 +1,78 @@
+"""``fgloc calibrate`` on a minute of a real log."""
+
+import json
+
+import pytest
+
+from factorgraph_loc.rig import read_rig
+
+
+@pytest.fixture(scope="module")
+def calibrated(short_log, tmp_path_factory):
+    """The rig of the short log, its report, and what was printed."""
+    from typer.testing import CliRunner  # noqa: PLC0415
+
+    from factorgraph_loc.cli.main import app  # noqa: PLC0415
+
+    out = tmp_path_factory.mktemp("rigs") / "mower.rig.toml"
+    result = CliRunner().invoke(app, ["calibrate", str(short_log), "-o", str(out)])
+    assert result.exit_code == 0, result.output
+    return out, out.with_name("mower.report.html"), result
+
+
+def test_the_rig_is_complete_and_runs(fgloc, short_log, calibrated, tmp_path):
+    out, _, _ = calibrated
+    rig = read_rig(out)
+    assert rig.bearing_range.range_scale == pytest.approx(1.0697, abs=0.01)
+    result = fgloc("run", short_log, "-e", "ekf", "--rig", out, "-o", tmp_path / "run", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["causal.position_rmse"] < 0.5
+
+
+def test_the_report_needs_no_other_file(calibrated):
+    out, report, result = calibrated
+    assert f"the rig is in {out}, the report in {report}" in result.stdout
+    page = report.read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert "http" not in page
+    assert "heading_rate_bias" in page
+
+
+def test_what_is_there_is_not_replaced_unasked(fgloc, short_log, calibrated):
+    out, _, _ = calibrated
+    before = out.read_bytes()
+    result = fgloc("calibrate", short_log, "-o", out)
+    assert result.exit_code == 2
+    assert "exists already" in result.stderr
+    assert out.read_bytes() == before
+
+
+def test_json_is_one_document(fgloc, short_log, calibrated):
+    out, report, _ = calibrated
+    result = fgloc("calibrate", short_log, "-o", out, "--overwrite", "--json")
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)
+    assert found["files"] == {"rig": str(out), "report": str(report)}
+    assert {c["name"] for c in found["constants"]} >= {"scale_distance", "heading_rate_bias", "range_scale"}
+    assert found["after"]["short"]["causal.position_rmse"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [("mower.toml", "expected a name that ends in .rig.toml"), ("no/a.rig.toml", "there is no folder")],
+)
+def test_a_bad_name_is_told_at_once(fgloc, tmp_path, out, message):
+    result = fgloc("calibrate", "plaza2", "-o", tmp_path / out)
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_a_log_without_reference_is_named(fgloc, short_log, tmp_path):
+    import shutil  # noqa: PLC0415
+
+    blind = shutil.copytree(short_log, tmp_path / "blind")
+    (blind / "reference.tum").unlink()
+    result = fgloc("calibrate", blind, "-o", tmp_path / "a.rig.toml")
+    assert result.exit_code == 2
+    assert "has no reference, expected one to calibrate against" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
