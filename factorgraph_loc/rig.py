@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -90,7 +90,8 @@ class BearingRangeUncertainty(FileModel):
     x: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
     y: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
     bearing_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
-    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0, description="as a share")] = 0.0
+    depth_axis: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
     time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
 
@@ -103,6 +104,8 @@ class BearingRangeSettings(FileModel):
     heading: Angle = 0.0
     bearing_bias: Angle = 0.0
     range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported over true")] = 1.0
+    range_kind: Annotated[Literal["distance", "depth"], Field(description="depth: along one axis only")] = "distance"
+    depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor's frame")] = 0.0
     range_sigma: Annotated[float, Field(gt=0.0, le=10.0, description="m")]
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
     bearing_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad, not degrees")] = 0.05
@@ -114,6 +117,8 @@ class BearingRangeSettings(FileModel):
             mounting=(self.x, self.y, self.heading),
             bearing_bias=self.bearing_bias,
             range_scale=self.range_scale,
+            depth=self.range_kind == "depth",
+            depth_axis=self.depth_axis,
             range_sigma=self.range_sigma,
             range_sigma_relative=self.range_sigma_relative,
             bearing_sigma=self.bearing_sigma,
@@ -144,6 +149,9 @@ class Estimated:
         out = np.zeros((*np.shape(values)[:-1], count))
         out[..., list(self.indices)] = values
         return out
+
+
+NOTHING = Estimated((), (), np.zeros(0))
 
 
 class Rig(FileModel):

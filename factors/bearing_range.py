@@ -2,9 +2,12 @@
 
 A sensor sits on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and
 ``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
-eq. 6.40). The noise is Gaussian in its core; far from it the loss of Geman and McClure levels off, jointly for range
-and bearing of one landmark.
+eq. 6.40). A camera that tells range from the size of what it sees reports the depth along its axis instead of the distance:
+the distance times the cosine of the direction. The noise is Gaussian in its core; far from it the loss of Geman and
+McClure levels off, jointly for range and bearing of one landmark.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -17,20 +20,25 @@ from factors import se2
 from factors.se2 import Array
 
 # the constants of a sensor that can be estimated: those of its model, and how much later it saw than its stamp says [s]
-PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "time_offset")
+PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
+TIME_OFFSET = PARAMETERS.index("time_offset")
+MINIMUM_COSINE = 0.1  # no sensor that measures depth sees farther to the side
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeModel:
     """What we believe about the sensor.
 
-    ``mounting``: (x, y, heading) of the sensor in the robot's frame. ``range_scale``: reported over true. The standard
+    ``mounting``: (x, y, heading) of the sensor in the robot's frame. ``range_scale``: reported over true. ``depth``: what is
+    reported as range is the distance along one axis only, at the angle ``depth_axis`` in the sensor's frame. The standard
     deviation of a range r is ``hypot(range_sigma, range_sigma_relative * r)`` [m]; that of a bearing is ``bearing_sigma`` [rad].
     ``robust``: scale of the Geman-McClure loss in standard deviations.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
     range_scale: float = 1.0
+    depth: bool = False
+    depth_axis: float = 0.0
     range_sigma: float = 0.1
     range_sigma_relative: float = 0.0
     bearing_bias: float = 0.0
@@ -43,25 +51,40 @@ def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Arra
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors, points)
     distance = np.hypot(local[..., 0], local[..., 1])
+    if model.depth:
+        distance = math.cos(model.depth_axis) * local[..., 0] + math.sin(model.depth_axis) * local[..., 1]
     bearing = np.arctan2(local[..., 1], local[..., 0])
     return model.range_scale * distance, se2.wrap(bearing + model.bearing_bias)
+
+
+def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
+    """Where points (K, 2) are in the robot's frame, from their ranges (K,) and bearings (K,)."""
+    direction = bearings - model.bearing_bias
+    distance = ranges / model.range_scale
+    if model.depth:
+        distance = distance / np.maximum(np.cos(direction - model.depth_axis), MINIMUM_COSINE)
+    local = np.column_stack((distance * np.cos(direction), distance * np.sin(direction)))
+    return se2.transform_from(np.array(model.mounting), local)
 
 
 def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array, Array]:
     """Derivatives of (range, bearing) at ``poses`` (..., 3) and ``points`` (..., 2).
 
-    Returns those by the pose's body-frame perturbation (..., 2, 3), by the point (..., 2, 2), and by the sensor's parameters
-    (..., 2, 5): mounting x, y, heading, bearing bias, range scale.
+    Returns those by the pose's body-frame perturbation (..., 2, 3), by the point (..., 2, 2), and by :data:`PARAMETERS`
+    (..., 2, 6): the range scale's by a relative change, the time offset's zero, as it needs the robot's velocity.
     """
     poses = np.asarray(poses, dtype=float)
-    mx, my, _ = model.mounting
+    mx, my, turn = model.mounting
+    axis = turn + model.depth_axis
     robot = se2.transform_to(poses, points)  # the point in the robot's frame
     dx, dy = robot[..., 0] - mx, robot[..., 1] - my
     distance = np.maximum(np.hypot(dx, dy), 1e-6)
     ux, uy = dx / distance, dy / distance
+    ahead_x, ahead_y = math.cos(axis), math.sin(axis)
     # by the point in the robot's frame
     local = np.empty((*np.shape(distance), 2, 2))
-    local[..., 0, 0], local[..., 0, 1] = model.range_scale * ux, model.range_scale * uy
+    local[..., 0, 0] = model.range_scale * (ahead_x if model.depth else ux)
+    local[..., 0, 1] = model.range_scale * (ahead_y if model.depth else uy)
     local[..., 1, 0], local[..., 1, 1] = -uy / distance, ux / distance
     by_pose = np.zeros((*local.shape[:-1], 3))
     by_pose[..., :2] = -local
@@ -70,11 +93,12 @@ def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Ar
     to_robot = np.empty((*np.shape(c), 2, 2))
     to_robot[..., 0, 0], to_robot[..., 0, 1], to_robot[..., 1, 0], to_robot[..., 1, 1] = c, s, -s, c
     by_point = local @ to_robot
-    by_sensor = np.zeros((*local.shape[:-1], 5))
+    by_sensor = np.zeros((*local.shape[:-1], len(PARAMETERS)))
     by_sensor[..., :2] = -local
-    by_sensor[..., 1, 2] = -1.0
-    by_sensor[..., 1, 3] = 1.0
-    by_sensor[..., 0, 4] = distance
+    by_sensor[..., 1, 2] = 1.0
+    by_sensor[..., 0, 3] = model.range_scale * (ahead_x * dx + ahead_y * dy if model.depth else distance)
+    if model.depth:
+        by_sensor[..., 0, 4] = model.range_scale * (ahead_x * dy - ahead_y * dx)
     return by_pose, by_point, by_sensor
 
 
@@ -101,6 +125,18 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
     return error
 
 
+def recalibrated(model: BearingRangeModel, parameters: Array) -> BearingRangeModel:
+    """The model with :data:`PARAMETERS` changed by (6,) values: the range scale by a share, and the time offset has no part."""
+    x, y, bearing_bias, range_scale, depth_axis, _ = parameters.tolist()
+    return replace(
+        model,
+        mounting=(model.mounting[0] + x, model.mounting[1] + y, model.mounting[2]),
+        bearing_bias=model.bearing_bias + bearing_bias,
+        range_scale=model.range_scale * (1.0 + range_scale),
+        depth_axis=model.depth_axis + depth_axis,
+    )
+
+
 def whitened(
     model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
 ) -> tuple[Array, Array]:
@@ -108,18 +144,38 @@ def whitened(
 
     Compiled, as it is the inner loop of every filter and graph; :func:`residuals` and :func:`jacobians` are its plain twins.
     """
-    error, jacobian = np.zeros((len(points), 2)), np.zeros((len(points), 2, 3))
+    error, by_pose, _, _ = _evaluate(model, pose, points, ranges, bearings, 0)
+    return error, by_pose
+
+
+def whitened_all(
+    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The same with the Jacobians by the points (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6), that by the time offset zero."""
+    return _evaluate(model, pose, points, ranges, bearings, len(points))
+
+
+def _evaluate(
+    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array, more: int
+) -> tuple[Array, Array, Array, Array]:
+    count = len(points)
+    error, by_pose = np.zeros((count, 2)), np.zeros((count, 2, 3))
+    by_point, by_sensor = np.zeros((more, 2, 2)), np.zeros((more, 2, len(PARAMETERS)))
     _whitened(
         pose,
         model.mounting,
         (model.range_scale, model.range_sigma, model.range_sigma_relative, model.bearing_bias, model.bearing_sigma),
+        model.depth,
+        model.depth_axis,
         points,
         ranges,
         bearings,
         error,
-        jacobian,
+        by_pose,
+        by_point,
+        by_sensor,
     )
-    return error, jacobian
+    return error, by_pose, by_point, by_sensor
 
 
 @numba.njit(cache=True)
@@ -127,14 +183,20 @@ def _whitened(
     pose: Array,
     mounting: tuple[float, float, float],
     model: tuple[float, float, float, float, float],
+    depth: bool,
+    depth_axis: float,
     points: Array,
     ranges: Array,
     bearings: Array,
     error: Array,
-    jacobian: Array,
+    by_pose: Array,
+    by_point: Array,
+    by_sensor: Array,
 ) -> None:
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
+    ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)
+    more = len(by_point) > 0
     for k in range(len(points)):
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
         px, py = c * dx + s * dy, c * dy - s * dx  # in the robot's frame
@@ -143,16 +205,29 @@ def _whitened(
         ux, uy = sx / distance, sy / distance
         if not math.isnan(ranges[k]):
             weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * ranges[k])
-            error[k, 0] = (range_scale * distance - ranges[k]) * weight
+            vx, vy = (ahead_x, ahead_y) if depth else (ux, uy)  # the direction in which the range grows
+            along = vx * sx + vy * sy
+            error[k, 0] = (range_scale * along - ranges[k]) * weight
             weight *= range_scale
-            jacobian[k, 0, 0], jacobian[k, 0, 1] = -ux * weight, -uy * weight
-            jacobian[k, 0, 2] = (ux * py - uy * px) * weight
+            by_pose[k, 0, 0], by_pose[k, 0, 1] = -vx * weight, -vy * weight
+            by_pose[k, 0, 2] = (vx * py - vy * px) * weight
+            if more:
+                by_sensor[k, 0, 3] = along * weight
+                by_sensor[k, 0, 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
         if not math.isnan(bearings[k]):
             turn = math.atan2(sy, sx) - mounting[2] + bearing_bias - bearings[k]
             error[k, 1] = (turn - 2.0 * math.pi * math.ceil((turn - math.pi) / (2.0 * math.pi))) / bearing_sigma
             weight = 1.0 / (distance * bearing_sigma)
-            jacobian[k, 1, 0], jacobian[k, 1, 1] = uy * weight, -ux * weight
-            jacobian[k, 1, 2] = (-uy * py - ux * px) * weight
+            by_pose[k, 1, 0], by_pose[k, 1, 1] = uy * weight, -ux * weight
+            by_pose[k, 1, 2] = (-uy * py - ux * px) * weight
+            if more:
+                by_sensor[k, 1, 2] = 1.0 / bearing_sigma
+        if more:
+            for i in range(2):
+                # moving the sensor is moving the robot; moving the point is the opposite, in the world's frame
+                by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
+                by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
+                by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
 
 
 def robust_weight(squared: Array, scale: float) -> Array:
@@ -177,10 +252,14 @@ def log_likelihood(model: BearingRangeModel, poses: Array, points: Array, ranges
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """K landmarks of a known map seen at one time, as a factor on the robot's pose then or a little earlier.
+    """K landmarks seen at one time, as a factor on the robot's pose then or a little earlier.
 
+    ``points`` (K, 2): where the landmarks are; ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise.
     ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, known from odometry;
-    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``points`` (K, 2).
+    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``twist`` (3,): the robot's velocity then.
+
+    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
+    constants (P,); then, where ``free``, the position (2,) of the one landmark, in place of ``points``.
     """
 
     model: BearingRangeModel
@@ -189,31 +268,86 @@ class BearingRangeFactor:
     bearings: Array
     offset: Array | None = None
     offset_covariance: Array | None = None
+    point_covariances: Array | None = None
+    estimated: tuple[int, ...] = ()
+    free: bool = False
+    twist: Array | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, 3) by the pose ``values[0]`` (3,)."""
-        error, jacobian = self.whitened(values[0])
+        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        error, blocks = self.whitened(values)
         weight = np.sqrt(robust_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
-        return (weight[:, None] * error).ravel(), [(weight[:, None, None] * jacobian).reshape(-1, 3)]
+        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
+        return (weight[:, None] * error).ravel(), weighted
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss at the pose ``values[0]``."""
-        error, _ = self.whitened(values[0])
+        """The robust loss."""
+        error, _ = self.whitened(values)
         return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
-    def widened(self, width: float) -> "BearingRangeFactor":
+    def widened(self, width: float) -> BearingRangeFactor:
         """The same with a robust loss that is ``width`` times as wide."""
         return replace(self, model=replace(self.model, robust=width * self.model.robust))
 
-    def whitened(self, pose: Array) -> tuple[Array, Array]:
-        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, 3), without the robust weight."""
-        at = pose if self.offset is None else se2.compose(pose, self.offset)
-        error, jacobian = whitened(self.model, at, self.points, self.ranges, self.bearings)
-        if self.offset_covariance is not None:
-            spread = jacobian @ self.offset_covariance @ np.swapaxes(jacobian, -1, -2) + np.eye(2)
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+        offset = here.offset
+        at = values[0] if offset is None else se2.compose(values[0], offset)
+        arguments = (here.model, at, here.points, self.ranges, self.bearings)
+        if self.estimated or self.free or self.point_covariances is not None:
+            error, by_pose, by_point, by_sensor = whitened_all(*arguments)
+        else:
+            error, by_pose = whitened(*arguments)
+        blocks = [by_pose]
+        if self.estimated:
+            if self.twist is not None:
+                by_sensor[..., TIME_OFFSET] = by_pose @ self.twist
+            blocks.append(by_sensor[..., list(self.estimated)])
+        if self.free:
+            blocks.append(by_point)
+        if self.offset_covariance is not None or self.point_covariances is not None:
+            spread = np.zeros((len(error), 2, 2)) + np.eye(2)
+            if self.offset_covariance is not None:
+                spread += by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
+            if self.point_covariances is not None:
+                spread += by_point @ self.point_covariances @ by_point.transpose(0, 2, 1)
             whitener = np.linalg.inv(np.linalg.cholesky(spread))
             error = np.einsum("kij,kj->ki", whitener, error)
-            jacobian = whitener @ jacobian
-        if self.offset is not None:
-            jacobian = jacobian @ se2.adjoint(se2.inverse(self.offset))
-        return error, jacobian
+            blocks = [whitener @ block for block in blocks]
+        if offset is not None:
+            blocks[0] = blocks[0] @ se2.adjoint(se2.inverse(offset))
+        return error, blocks
+
+    def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
+        """The factor on the pose alone, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
+        if not parameters and point is None:
+            return self
+        model, offset = self.model, self.offset
+        if parameters:
+            changes = np.zeros(len(PARAMETERS))
+            changes[list(self.estimated)] = parameters[0]
+            model = recalibrated(model, changes)
+            if self.twist is not None and changes[TIME_OFFSET] != 0.0:
+                later = se2.exp(self.twist * changes[TIME_OFFSET])
+                offset = later if offset is None else se2.compose(offset, later)
+        points = self.points if point is None else point[None]
+        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+
+    def dof(self) -> int:
+        """How many ranges and bearings are measured."""
+        return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
+
+    def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
+        """Where the one landmark is, of which range and bearing are measured, as the pose and the constants have it.
+
+        Returns its position (2,), the Jacobian (2, d) of that by each of ``values`` (the landmark is none of them), and its
+        covariance (2, 2) from the noise of the measurement.
+        """
+        here = self.fixed(values[1:], None)
+        at = values[0] if here.offset is None else se2.compose(values[0], here.offset)
+        point = se2.transform_from(at, located(here.model, self.ranges, self.bearings))[0]
+        _, blocks = replace(self, free=True).whitened([*values, point])
+        # the whitened residual stays zero: by_value dv + by_point dp = noise
+        to_point = np.linalg.inv(blocks[-1][0])
+        return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T

@@ -96,6 +96,22 @@ class PriorFactor:
         return 0.5 * float(error @ error)
 
 
+class VectorPriorFactor:
+    """A Gaussian on one vector: ``mean`` (P,) and standard deviations ``sigmas`` (P,)."""
+
+    def __init__(self, mean: Array, sigmas: Array) -> None:
+        self._mean = mean
+        self._sigmas = sigmas
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (P,) and its Jacobian."""
+        return (values[0] - self._mean) / self._sigmas, [np.diag(1.0 / self._sigmas)]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        return 0.5 * float(np.sum(((values[0] - self._mean) / self._sigmas) ** 2))
+
+
 def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:
     if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, d) for d in dimensions]:
         raise ValueError(f"shapes {residual.shape}, {[b.shape for b in blocks]}, expected {rows} rows")

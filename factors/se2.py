@@ -136,6 +136,15 @@ def transform_to(pose: Array, points: Array) -> Array:
     return out
 
 
+def transform_from(pose: Array, points: Array) -> Array:
+    """Points ``(..., 2)`` in the frame of ``pose``, expressed in the parent frame; the inverse of :func:`transform_to`."""
+    pose, points = np.asarray(pose, dtype=float), np.asarray(points, dtype=float)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x = pose[..., 0] + c * points[..., 0] - s * points[..., 1]
+    y = pose[..., 1] + s * points[..., 0] + c * points[..., 1]
+    return np.stack((x, y), axis=-1)
+
+
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """A covariance ``(..., 3, 3)`` of the body-frame perturbation, as that of ``(x, y, heading)`` in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])

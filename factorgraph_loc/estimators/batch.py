@@ -14,12 +14,10 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.estimators.base import PoseEstimate
-from factorgraph_loc.estimators.keyframes import ITERATIONS_OF_GUESS, GraphEstimator, GraphSettings, Keyframe
-from factorgraph_loc.estimators.landmarks import robust_update
+from factorgraph_loc.estimators.keyframes import Addition, GraphEstimator, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.variables import Values
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
-from factors.bearing_range import BearingRangeFactor
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
@@ -37,7 +35,7 @@ class Batch(GraphEstimator):
     def __init__(self, setup: Setup, settings: BatchSettings) -> None:
         super().__init__(setup, settings)
         self._widest = settings.widest_loss
-        self._guesses: list[Array] = []
+        self._guesses: Values = {}
 
     def estimate(self) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
@@ -46,29 +44,27 @@ class Batch(GraphEstimator):
     def trajectory(self) -> Trajectory:
         """The optimum over the whole log."""
         problem = self._problem()
-        start = np.array(self._guesses), np.zeros(len(self._estimated.indices))
-        best = problem.solve(*start)
+        start = self._constant_priors()[0] | self._guesses
+        best = problem.solve(start)
         width = self._widest
         if width > 1.0:
-            poses, parameters = start
+            values = start
             while width > 1.0:
-                wide = self._problem(width).solve(poses, parameters, ITERATIONS_PER_WIDTH)
-                poses, parameters, width = wide.poses, wide.parameters, width / 2.0
+                values, width = self._problem(width).solve(values, ITERATIONS_PER_WIDTH).values, width / 2.0
             # either way may end in the worse optimum
-            best = min(best, problem.solve(poses, parameters), key=lambda s: s.cost)
-        self._parameters = best.parameters
-        covariances, self._parameter_covariance = problem.covariances(best.poses, best.parameters)
-        return self._between(best.poses, covariances)
+            best = min(best, problem.solve(values), key=lambda s: s.cost)
+        covariances = self._settle(problem, best.values)
+        return self._between(np.array([best.values[k.key] for k in self._keyframes]), covariances)
 
     def _begin(self, first: Keyframe) -> None:
-        self._guesses.append(self._pose)
+        self._guesses[first.key] = self._pose
 
-    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
-        self._pose, self._covariance = guess, spread
-        self._guesses.append(guess)
+    def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
+        self._pose, self._covariance = addition.values[keyframe.key], spread
+        self._guesses |= addition.values
 
-    def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
-        if keyframe.index == len(self._guesses) - 1:
-            update = robust_update(factor, self._pose, self._covariance, ITERATIONS_OF_GUESS)
-            self._pose, self._covariance = se2.compose(self._pose, se2.exp(update.delta)), update.covariance
-            self._guesses[-1] = self._pose
+    def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        self._guesses |= addition.values
+        if guess is not None:
+            self._pose, self._covariance = guess
+            self._guesses[keyframe.key] = self._pose

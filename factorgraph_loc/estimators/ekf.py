@@ -1,55 +1,84 @@
 """Extended Kalman filter on SE(2), with Rauch-Tung-Striebel smoothing for its final trajectory.
 
-The error state is a body-frame perturbation of the pose, followed by that of the odometry's constants that are estimated
-(Sola, Deray, Atchuthan, 2018, section IV). A measurement whose innovation is too large has its noise widened instead
-of being dropped, so that the filter cannot lock itself out.
+The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by the constants of
+odometry and sensor that are estimated, and by the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990). A
+measurement whose innovation is too large has its noise widened instead of being dropped, so that the filter cannot lock itself out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Learnt, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, together, update_state
+from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
+from factors.bearing_range import TIME_OFFSET, BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment, recalibrated
 from factors.se2 import Array
 
 
 class EkfSettings(FilterSettings):
-    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993)."""
+    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993).
+
+    ``self_calibration``: constants to which the rig gives an uncertainty are states. ``landmarks``: see
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
+    """
 
     iterations: Annotated[int, Field(ge=1, le=20)] = 1
+    self_calibration: bool = True
+    landmarks: MapUse = "known"
 
 
 @dataclass(frozen=True)
 class _State:
-    """``pose`` (3,), ``parameters`` (P,) of the odometry, ``covariance`` (3+P, 3+P) of their error state."""
+    """``pose`` (3,); ``rest`` (R,): constants, then ``landmarks``; ``covariance`` (3+R, 3+R) of the error state."""
 
     pose: Array
-    parameters: Array
+    rest: Array
     covariance: Array
+    landmarks: tuple[str, ...] = ()
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        return _State(se2.compose(self.pose, se2.exp(delta[:3])), self.parameters + delta[3:], covariance)
+        return _State(se2.compose(self.pose, se2.exp(delta[:3])), self.rest + delta[3:], covariance, self.landmarks)
 
-    def minus(self, other: _State) -> Array:
-        return np.concatenate((se2.log(se2.between(other.pose, self.pose)), self.parameters - other.parameters))
+    def first(self, size: int) -> _State:
+        """The first ``size`` components of the error state: without landmarks that were met later."""
+        return _State(self.pose, self.rest[: size - 3], self.covariance[:size, :size])
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A prediction: the pose that it led to, the first rows (3, S) of its transition, and the covariance (3, 3) that it added."""
+
+    pose: Array
+    transition: Array
+    noise: Array
+
+    def covariance(self, before: Array) -> Array:
+        """The covariance (S, S) after the prediction, from that before."""
+        moved = self.transition @ before
+        after = before.copy()
+        after[:3] = moved
+        after[:, :3] = moved.T
+        after[:3, :3] = moved @ self.transition.T + self.noise
+        return after
 
 
 @dataclass(frozen=True)
 class _Record:
     t: float
-    predicted: _State
-    transition: Array  # from the record before to ``predicted``
+    step: _Step  # from the record before
     updated: _State
 
 
@@ -61,77 +90,153 @@ class Ekf(Filter):
     def __init__(self, setup: Setup, settings: EkfSettings) -> None:
         super().__init__(setup, settings)
         self._iterations = settings.iterations
-        self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_odometry()
-        self._predicted: _State | None = None
-        self._transition = np.eye(3)
+        self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
+        self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
+        self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
+        self._new_landmarks: NewLandmarks[bool] = NewLandmarks()
+        # where the constants lie in the state's rest, and where the landmarks begin
+        middle = len(self._odometry_constants.names)
+        self._first_landmark = middle + len(self._sensor_constants.names)
+        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, self._first_landmark)
+        self._step: _Step | None = None
 
     def learnt(self) -> Learnt:
-        """The odometry's constants that are estimated."""
+        """The constants and landmarks that are estimated."""
         if self._state is None:
             return Learnt()
-        sigmas = np.sqrt(np.diag(self._state.covariance)[3:])
-        return Learnt(
-            {
-                n: (float(v), float(s))
-                for n, v, s in zip(self._estimated.names, self._state.parameters, sigmas, strict=True)
-            }
-        )
+        rest, covariance = self._state.rest, self._state.covariance[3:, 3:]
+        sigmas = np.sqrt(np.diag(covariance))
+        names = [*self._odometry_constants.names, *(f"bearing_range.{name}" for name in self._sensor_constants.names)]
+        points = {}
+        for number, name in enumerate(self._state.landmarks):
+            part = self._landmark_part(number)
+            points[name] = LearntPoint(rest[part], covariance[part, part])
+        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, rest, sigmas, strict=False)}, points)
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
         records: list[_Record] = self._records
-        states = [r.updated for r in records]
-        if self._smooth:
-            for k in range(len(records) - 2, -1, -1):
-                after, smoothed, here = records[k + 1], states[k + 1], states[k]
-                gain = np.linalg.solve(after.predicted.covariance, after.transition @ here.covariance).T
-                change = smoothed.covariance - after.predicted.covariance
-                states[k] = here.plus(gain @ smoothed.minus(after.predicted), here.covariance + gain @ change @ gain.T)
-        return at_ticks(
-            self._ticks,
-            np.array([r.t for r in records]),
-            np.array([s.pose for s in states]),
-            np.array([s.covariance[:3, :3] for s in states]),
-        )
+        smoothed = records[-1].updated
+        poses, covariances = [smoothed.pose], [smoothed.covariance[:3, :3]]
+        for after, record in zip(records[:0:-1], records[-2::-1], strict=True):
+            smoothed = self._smoothed(record.updated, after.step, smoothed) if self._smooth else record.updated
+            poses.append(smoothed.pose)
+            covariances.append(smoothed.covariance[:3, :3])
+        times = np.array([r.t for r in records])
+        return at_ticks(self._ticks, times, np.array(poses[::-1]), np.array(covariances[::-1]))
+
+    def _smoothed(self, here: _State, step: _Step, after: _State) -> _State:
+        """The state ``here`` given what came later: ``step`` led from it to where ``after`` is the smoothed state."""
+        after = after.first(len(here.covariance))
+        predicted = step.covariance(here.covariance)
+        carried = here.covariance.copy()  # transition times covariance
+        carried[:3] = step.transition @ here.covariance
+        gain = np.linalg.solve(predicted, carried).T
+        change = np.concatenate((se2.log(se2.between(step.pose, after.pose)), after.rest - here.rest))
+        return here.plus(gain @ change, here.covariance + gain @ (after.covariance - predicted) @ gain.T)
 
     def _start(self, prior: PosePrior) -> _State:
-        count = len(self._estimated.indices)
-        covariance = np.zeros((3 + count, 3 + count))
+        sigmas = np.concatenate((self._odometry_constants.sigmas, self._sensor_constants.sigmas))
+        covariance = np.diag(np.concatenate((np.zeros(3), sigmas**2)))
         covariance[:3, :3] = se2.world_to_body(prior.pose, prior.covariance)
-        covariance[3:, 3:] = np.diag(self._estimated.sigmas**2)
-        return _State(np.array(prior.pose, dtype=float), np.zeros(count), covariance)
+        return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance)
 
     def _predict(self, increment: Increment) -> None:
         s = self._state
-        delta, by_parameter = increment.delta, np.zeros((3, 0))
-        if len(s.parameters):
-            delta, jacobian = recalibrated(increment, self._estimated.full(s.parameters, len(PARAMETERS)))
-            by_parameter = jacobian[:, list(self._estimated.indices)]
-        transition = np.eye(len(s.covariance))
-        transition[:3, :3] = se2.adjoint(se2.inverse(delta))
-        transition[:3, 3:] = by_parameter
-        covariance = transition @ s.covariance @ transition.T
-        covariance[:3, :3] += increment.covariance
-        self._state = replace(s, pose=se2.compose(s.pose, delta), covariance=covariance)
-        self._predicted, self._transition = self._state, transition
+        delta = increment.delta
+        transition = np.zeros((3, len(s.covariance)))
+        if self._odometry_constants.names:
+            changes = self._odometry_constants.full(s.rest[self._odometry_part], len(PARAMETERS))
+            delta, jacobian = recalibrated(increment, changes)
+            places = list(self._odometry_constants.indices)
+            transition[:, 3 : 3 + len(places)] = jacobian[:, places]
+        transition[:, :3] = se2.adjoint(se2.inverse(delta))
+        self._step = _Step(se2.compose(s.pose, delta), transition, increment.covariance)
+        self._state = replace(s, pose=self._step.pose, covariance=self._step.covariance(s.covariance))
 
     def _update(self, m: BearingRange) -> None:
-        seen = self._landmarks.factor(m)
-        if seen is None:
-            return
+        self._step = self._step or self._standstill()
+        twist = None
+        if TIME_OFFSET in self._sensor_constants.indices:
+            twist = self._motion.twist(m.t)
+        known = self._landmarks.factor(m, None, twist)
+        seen: list[tuple[BearingRangeFactor, slice | None]] = [] if known is None else [(known, None)]
+        met: list[tuple[str, BearingRangeFactor]] = []
+        for name, factor in self._landmarks.others(m, None, twist):
+            if name in self._state.landmarks:
+                seen.append((factor, self._landmark_part(self._state.landmarks.index(name))))
+            else:
+                met.append((name, factor))
+        if seen:
+            self._correct(m.t, seen)
+        for name, factor in met:
+            self._meet(name, factor)
+
+    def _correct(self, t: float, seen: Sequence[tuple[BearingRangeFactor, slice | None]]) -> None:
         prior = self._state
-        if self._predicted is None:
-            self._predicted = prior
-        update = robust_update(seen, prior.pose, prior.covariance, self._iterations)
-        self._landmarks.report(m.t, seen, update)
+        size = 3  # of the part of the state that the measurement depends on
+        if any(part is not None for _, part in seen):
+            size = len(prior.covariance)
+        elif self._sensor_constants.names:
+            size = 3 + self._first_landmark
+
+        def linearize(delta: Array) -> tuple[Array, Array]:
+            state = prior.plus(delta, prior.covariance)
+            parts = []
+            for factor, part in seen:
+                residual, blocks = factor.whitened(self._values(state, part))
+                jacobian = np.zeros((len(residual), 2, size))
+                jacobian[..., :3] = blocks[0]
+                if self._sensor_constants.names:
+                    jacobian[..., 3 + self._sensor_part.start : 3 + self._sensor_part.stop] = blocks[1]
+                if part is not None:
+                    jacobian[..., 3 + part.start : 3 + part.stop] = blocks[-1]
+                parts.append((residual, jacobian))
+            return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])
+
+        measured = together([factor for factor, _ in seen])
+        update = update_state(linearize, prior.covariance, measured.model.robust, self._iterations, measured.dof())
+        self._landmarks.report(t, measured, update)
         self._state = prior.plus(update.delta, update.covariance)
+
+    def _meet(self, name: str, factor: BearingRangeFactor) -> None:
+        """A landmark that is not in the state: it comes in when an earlier sighting agrees, at where it is seen now."""
+        s = self._state
+        size = len(s.covariance)
+        point, blocks, noise = factor.locate(self._values(s, None))
+        jacobian = np.zeros((2, size))
+        jacobian[:, :3] = blocks[0]
+        if self._sensor_constants.names:
+            jacobian[:, 3 + self._sensor_part.start : 3 + self._sensor_part.stop] = blocks[1]
+        carried = jacobian @ s.covariance
+        spread = carried @ jacobian.T + noise
+        if not self._new_landmarks.propose(name, point, spread, True):
+            return
+        covariance = np.empty((size + 2, size + 2))
+        covariance[:size, :size] = s.covariance
+        covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = carried, carried.T, spread
+        self._state = _State(s.pose, np.concatenate((s.rest, point)), covariance, (*s.landmarks, name))
+
+    def _values(self, state: _State, landmark: slice | None) -> list[Array]:
+        """The values of a factor."""
+        values = [state.pose]
+        if self._sensor_constants.names:
+            values.append(state.rest[self._sensor_part])
+        if landmark is not None:
+            values.append(state.rest[landmark])
+        return values
+
+    def _landmark_part(self, number: int) -> slice:
+        start = self._first_landmark + 2 * number
+        return slice(start, start + 2)
 
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance[:3, :3])
 
     def _record(self) -> _Record:
-        predicted = self._predicted or self._state
-        record = _Record(self._t, predicted, self._transition, self._state)
-        self._predicted, self._transition = None, np.eye(len(self._state.covariance))
-        return record
+        step, self._step = self._step or self._standstill(), None
+        return _Record(self._t, step, self._state)
+
+    def _standstill(self) -> _Step:
+        """The step to a second measurement of the same time."""
+        return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))

@@ -10,22 +10,34 @@ from __future__ import annotations
 import bisect
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEstimate, PosePrior, gaussian_belief
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
+from factorgraph_loc.estimators.base import (
+    Belief,
+    Diagnostics,
+    Learnt,
+    LearntPoint,
+    PoseEstimate,
+    PosePrior,
+    gaussian_belief,
+)
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, robust_update, together
+from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import Motion, propagate
-from factorgraph_loc.estimators.problem import Problem, pose_key
+from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
-from factors.bearing_range import BearingRangeFactor
+from factors.bearing_range import TIME_OFFSET, BearingRangeFactor
+from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry import PARAMETERS, ChainState, Increment, OdometryFactor, recalibrated
 from factors.se2 import Array
 
@@ -33,26 +45,43 @@ ITERATIONS_OF_GUESS = 1
 
 
 class GraphSettings(FileModel):
-    """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come."""
+    """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come.
+
+    ``self_calibration``: constants to which the rig gives an uncertainty are variables. ``landmarks``: see
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
+    """
 
     keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] = 0.09
     keyframe_max_interval: Annotated[float, Field(gt=0.0, le=60.0)] = 1.0
     max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
+    self_calibration: bool = True
+    landmarks: MapUse = "known"
 
 
 @dataclass
 class Keyframe:
-    """A pose variable of the graph: its time, the odometry there, and the factors that hang on it alone."""
+    """A pose variable of the graph: its time, the odometry there, and the sightings that hang on it."""
 
     index: int
     t: float
     odometry: ChainState
     from_previous: Increment | None
-    factors: list[BearingRangeFactor] = field(default_factory=list)
+    nodes: list[Node] = field(default_factory=list)
 
     @property
     def key(self) -> int:
         return pose_key(self.index)
+
+
+Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
+
+
+@dataclass
+class Addition:
+    """What a measurement adds to the graph: factors, and new variables with their guesses."""
+
+    nodes: list[Node] = field(default_factory=list)
+    values: Values = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -74,10 +103,13 @@ class GraphEstimator(ABC):
         self.diagnostics = Diagnostics()
         self._graph_settings = settings
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
-        self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_odometry()
-        self._parameters = np.zeros(len(self._estimated.indices))
-        self._parameter_covariance = np.diag(self._estimated.sigmas**2)
+        self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
+        self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
+        self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
+        self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
+        self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
+        # all variables but the poses: estimate and covariance
+        self._constants, self._spreads = self._constant_priors()
         self._keyframes: list[Keyframe] = []
         self._keyframe_times: list[float] = []
         self._ticks: list[_Tick] = []
@@ -127,11 +159,21 @@ class GraphEstimator(ABC):
         return gaussian_belief(self.estimate())
 
     def learnt(self) -> Learnt:
-        """The odometry's constants that are estimated."""
-        sigmas = np.sqrt(np.diag(self._parameter_covariance))
-        return Learnt(
-            {n: (float(v), float(s)) for n, v, s in zip(self._estimated.names, self._parameters, sigmas, strict=True)}
-        )
+        """The constants and landmarks that are estimated."""
+        values: dict[str, tuple[float, float]] = {}
+        for key, prefix, constants in (
+            (ODOMETRY_KEY, "", self._odometry_constants),
+            (SENSOR_KEY, "bearing_range.", self._sensor_constants),
+        ):
+            if key in self._constants:
+                sigmas = np.sqrt(np.diag(self._spreads[key]))
+                for name, value, sigma in zip(constants.names, self._constants[key], sigmas, strict=True):
+                    values[prefix + name] = (float(value), float(sigma))
+        points = {
+            name: LearntPoint(self._constants[landmark_key(i)], self._spreads[landmark_key(i)])
+            for name, i in self._places.items()
+        }
+        return Learnt(values, points)
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
@@ -142,15 +184,23 @@ class GraphEstimator(ABC):
         """Start the graph with its first keyframe and the prior."""
 
     @abstractmethod
-    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
-        """Add a keyframe with its factors, and bring pose, covariance and parameters up to date.
+    def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
+        """Add a keyframe and what came with it, and bring pose, covariance and constants up to date.
 
-        ``guess`` (3,) and ``spread`` (3, 3): its pose and body-frame covariance by an update of the one before.
+        The guess of its pose in ``addition``, and its body-frame covariance ``spread`` (3, 3), come from an update of the one
+        before.
         """
 
     @abstractmethod
-    def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
-        """Add a factor to an earlier keyframe (it is already among its factors), and bring the estimate up to date."""
+    def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        """Add to a keyframe that is in the graph, and bring the estimate up to date.
+
+        ``guess``: pose and covariance of the newest keyframe after the update, where it is that.
+        """
+
+    def _is_open(self, keyframe: int) -> bool:
+        """Whether factors may still be added to a keyframe."""
+        return 0 <= keyframe < len(self._keyframes)
 
     def _pass_time(self, t: float) -> None:
         self._t = max(self._t, t)
@@ -165,13 +215,14 @@ class GraphEstimator(ABC):
             self._add_keyframe(m.t, m)
             return
         before = self._keyframe_before(m.t)
-        factor = self._landmarks.factor(m, self._since(before, m.t) if m.t > before.t else None)
-        if factor is not None:
-            if before is newest:
-                seen = robust_update(factor, self._pose, self._covariance, iterations=1)
-                self._landmarks.report(m.t, factor, seen)
-            before.factors.append(factor)
-            self._attach(before, factor)
+        if not self._is_open(before.index):
+            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
+            return
+        offset = self._since(before, m.t) if m.t > before.t else None
+        addition = Addition()
+        guess = self._sight(before, m, offset, (self._pose, self._covariance) if before is newest else None, addition)
+        if addition.nodes:
+            self._attach(before, addition, guess)
 
     def _add_keyframe(self, t: float, m: BearingRange | None) -> None:
         newest = self._keyframes[-1]
@@ -179,17 +230,78 @@ class GraphEstimator(ABC):
         increment = self._motion.relative(newest.odometry, odometry)
         moved = self._recalibrated(increment)
         keyframe = Keyframe(newest.index + 1, t, odometry, increment)
-        pose, covariance = se2.compose(self._pose, moved.delta), propagate(self._covariance, moved)
-        factor = None if m is None else self._landmarks.factor(m)
-        if factor is not None:
-            # the guess is where the graph linearises first, and what the robust weights are computed at
-            seen = robust_update(factor, pose, covariance, ITERATIONS_OF_GUESS)
-            self._landmarks.report(t, factor, seen)
-            pose, covariance = se2.compose(pose, se2.exp(seen.delta)), seen.covariance
-            keyframe.factors.append(factor)
+        guess: Guess | None = (se2.compose(self._pose, moved.delta), propagate(self._covariance, moved))
+        addition = Addition()
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
-        self._extend(keyframe, pose, covariance)
+        if m is not None:
+            guess = self._sight(keyframe, m, None, guess, addition)
+        assert guess is not None
+        addition.values[keyframe.key] = guess[0]
+        self._extend(keyframe, addition, guess[1])
+
+    def _sight(
+        self,
+        keyframe: Keyframe,
+        m: BearingRange,
+        offset: Increment | None,
+        guess: Guess | None,
+        addition: Addition,
+    ) -> Guess | None:
+        """Turn a measurement into factors of ``keyframe``; returned is the guess of its pose, updated by them.
+
+        The guess is where the graph linearises first, and what the robust weights are computed at. Without one (the keyframe is
+        an older one) landmarks that are not yet in the graph stay out.
+        """
+        twist = self._motion.twist(m.t) if TIME_OFFSET in self._sensor_constants.indices else None
+        nodes: list[Node] = []
+        seen: list[BearingRangeFactor] = []
+        met: list[tuple[str, BearingRangeFactor]] = []
+        shared = (SENSOR_KEY,) if self._sensor_constants.names else ()
+        constants = [self._constants[key] for key in shared]
+        known = self._landmarks.factor(m, offset, twist)
+        if known is not None:
+            nodes.append(Node((keyframe.key, *shared), known, 2 * len(known.points)))
+            seen.append(known.fixed(constants, None))
+        for name, factor in self._landmarks.others(m, offset, twist):
+            if name not in self._places:
+                met.append((name, factor))
+                continue
+            key = landmark_key(self._places[name])
+            nodes.append(Node((keyframe.key, *shared, key), factor, 2))
+            here = factor.fixed(constants, self._constants[key])
+            seen.append(replace(here, point_covariances=self._spreads[key][None]))
+        if guess is not None:
+            if seen:
+                factor = together(seen)
+                update = robust_update(factor, *guess, ITERATIONS_OF_GUESS)
+                self._landmarks.report(m.t, factor, update)
+                guess = se2.compose(guess[0], se2.exp(update.delta)), update.covariance
+            for name, factor in met:
+                self._meet(name, factor, keyframe, guess, addition)
+        keyframe.nodes += nodes
+        addition.nodes += nodes
+        return guess
+
+    def _meet(
+        self, name: str, factor: BearingRangeFactor, keyframe: Keyframe, guess: Guess, addition: Addition
+    ) -> None:
+        """A landmark that is not in the graph: it comes in when an earlier sighting agrees, with both."""
+        shared = (SENSOR_KEY,) if self._sensor_constants.names else ()
+        point, (by_pose, *_), noise = factor.locate([guess[0], *(self._constants[key] for key in shared)])
+        covariance = by_pose @ guess[1] @ by_pose.T + noise
+        earlier = self._new_landmarks.propose(name, point, covariance, (keyframe.index, factor))
+        if earlier is None:
+            return
+        self._places[name] = len(self._places)
+        key = landmark_key(self._places[name])
+        self._constants[key], self._spreads[key] = point, covariance
+        addition.values[key] = point
+        for index, sighted in (earlier, (keyframe.index, factor)):
+            if self._is_open(index):
+                node = Node((pose_key(index), *shared, key), sighted, 2)
+                self._keyframes[index].nodes.append(node)
+                addition.nodes.append(node)
 
     def _keyframe_before(self, t: float) -> Keyframe:
         return self._keyframes[bisect.bisect_right(self._keyframe_times, t) - 1]
@@ -198,21 +310,48 @@ class GraphEstimator(ABC):
         return self._recalibrated(self._motion.relative(keyframe.odometry, self._motion.state(t)))
 
     def _recalibrated(self, increment: Increment) -> Increment:
-        if not len(self._parameters):
+        if ODOMETRY_KEY not in self._constants:
             return increment
-        delta, _ = recalibrated(increment, self._estimated.full(self._parameters, len(PARAMETERS)))
-        return Increment(delta, increment.covariance, increment.duration)
+        changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
+        return Increment(recalibrated(increment, changes)[0], increment.covariance, increment.duration)
+
+    def _constant_priors(self) -> tuple[Values, Values]:
+        """Means and covariances of the sensors' constants before any measurement."""
+        means: Values = {}
+        spreads: Values = {}
+        for key, constants in ((ODOMETRY_KEY, self._odometry_constants), (SENSOR_KEY, self._sensor_constants)):
+            if constants.names:
+                means[key], spreads[key] = np.zeros(len(constants.names)), np.diag(constants.sigmas**2)
+        return means, spreads
+
+    def _odometry_factor(self, keyframe: Keyframe) -> tuple[OdometryFactor, tuple[int, ...]]:
+        """The factor from the keyframe before, and its keys."""
+        assert keyframe.from_previous is not None
+        keys: tuple[int, ...] = (pose_key(keyframe.index - 1), keyframe.key)
+        if self._odometry_constants.names:
+            keys = (*keys, ODOMETRY_KEY)
+        return OdometryFactor(keyframe.from_previous, self._odometry_constants.indices), keys
 
     def _problem(self, width: float = 1.0) -> Problem:
         """All that is known as one problem; the robust losses ``width`` times as wide as they are."""
         assert self._prior is not None
-        steps = [k.from_previous for k in self._keyframes if k.from_previous is not None]
-        return Problem(
-            self._prior,
-            self._estimated.sigmas,
-            [OdometryFactor(step, self._estimated.indices) for step in steps],
-            [(k.index, factor.widened(width)) for k in self._keyframes for factor in k.factors],
-        )
+        body = se2.world_to_body(self._prior.pose, self._prior.covariance)
+        factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(self._prior.pose, body), (pose_key(0),))]
+        means, spreads = self._constant_priors()
+        factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
+        factors += [self._odometry_factor(k) for k in self._keyframes[1:]]
+        for keyframe in self._keyframes:
+            for node in keyframe.nodes:
+                assert isinstance(node.factor, BearingRangeFactor)
+                factors.append((node.factor.widened(width), node.keys))
+        return Problem(factors)
+
+    def _settle(self, problem: Problem, values: Values) -> Array:
+        """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""
+        covariances = problem.covariances(values, values)
+        for key in self._constants:
+            self._constants[key], self._spreads[key] = values[key], covariances[key]
+        return np.array([covariances[k.key] for k in self._keyframes])
 
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3).

@@ -1,8 +1,10 @@
-"""Identified landmarks of the known map, as all estimators take them in."""
+"""Identified landmarks, as all estimators take them in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
 from factors import se2
-from factors.bearing_range import BearingRangeFactor, robust_weight, sigmas
+from factors.bearing_range import BearingRangeFactor, BearingRangeModel, robust_weight, sigmas
 from factors.odometry import Increment
 from factors.se2 import Array
 
@@ -18,33 +20,84 @@ CONVERGED = 1e-6  # of an iterated update, m and rad
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 
 
-class KnownLandmarks:
-    """Turns measurements into factors on a pose; what the map or the rig lacks is counted as ignored."""
+MapUse = Literal["known", "extended", "unknown"]
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+
+class KnownLandmarks:
+    """Turns measurements into factors; what the map or the rig lacks is counted as ignored.
+
+    ``use`` of the map: ``known`` takes its landmarks as they are and ignores others, ``extended`` estimates the others, ``unknown``
+    estimates all, as if there were no map. ``estimated``: places of the sensor's constants that are estimated.
+    """
+
+    def __init__(
+        self, setup: Setup, diagnostics: Diagnostics, use: MapUse = "known", estimated: tuple[int, ...] = ()
+    ) -> None:
         settings = setup.rig.bearing_range if "bearing_range" in setup.sensors else None
         self._model = None if settings is None else settings.model()
-        self._positions = {name: np.array((m.x, m.y)) for name, m in setup.world.landmarks.items()}
+        landmarks = {} if use == "unknown" else setup.world.landmarks
+        self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
+        self._maps_others = use != "known"
+        self._estimated = estimated
         self._diagnostics = diagnostics
 
-    def factor(self, m: BearingRange, offset: Increment | None = None) -> BearingRangeFactor | None:
-        """The factor of a measurement, on the pose at its time, or on the one that lies ``offset`` before it."""
+    def factor(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> BearingRangeFactor | None:
+        """The factor of the known landmarks, on the pose at its time, or on the one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity then, where the sensor's time offset is estimated.
+        """
         if self._model is None:
             self._diagnostics.ignore("bearing_range", len(m.landmarks))
             return None
         known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
         rows = [i for i in known if not (np.isnan(m.range[i]) and np.isnan(m.bearing[i]))]
-        if len(known) < len(m.landmarks):
+        if len(known) < len(m.landmarks) and not self._maps_others:
             self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
         if len(rows) < len(known):
             self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
         if not rows:
             return None
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
-        ranges, bearings = m.range[rows], m.bearing[rows]
-        if offset is None:
-            return BearingRangeFactor(self._model, points, ranges, bearings)
-        return BearingRangeFactor(self._model, points, ranges, bearings, offset.delta, offset.covariance)
+        return self._factor(self._model, m, rows, points, offset, twist)
+
+    def others(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> list[tuple[str, BearingRangeFactor]]:
+        """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
+        if self._model is None or not self._maps_others:
+            return []
+        found = []
+        for i, name in enumerate(m.landmarks):
+            if name in self._positions:
+                continue
+            if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
+                self._diagnostics.ignore("unknown landmark without range and bearing")
+            else:
+                factor = self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist)
+                found.append((name, replace(factor, free=True)))
+        return found
+
+    def _factor(
+        self,
+        model: BearingRangeModel,
+        m: BearingRange,
+        rows: list[int],
+        points: Array,
+        offset: Increment | None,
+        twist: Array | None,
+    ) -> BearingRangeFactor:
+        return BearingRangeFactor(
+            model,
+            points,
+            m.range[rows],
+            m.bearing[rows],
+            None if offset is None else offset.delta,
+            None if offset is None else offset.covariance,
+            estimated=self._estimated,
+            twist=twist,
+        )
 
     def report(self, t: float, factor: BearingRangeFactor, update: Update) -> None:
         """Record the innovation of an update at time ``t``."""
@@ -67,43 +120,78 @@ class Update:
     dof: int
 
 
-def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int) -> Update:
-    """Kalman update of ``pose`` (3,) and further states, robust and iterated, in information form.
+def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
+    """Factors on one pose alone, of one measurement, as one."""
+    first, *others = factors
+    if not others:
+        return first
+    covariances = [
+        np.zeros((len(f.points), 2, 2)) if f.point_covariances is None else f.point_covariances for f in factors
+    ]
+    return replace(
+        first,
+        points=np.concatenate([f.points for f in factors]),
+        ranges=np.concatenate([f.ranges for f in factors]),
+        bearings=np.concatenate([f.bearings for f in factors]),
+        point_covariances=np.concatenate(covariances),
+    )
 
-    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. At first a
+
+def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int) -> Update:
+    """Kalman update of ``pose`` (3,) and further states by a factor on the pose alone; see :func:`update_state`.
+
+    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
+    """
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])
+        return residual, block
+
+    return update_state(linearize, covariance, factor.model.robust, iterations, factor.dof())
+
+
+def update_state(
+    linearize: Callable[[Array], tuple[Array, Array]], covariance: Array, robust: float, iterations: int, dof: int
+) -> Update:
+    """Kalman update, robust and iterated, in information form.
+
+    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the first D
+    components of the error state, with the state moved by ``delta`` (S,). ``robust``: scale of the loss. At first a
     landmark whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that
     it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
-    robust weight at the updated pose (iteratively reweighted least squares).
+    robust weight at the updated state (iteratively reweighted least squares).
     """
     prior = np.asarray(np.linalg.inv(covariance), dtype=float)
-    residual, blocks = factor.whitened(pose)
-    widening = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:3, :3]) / GATE)
-    delta, updated = _solve(prior, blocks, residual, np.ones(len(residual)), np.zeros(3))
+    zero = np.zeros(len(covariance))
+    residual, blocks = linearize(zero)
+    size = blocks.shape[2]
+    widening = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:size, :size]) / GATE)
+    delta, updated = _solve(prior, blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
-    nis = float(np.vdot(residual, residual) - pull @ updated[:3, :3] @ pull)
+    nis = float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull)
     if widening.max() > 1.0:
-        delta, updated = _solve(prior, blocks, residual, widening**-2, np.zeros(3))
+        delta, updated = _solve(prior, blocks, residual, widening**-2, zero[:size])
     first = residual
     for _ in range(iterations - 1):
-        residual, blocks = factor.whitened(se2.compose(pose, se2.exp(delta[:3])))
-        weight = robust_weight(np.einsum("ki,ki->k", residual, residual), factor.model.robust)
+        residual, blocks = linearize(delta)
+        weight = robust_weight(np.einsum("ki,ki->k", residual, residual), robust)
         before = delta
-        delta, updated = _solve(prior, blocks, residual, weight, delta[:3])
+        delta, updated = _solve(prior, blocks, residual, weight, delta[:size])
         if np.abs(delta - before).max() < CONVERGED:
             break
-    dof = int(np.count_nonzero(~np.isnan(factor.ranges)) + np.count_nonzero(~np.isnan(factor.bearings)))
     return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
 
 
 def _solve(prior: Array, blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
-    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (3,)."""
-    jacobian = blocks.reshape(-1, 3)
+    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (D,)."""
+    size = len(at)
+    jacobian = blocks.reshape(-1, size)
     weighted = jacobian.T * np.repeat(weight, 2)
     information = prior.copy()
-    information[:3, :3] += weighted @ jacobian
+    information[:size, :size] += weighted @ jacobian
     updated = np.asarray(np.linalg.inv(information), dtype=float)
-    return updated[:, :3] @ (weighted @ (jacobian @ at - residual.ravel())), updated
+    return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
 
 
 def _per_landmark(residual: Array, blocks: Array, covariance: Array) -> Array:

@@ -12,6 +12,8 @@ from factors.odometry import ChainState, Increment
 from factors.odometry_chain import OdometryChain
 from factors.se2 import Array
 
+TWIST_TIME = 0.1  # s over which the velocity is taken
+
 
 class Motion:
     """Odometry rows in, relative motion between any two recent times out.
@@ -50,6 +52,11 @@ class Motion:
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         return self._chain.relative(start, end)
+
+    def twist(self, t: float) -> Array:
+        """The robot's velocity (3,) just before ``t``, in its own frame."""
+        moved = self.relative(self.state(t - TWIST_TIME), self.state(t))
+        return np.asarray(se2.log(moved.delta) / TWIST_TIME)
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:

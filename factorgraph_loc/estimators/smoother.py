@@ -7,7 +7,7 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated
 
 import gtsam
@@ -15,14 +15,13 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Keyframe
-from factorgraph_loc.estimators.problem import PARAMETERS_KEY
+from factorgraph_loc.estimators.keyframes import Addition, GraphEstimator, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Node, Solver, Window
+from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
+from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
-from factors.bearing_range import BearingRangeFactor
-from factors.odometry import OdometryFactor, between_factor
+from factors.odometry import between_factor
 from factors.se2 import Array
 
 
@@ -55,54 +54,60 @@ class Smoother(GraphEstimator):
             estimates = self._filtered
         elif isinstance(self._solver, FullHistory):
             self._solver.converge()
-            poses = np.array([self._solver.pose(k.key) for k in self._keyframes])
-            self._read(self._keyframes[-1])
-            covariances, self._parameter_covariance = self._problem().covariances(poses, self._parameters)
-            return self._between(poses, covariances)
+            values = {k.key: self._solver.value(k.key) for k in self._keyframes}
+            values |= {key: self._solver.value(key) for key in self._constants}
+            covariances = self._settle(self._problem(), values)
+            return self._between(np.array([values[k.key] for k in self._keyframes]), covariances)
         else:
-            estimates = self._left + [self._marginal(k) for k in self._keyframes[len(self._left) :]]
+            for key in self._constants:
+                self._constants[key], self._spreads[key] = self._marginal(key)
+            estimates = self._left + [self._marginal(k.key) for k in self._keyframes[len(self._left) :]]
         return self._between(np.array([p for p, _ in estimates]), np.array([c for _, c in estimates]))
 
     def _begin(self, first: Keyframe) -> None:
         self._filtered.append((self._pose, self._covariance))
         self._start_again(first)
 
-    def _extend(self, keyframe: Keyframe, guess: Array, spread: Array) -> None:
-        self._filtered.append((guess, spread))
+    def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
+        self._filtered.append((addition.values[keyframe.key], spread))
         self._leave(keyframe.t)
-        nodes = [self._odometry_node(keyframe), *(self._landmark_node(keyframe, f) for f in keyframe.factors)]
-        self._update(nodes, {keyframe.key: guess})
+        self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
-    def _attach(self, keyframe: Keyframe, factor: BearingRangeFactor) -> None:
-        if keyframe.index < len(self._left):
-            self.diagnostics.drop_late("bearing_range", len(factor.points))
-        else:
-            self._update([self._landmark_node(keyframe, factor)], {})
+    def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        self._update(addition.nodes, addition.values)
 
-    def _update(self, nodes: Sequence[Node], poses: Mapping[int, Array]) -> None:
+    def _is_open(self, keyframe: int) -> bool:
+        return super()._is_open(keyframe) and keyframe >= len(self._left)
+
+    def _update(self, nodes: Sequence[Node], values: Values) -> None:
         newest = self._keyframes[-1]
         try:
-            self._solver.update(nodes, poses, None, newest.t)
-            self._read(newest)
+            self._solver.update(nodes, values, newest.t)
+            self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {str(error).strip().splitlines()[0]}"))
             self._rebuild(newest)
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
-    def _read(self, newest: Keyframe) -> None:
-        """Bring the newest pose, its covariance and the constants up to date."""
-        self._pose, self._covariance = self._marginal(newest)
-        self._filtered[newest.index] = (self._pose, self._covariance)
-        if len(self._parameters):
-            self._parameters = self._solver.parameters()
-            self._parameter_covariance = self._solver.covariance(PARAMETERS_KEY)
+    def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
+        """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
 
-    def _marginal(self, keyframe: Keyframe) -> tuple[Array, Array]:
-        pose, covariance = self._solver.pose(keyframe.key), self._solver.covariance(keyframe.key)
-        if not np.all(np.isfinite(pose)) or not np.all(np.isfinite(covariance)):
+        Of the constants the covariance is not needed before the end, and it takes time: only those of landmarks are read.
+        """
+        self._pose, self._covariance = self._marginal(newest.key)
+        self._filtered[newest.index] = (self._pose, self._covariance)
+        for key in touched:
+            if key in (ODOMETRY_KEY, SENSOR_KEY):
+                self._constants[key] = self._solver.value(key)
+            else:
+                self._constants[key], self._spreads[key] = self._marginal(key)
+
+    def _marginal(self, key: int) -> tuple[Array, Array]:
+        value, covariance = self._solver.value(key), self._solver.covariance(key)
+        if not np.all(np.isfinite(value)) or not np.all(np.isfinite(covariance)):
             raise RuntimeError("the solution is not finite")
-        return pose, covariance
+        return value, covariance
 
     def _leave(self, now: float) -> None:
         """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out."""
@@ -117,7 +122,9 @@ class Smoother(GraphEstimator):
         leaving = self._keyframes[count:end]
         try:
             covariances = self._solver.covariances([k.key for k in leaving])
-            self._left += [(self._solver.pose(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
+            self._left += [(self._solver.value(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
+            for key in self._constants:
+                self._constants[key], self._spreads[key] = self._marginal(key)
         except RuntimeError:
             self._left += [self._filtered[k.index] for k in leaving]
 
@@ -125,53 +132,45 @@ class Smoother(GraphEstimator):
         try:
             self._start_again(newest)
         except RuntimeError as error:
-            if not newest.factors:
+            if not newest.nodes:
                 raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
-            self.diagnostics.reject("bearing_range: the graph cannot be solved with it", len(newest.factors))
-            newest.factors.clear()
+            self.diagnostics.reject("bearing_range: the graph cannot be solved with it", len(newest.nodes))
+            newest.nodes.clear()
             self._rebuild(newest)
 
     def _start_again(self, newest: Keyframe) -> None:
         """A new solver with what is in the graph.
 
-        The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of.
+        The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of, and so do
+        constants and landmarks.
         """
         self._solver = self._new_solver()
         oldest, *others = self._keyframes[len(self._left) :]
         pose, spread = self._filtered[oldest.index]
+        means, spreads = self._constants, self._spreads
         nodes: list[Node] = []
         if oldest.index == 0:
             assert self._prior is not None
             pose, spread = np.asarray(self._prior.pose), se2.world_to_body(self._prior.pose, self._prior.covariance)
-            nodes += [self._landmark_node(oldest, f) for f in oldest.factors]
-        nodes += self._prior_nodes(oldest, pose, spread)
+            means, spreads = self._constant_priors()
+            nodes += oldest.nodes
+        noise = gtsam.noiseModel.Gaussian.Covariance(spread)
+        nodes.append(Node((oldest.key,), native=gtsam.PriorFactorPose2(oldest.key, gtsam.Pose2(*pose), noise)))
+        for key, mean in means.items():
+            noise = gtsam.noiseModel.Gaussian.Covariance(spreads[key])
+            nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
         for keyframe in others:
-            nodes.append(self._odometry_node(keyframe))
-            nodes += [self._landmark_node(keyframe, f) for f in keyframe.factors]
-        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)}
-        self._solver.update(nodes, guesses, self._parameters if len(self._parameters) else None, newest.t)
-        self._read(newest)
-
-    def _prior_nodes(self, keyframe: Keyframe, pose: Array, covariance: Array) -> list[Node]:
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        prior = gtsam.PriorFactorPose2(keyframe.key, gtsam.Pose2(*pose), noise)
-        nodes = [Node((keyframe.key,), native=prior)]
-        if len(self._parameters):
-            noise = gtsam.noiseModel.Gaussian.Covariance(self._parameter_covariance)
-            constants = gtsam.PriorFactorVector(PARAMETERS_KEY, self._parameters, noise)
-            nodes.append(Node((PARAMETERS_KEY,), native=constants))
-        return nodes
+            nodes += [self._odometry_node(keyframe), *keyframe.nodes]
+        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
+        self._solver.update(nodes, guesses, newest.t)
+        self._read(newest, self._constants)
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
-        increment, before = keyframe.from_previous, self._keyframes[keyframe.index - 1].key
-        assert increment is not None
-        if not len(self._parameters):
-            return Node((before, keyframe.key), native=between_factor(before, keyframe.key, increment))
-        factor = OdometryFactor(increment, self._estimated.indices)
-        return Node((before, keyframe.key, PARAMETERS_KEY), factor=factor, rows=3)
-
-    def _landmark_node(self, keyframe: Keyframe, factor: BearingRangeFactor) -> Node:
-        return Node((keyframe.key,), factor=factor, rows=2 * len(factor.points))
+        factor, keys = self._odometry_factor(keyframe)
+        if len(keys) > 2:
+            return Node(keys, factor, 3)
+        assert keyframe.from_previous is not None
+        return Node(keys, native=between_factor(keys[0], keys[1], keyframe.from_previous))
 
     def _new_solver(self) -> Solver:
         parameters = gtsam.ISAM2Params()

@@ -8,15 +8,14 @@ are few variables, and callbacks are cheap.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import gtsam
 import numpy as np
 
-from factorgraph_loc.estimators.problem import PARAMETERS_KEY
+from factorgraph_loc.estimators.variables import Node, Values, is_pose, read, to_gtsam
 from factors import se2
-from factors.graph import Factor, custom_factor, jacobian_factor, pose_array, read_pose, read_vector
+from factors.graph import custom_factor, jacobian_factor, read_pose, read_vector
 from factors.se2 import Array
 
 RELINEARIZE_SKIP = 10  # updates between checks of which factors of the full history to linearise anew
@@ -27,27 +26,14 @@ MAX_FINAL_UPDATES = 20
 CONVERGED = 1e-4  # m, rad: of the final updates
 
 
-@dataclass(frozen=True)
-class Node:
-    """A factor for the graph: GTSAM's own (``native``), or one of ours on the variables ``keys``."""
-
-    keys: tuple[int, ...]
-    native: gtsam.NonlinearFactor | None = None
-    factor: Factor | None = None
-    rows: int = 0
-
-
 class Solver(Protocol):
     """An incremental solver. Every method may raise RuntimeError; the solver is then lost."""
 
-    def update(self, nodes: Sequence[Node], poses: Mapping[int, Array], parameters: Array | None, t: float) -> None:
-        """Add factors, new ``poses`` (3,) by key, and the constants if they are new; ``t`` is the time of new poses."""
+    def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
+        """Add factors and new variables with their guesses; ``t`` is the time of new poses."""
 
-    def pose(self, key: int) -> Array:
-        """Estimate (3,) of a pose."""
-
-    def parameters(self) -> Array:
-        """Estimate (P,) of the constants."""
+    def value(self, key: int) -> Array:
+        """Estimate of a variable."""
 
     def covariance(self, key: int) -> Array:
         """Marginal covariance of a variable, poses in the body frame."""
@@ -61,18 +47,16 @@ class FullHistory:
         self._ours: list[_Linear] = []
         self._updates = 0
 
-    def update(self, nodes: Sequence[Node], poses: Mapping[int, Array], parameters: Array | None, t: float) -> None:
-        values = _values(poses, parameters)
+    def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         graph = gtsam.NonlinearFactorGraph()
         new: list[_Linear] = []
         for node in nodes:
             if node.native is not None:
                 graph.add(node.native)
             else:
-                assert node.factor is not None
-                new.append(_Linear(node, graph.size(), _point(node.keys, values, self._isam)))
+                new.append(_Linear(node, graph.size(), self._point(node.keys, values)))
                 graph.add(new[-1].linearize())
-        slots = self._isam.update(graph, values).getNewFactorsIndices()
+        slots = self._isam.update(graph, to_gtsam(values)).getNewFactorsIndices()
         for linear in new:
             linear.slot = slots[linear.slot]
         self._ours += new
@@ -80,11 +64,8 @@ class FullHistory:
         if self._updates % RELINEARIZE_SKIP == 0:
             self._relinearize(self._ours[-RECENT:], MOVED)
 
-    def pose(self, key: int) -> Array:
-        return pose_array(self._isam.calculateEstimatePose2(key))
-
-    def parameters(self) -> Array:
-        return np.asarray(self._isam.calculateEstimateVector(PARAMETERS_KEY))
+    def value(self, key: int) -> Array:
+        return read(self._isam, key)
 
     def covariance(self, key: int) -> Array:
         return np.asarray(self._isam.marginalCovariance(key))
@@ -96,12 +77,15 @@ class FullHistory:
             if not self._relinearize(self._ours, np.full(3, CONVERGED)):
                 break
 
+    def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
+        """Values of the variables: as given in ``values``, else as the solver estimates them."""
+        return [values[key] if key in values else read(self._isam, key) for key in keys]
+
     def _relinearize(self, linears: Iterable[_Linear], moved: Array) -> bool:
         """Replace the factors whose poses are farther than ``moved`` from where they were linearised; whether there were any."""
         graph, slots, changed = gtsam.NonlinearFactorGraph(), [], []
-        nothing_new = gtsam.Values()
         for linear in linears:
-            point = _point(linear.node.keys, nothing_new, self._isam)
+            point = self._point(linear.node.keys, {})
             if linear.is_off(point, moved):
                 linear.point = point
                 slots.append(linear.slot)
@@ -119,24 +103,20 @@ class Window:
 
     def __init__(self, parameters: gtsam.ISAM2Params, lag: float, on_failure: Callable[[str], None]) -> None:
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag + MARGIN, parameters)
-        self._has_parameters = False
+        self._sizes: dict[int, int] = {}  # of the variables that are no poses
         self._on_failure = on_failure
 
-    def update(self, nodes: Sequence[Node], poses: Mapping[int, Array], parameters: Array | None, t: float) -> None:
+    def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
+        self._sizes |= {key: len(value) for key, value in values.items() if not is_pose(key)}
         graph = gtsam.NonlinearFactorGraph()
         for node in nodes:
-            graph.add(node.native if node.native is not None else self._custom(node, parameters))
-        stamps: dict[int, float] = dict.fromkeys(poses, t)
-        self._has_parameters = self._has_parameters or parameters is not None
-        if self._has_parameters:
-            stamps[PARAMETERS_KEY] = t  # constants never leave the window
-        self._smoother.update(graph, _values(poses, parameters), cast("Mapping[Any, Any]", stamps))
+            graph.add(node.native if node.native is not None else self._custom(node))
+        stamps: dict[int, float] = dict.fromkeys(values, t)
+        stamps |= dict.fromkeys(self._sizes, t)  # what is constant never leaves the window
+        self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
-    def pose(self, key: int) -> Array:
-        return pose_array(self._smoother.calculateEstimatePose2(key))
-
-    def parameters(self) -> Array:
-        return np.asarray(self._smoother.calculateEstimateVector(PARAMETERS_KEY))
+    def value(self, key: int) -> Array:
+        return read(self._smoother, key)
 
     def covariance(self, key: int) -> Array:
         return np.asarray(self._smoother.marginalCovariance(key))
@@ -146,11 +126,10 @@ class Window:
         joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
         return [np.asarray(joint.at(key, key)) for key in keys]
 
-    def _custom(self, node: Node, parameters: Array | None) -> gtsam.NonlinearFactor:
+    def _custom(self, node: Node) -> gtsam.NonlinearFactor:
         assert node.factor is not None
-        readers = [read_vector if key == PARAMETERS_KEY else read_pose for key in node.keys]
-        size = len(self.parameters() if parameters is None else parameters) if PARAMETERS_KEY in node.keys else 0
-        dimensions = [size if key == PARAMETERS_KEY else 3 for key in node.keys]
+        readers = [read_pose if is_pose(key) else read_vector for key in node.keys]
+        dimensions = [3 if is_pose(key) else self._sizes[key] for key in node.keys]
         return custom_factor(node.factor, node.keys, readers, dimensions, node.rows, self._on_failure)
 
 
@@ -164,39 +143,17 @@ class _Linear:
 
     def linearize(self) -> gtsam.LinearContainerFactor:
         assert self.node.factor is not None
-        values = gtsam.Values()
-        for key, value in zip(self.node.keys, self.point, strict=True):
-            values.insert(key, value if key == PARAMETERS_KEY else gtsam.Pose2(*value))
+        values = to_gtsam(dict(zip(self.node.keys, self.point, strict=True)))
         return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, self.point), values)
 
     def is_off(self, point: Sequence[Array], moved: Array) -> bool:
+        """Whether a pose or a landmark is farther than ``moved`` (m, m, rad) from where it was."""
         for key, old, new in zip(self.node.keys, self.point, point, strict=True):
-            if key != PARAMETERS_KEY:
-                change = new - old
+            change = new - old
+            if is_pose(key):
                 turn = abs(se2.wrap_scalar(change[2]))
                 if abs(change[0]) > moved[0] or abs(change[1]) > moved[1] or turn > moved[2]:
                     return True
+            elif np.abs(change).max() > moved[0]:
+                return True
         return False
-
-
-def _values(poses: Mapping[int, Array], parameters: Array | None) -> gtsam.Values:
-    values = gtsam.Values()
-    for key, pose in poses.items():
-        values.insert(key, gtsam.Pose2(*pose))
-    if parameters is not None:
-        values.insert(PARAMETERS_KEY, parameters)
-    return values
-
-
-def _point(keys: Sequence[int], values: gtsam.Values, isam: gtsam.ISAM2) -> list[Array]:
-    """Values of the variables: as given in ``values``, else as the solver estimates them."""
-    point = []
-    for key in keys:
-        if key == PARAMETERS_KEY:
-            known = values.exists(key)
-            point.append(read_vector(values, key) if known else np.asarray(isam.calculateEstimateVector(key)))
-        elif values.exists(key):
-            point.append(read_pose(values, key))
-        else:
-            point.append(pose_array(isam.calculateEstimatePose2(key)))
-    return point

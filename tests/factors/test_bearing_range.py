@@ -11,13 +11,16 @@ from factors.bearing_range import (
     BearingRangeFactor,
     BearingRangeModel,
     jacobians,
+    located,
     log_likelihood,
     predict,
+    recalibrated,
     residuals,
     robust_loss,
     robust_weight,
     sigmas,
     whitened,
+    whitened_all,
 )
 from factors.graph import custom_factor, jacobian_factor, read_pose
 
@@ -33,12 +36,15 @@ models = st.builds(
     bearing_bias=st.floats(-0.2, 0.2),
     bearing_sigma=st.floats(0.01, 0.2),
     robust=st.floats(0.5, 5.0),
+    depth=st.booleans(),
+    depth_axis=st.floats(-0.3, 0.3),
 )
 
 
 def apart(model, pose, point):
     """Not at the sensor itself, where bearing has no derivative, nor where it wraps."""
-    distance, bearing = predict(model, pose, point)
+    _, bearing = predict(model, pose, point)
+    distance = np.hypot(*se2.transform_to(se2.compose(pose, np.array(model.mounting)), point))
     return distance > 0.3 and abs(bearing) < 3.0
 
 
@@ -63,18 +69,13 @@ def test_jacobians_are_the_numerical_ones(model, pose, point):
         return np.column_stack(columns)
 
     def with_sensor(d):
-        changed = BearingRangeModel(
-            mounting=tuple(np.array(model.mounting) + d[:3]),
-            bearing_bias=model.bearing_bias + d[3],
-            range_scale=model.range_scale + d[4],
-        )
-        return predict(changed, pose, point)
+        return predict(recalibrated(model, d), pose, point)
 
     np.testing.assert_allclose(
         by_pose, derivative(lambda d: predict(model, se2.compose(pose, se2.exp(d)), point), 3), atol=1e-5
     )
     np.testing.assert_allclose(by_point, derivative(lambda d: predict(model, pose, point + d), 2), atol=1e-5)
-    np.testing.assert_allclose(by_sensor, derivative(with_sensor, 5), atol=1e-5)
+    np.testing.assert_allclose(by_sensor, derivative(with_sensor, 6), atol=1e-5)
 
 
 @given(models, poses, st.integers(0, 10_000))
@@ -84,11 +85,83 @@ def test_the_compiled_function_gives_what_its_plain_twins_give(model, pose, seed
     ranges, bearings = rng.uniform(0.2, 9.0, 4), rng.uniform(-3.1, 3.1, 4)
     ranges[1] = bearings[2] = np.nan
     assume(all(apart(model, pose, p) for p in seen))
-    error, jacobian = whitened(model, pose, seen, ranges, bearings)
-    plain = jacobians(model, pose, seen)[0] / sigmas(model, ranges)[:, :, None]
-    plain[1, 0] = plain[2, 1] = 0.0
+    error, *found = whitened_all(model, pose, seen, ranges, bearings)
+    assert np.array_equal(whitened(model, pose, seen, ranges, bearings)[1], found[0])
+    plain = [block / sigmas(model, ranges)[:, :, None] for block in jacobians(model, pose, seen)]
+    for block in plain:
+        block[1, 0] = block[2, 1] = 0.0
     np.testing.assert_allclose(error, residuals(model, pose, seen, ranges, bearings), atol=1e-8)
-    np.testing.assert_allclose(jacobian, plain, rtol=1e-6, atol=1e-6)
+    for compiled, block in zip(found, plain, strict=True):
+        np.testing.assert_allclose(compiled, block, rtol=1e-6, atol=1e-6)
+
+
+def test_depth_is_the_distance_along_the_axis():
+    model = BearingRangeModel(depth=True, depth_axis=np.pi / 2, range_scale=1.1)
+    depth, bearing = predict(model, np.zeros(3), np.array((3.0, 2.0)))
+    assert depth == pytest.approx(2.2)
+    assert bearing == pytest.approx(np.arctan2(2.0, 3.0))
+
+
+@given(models, st.integers(0, 10_000))
+def test_what_is_located_is_what_was_seen(model, seed):
+    rng = np.random.default_rng(seed)
+    directions, distances = rng.uniform(-0.8, 0.8, 5), rng.uniform(0.5, 9.0, 5)
+    local = np.column_stack((distances * np.cos(directions), distances * np.sin(directions)))
+    seen = se2.transform_from(np.array(model.mounting), local)
+    ranges, bearings = predict(model, np.zeros(3), seen)
+    np.testing.assert_allclose(located(model, ranges, bearings), seen, atol=1e-9)
+
+
+@given(models, poses, st.integers(0, 10_000), st.booleans())
+def test_jacobians_of_the_factor_by_constants_and_point_are_the_numerical_ones(model, pose, seed, displaced):
+    rng = np.random.default_rng(seed)
+    offset = np.array((0.1, 0.02, 0.1)) if displaced else None
+    point = rng.uniform(-8.0, 8.0, 2)
+    at = pose if offset is None else se2.compose(pose, offset)
+    assume(apart(model, at, point))
+    measured = [value + rng.normal(0.0, 0.01) for value in predict(model, at, point)]
+    factor = BearingRangeFactor(
+        model,
+        np.zeros((1, 2)),
+        np.array([measured[0]]),
+        np.array([measured[1]]),
+        offset,
+        estimated=(0, 2, 3, 4, 5),
+        free=True,
+        twist=np.array((0.3, 0.01, 0.2)),
+    )
+    values = [pose, np.zeros(5), point]
+    _, blocks = factor.whitened(values)
+    step = 1e-6
+    for which, size in ((0, 3), (1, 5), (2, 2)):
+        for j, d in enumerate(step * np.eye(size)):
+            found = []
+            for sign in (1.0, -1.0):
+                moved = list(values)
+                moved[which] = se2.compose(pose, se2.exp(sign * d)) if which == 0 else values[which] + sign * d
+                found.append(factor.whitened(moved)[0])
+            np.testing.assert_allclose(blocks[which][:, :, j], (found[0] - found[1]) / (2 * step), rtol=1e-3, atol=2e-3)
+
+
+@given(models, poses, st.integers(0, 10_000))
+def test_a_located_landmark_has_the_spread_of_its_pose_and_noise(model, pose, seed):
+    rng = np.random.default_rng(seed)
+    sensor = se2.compose(pose, np.array(model.mounting))
+    point = se2.transform_from(sensor, np.array((3.0, rng.uniform(-1.0, 1.0))))
+    assume(apart(model, pose, point))
+    measured = predict(model, pose, point)
+    factor = BearingRangeFactor(
+        model, np.zeros((1, 2)), np.array([measured[0]]), np.array([measured[1]]), estimated=(2,), free=True
+    )
+    located_at, blocks, noise = factor.locate([pose, np.zeros(1)])
+    np.testing.assert_allclose(located_at, point, atol=1e-9)
+    assert np.all(np.linalg.eigvalsh(noise) > 0.0)
+    step = 1e-6
+    for j, d in enumerate(step * np.eye(3)):
+        after = factor.locate([se2.compose(pose, se2.exp(d)), np.zeros(1)])[0]
+        np.testing.assert_allclose(blocks[0][:, j], (after - point) / step, atol=1e-3)
+    after = factor.locate([pose, np.array([step])])[0]
+    np.testing.assert_allclose(blocks[1][:, 0], (after - point) / step, atol=1e-3)
 
 
 @given(models, poses, st.integers(0, 10_000), st.booleans())

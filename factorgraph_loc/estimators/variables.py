@@ -1,0 +1,73 @@
+"""The variables of a graph by GTSAM's keys, and what hangs on them.
+
+A variable is a pose (3,), or a vector: constants of a sensor that are estimated, or the position (2,) of a landmark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import se2
+from factors.graph import Factor, pose_array
+from factors.se2 import Array
+
+Values = dict[int, Array]
+
+ODOMETRY_KEY = int(gtsam.symbol("c", 0))  # constants of the odometry
+SENSOR_KEY = int(gtsam.symbol("s", 0))  # constants of the sensor of landmarks
+_POSE = ord("x")
+_CHARACTER = 56  # bits of a key below its character
+
+
+def pose_key(index: int) -> int:
+    """The key of the pose of keyframe ``index``."""
+    return int(gtsam.symbol("x", index))
+
+
+def landmark_key(index: int) -> int:
+    """The key of the landmark that was met as number ``index``."""
+    return int(gtsam.symbol("l", index))
+
+
+def is_pose(key: int) -> bool:
+    """Whether the variable is a pose."""
+    return key >> _CHARACTER == _POSE
+
+
+@dataclass(frozen=True)
+class Node:
+    """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, or GTSAM's own (``native``)."""
+
+    keys: tuple[int, ...]
+    factor: Factor | None = None
+    rows: int = 0
+    native: gtsam.NonlinearFactor | None = None
+
+
+def retract(key: int, value: Array, step: Array) -> Array:
+    """A variable moved by a step of its tangent space."""
+    return se2.compose(value, se2.exp(step)) if is_pose(key) else value + step
+
+
+def to_gtsam(values: Values) -> gtsam.Values:
+    """The same as GTSAM holds them."""
+    out = gtsam.Values()
+    for key, value in values.items():
+        out.insert(key, gtsam.Pose2(*value) if is_pose(key) else value)
+    return out
+
+
+def read(solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, key: int) -> Array:
+    """The estimate of a variable."""
+    if is_pose(key):
+        return pose_array(solver.calculateEstimatePose2(key))
+    return np.asarray(solver.calculateEstimateVector(key), dtype=float)
+
+
+def gather(values: Values, keys: Sequence[int]) -> list[Array]:
+    """The values of several variables."""
+    return [values[key] for key in keys]
