@@ -21,11 +21,15 @@ MIN_WINDOWS = 20
 MIN_SIGHTINGS = 100
 MOST_SIGHTINGS = 12000  # of a log that have a part in fits
 BLOCKS = 5  # stretches of time of a single log, each predicted by the others
+BETTER_KIND = (
+    0.9  # ranges are taken to be of the other kind, distance or depth, if then their spread is below this share
+)
 ROUNDS = 2  # of constants and scatter in turn
 # the constants that an estimator can learn on each run, with the most that the rig takes
 UNCERTAIN: dict[str, dict[str, float]] = {
     "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias"), 1.0),
-    "bearing_range": {"x": 10.0, "y": 10.0} | dict.fromkeys(("bearing_bias", "range_scale", "time_offset"), 1.0),
+    "bearing_range": {"x": 10.0, "y": 10.0}
+    | dict.fromkeys(("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0),
 }
 _FIRST_SIGMA = 0.1  # m, of a sensor of which nothing is known
 
@@ -129,6 +133,8 @@ def learn(logs: Sequence[Log], rig: Rig) -> Knowledge:
     seen = tuple(sightings_with(log) for log in logs)
     found, sensor = _learn_sensor(seen, rig)
     learnt += found
+    if rig.bearing_range is not None and sensor.range_kind != rig.bearing_range.range_kind:
+        notes.append(f"The ranges fit better as the {sensor.range_kind} than as the {rig.bearing_range.range_kind}.")
     sensors = rig.sensors if "bearing_range" in rig.sensors else (*rig.sensors, "bearing_range")
     rig = rig.model_copy(update={"bearing_range": sensor, "sensors": sensors})
     rig = _uncertainties(rig, learnt)
@@ -175,13 +181,13 @@ def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -
 def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], BearingRangeSettings]:
     before = rig.bearing_range or BearingRangeSettings(range_sigma=_FIRST_SIGMA)
     seen = [one.thinned(MOST_SIGHTINGS) for one in seen]
-    constants = sightings.constants_of(seen, before)
-    start = {c.name: c.neutral for c in constants}
-    settings = sightings.with_scatter(seen, before)
-    for _ in range(ROUNDS):
-        everything = sightings.fit_sensor(seen, settings, constants, start)
-        start = everything.as_dict()
-        settings = sightings.with_scatter(seen, settings.model_copy(update=start))
+    everything, settings = _fit_and_scatter(seen, before)
+    if sightings.could_be_depths(seen):
+        other = before.model_copy(update={"range_kind": "distance" if before.range_kind == "depth" else "depth"})
+        found, changed = _fit_and_scatter(seen, other)
+        if sightings.range_spread(seen, changed) < BETTER_KIND * sightings.range_spread(seen, settings):
+            everything, settings = found, changed
+    constants, start = everything.constants, everything.as_dict()
     gain = gains(everything, folds([one.t for one in seen], BLOCKS))
     kept = [c for c, g in zip(constants, gain, strict=True) if is_worth(g)]
     settings = settings.model_copy(update={c.name: c.neutral for c in constants})
@@ -192,6 +198,18 @@ def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], Be
     alone = [sightings.fit_sensor([one], settings, apart, start) for one in parts]
     learnt = _describe("bearing_range", everything, pooled, alone, gain, len(seen))
     return learnt, sightings.with_scatter(seen, settings)
+
+
+def _fit_and_scatter(seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
+    """All constants of the sensor and its scatter, in turn."""
+    constants = sightings.constants_of(seen, before)
+    start = {c.name: c.neutral for c in constants}
+    settings = sightings.with_scatter(seen, before)
+    for _ in range(ROUNDS):
+        everything = sightings.fit_sensor(seen, settings, constants, start)
+        start = everything.as_dict()
+        settings = sightings.with_scatter(seen, settings.model_copy(update=start))
+    return everything, settings
 
 
 def _apart(
@@ -227,7 +245,7 @@ def _describe(
         error = max(errors[c.name], spread / np.sqrt(len(parts)) if len(parts) and c.name in kept else 0.0)
         uncertainty = None
         if c.name in UNCERTAIN[sensor] and logs > 1:
-            uncertainty = max(spread, error) / (abs(value) if c.name in ("scale_distance", "scale_rotation") else 1.0)
+            uncertainty = max(spread, error) / (abs(value) if "scale" in c.name else 1.0)
         out.append(
             Learnt(
                 sensor,

@@ -21,6 +21,7 @@ UNITS = {
     "x": "m",
     "y": "m",
     "bearing_bias": "rad",
+    "depth_axis": "rad",
     "time_offset": "s",
 }
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]

@@ -106,9 +106,21 @@ def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> t
         found += [Constant("bearing_bias", settings.bearing_bias, 0.02, -np.pi, np.pi)]
     if has_range:
         found += [Constant("range_scale", settings.range_scale, 0.02, 0.2, 5.0)]
+    if settings.range_kind == "depth":
+        found += [Constant("depth_axis", settings.depth_axis, 0.02, -np.pi, np.pi)]
     if has_heading:
         found += [Constant("time_offset", settings.time_offset, 0.05, -MAX_OFFSET, MAX_OFFSET)]
     return tuple(found)
+
+
+def could_be_depths(seen: Sequence[Sightings]) -> bool:
+    """Whether the logs can tell distances from depths along one axis: there must be bearings beside the ranges."""
+    return any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in seen)
+
+
+def range_spread(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
+    """Robust standard deviation of the ranges' residuals [m]."""
+    return float(spread(np.concatenate([one.errors(settings) for one in seen]))[0])
 
 
 def fit_sensor(

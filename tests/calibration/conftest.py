@@ -37,6 +37,7 @@ class Robot:
     y: float = 0.0
     bearing_bias: float = 0.0
     range_scale: float = 1.0
+    depth: bool = False
     time_offset: float = 0.0
     range_sigma: float = 0.03
     bearing_sigma: float = 0.01
@@ -80,14 +81,16 @@ def _sightings(truth: Trajectory, robot: Robot, rng: np.random.Generator) -> Bea
     names = np.tile(list(WORLD.landmarks), len(t))
     local = se2.transform_to(sensors[:, None], WORLD.positions()[None]).reshape(-1, 2)
     count = len(local)
-    ranges = robot.range_scale * np.hypot(*local.T) + robot.range_sigma * rng.standard_normal(count)
+    ranges = robot.range_scale * (local[:, 0] if robot.depth else np.hypot(*local.T))
+    ranges += robot.range_sigma * rng.standard_normal(count)
     bearings = np.arctan2(local[:, 1], local[:, 0]) + robot.bearing_bias
     bearings += robot.bearing_sigma * rng.standard_normal(count)
     bad = rng.random(count) < robot.outliers
     ranges[bad] = rng.uniform(0.3, 15.0, np.sum(bad))
     bearings[bad] = rng.uniform(-np.pi, np.pi, np.sum(bad))
     stamps = np.repeat(t, len(WORLD.landmarks)) - robot.time_offset
-    return BearingRangeStream(stamps, names.tolist(), ranges, se2.wrap(bearings))
+    seen = local[:, 0] > 0.5 * np.abs(local[:, 1]) if robot.depth else np.ones(count, dtype=bool)
+    return BearingRangeStream(stamps[seen], names[seen].tolist(), ranges[seen], se2.wrap(bearings[seen]))
 
 
 @pytest.fixture

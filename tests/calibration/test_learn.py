@@ -75,6 +75,16 @@ def test_increments_have_neither_delay_nor_lag(simulate):
     assert constants["scale_rotation"].fitted == pytest.approx(1.04, abs=4.0 * constants["scale_rotation"].error)
 
 
+@pytest.mark.parametrize(("depth", "kind"), [(True, "depth"), (False, "distance")])
+def test_depths_are_told_from_distances(simulate, depth, kind):
+    log = simulate(seconds=100.0, depth=depth)
+    knowledge = learn([log], log.rig)
+    assert knowledge.rig.bearing_range.range_kind == kind
+    assert any("fit better as the depth" in note for note in knowledge.notes) == depth
+    scatter = np.hypot(knowledge.rig.bearing_range.range_sigma, 4.0 * knowledge.rig.bearing_range.range_sigma_relative)
+    assert scatter == pytest.approx(0.03, rel=0.15)
+
+
 def test_what_differs_between_logs_becomes_an_uncertainty(simulate):
     logs = [simulate(seed=i, seconds=100.0, x=x) for i, x in enumerate((0.1, 0.2, 0.3))]
     knowledge = learn(logs, logs[0].rig)
