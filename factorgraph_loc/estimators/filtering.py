@@ -62,7 +62,7 @@ class Filter(ABC):
         if not isinstance(measurement, BearingRange | Tick):
             self._motion.add(measurement)
         elif self._state is None:
-            self.diagnostics.ignore("before the start")
+            self._begin(measurement)
         elif measurement.t >= self._t:
             self._take(measurement)
         elif measurement.t < self._t - self._max_delay or not self._events:
@@ -71,7 +71,7 @@ class Filter(ABC):
             self._take_late(measurement)
 
     def estimate(self) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick."""
+        """The pose at the time of the newest measurement or tick, not a number before the start."""
         if self._state is None:
             return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         return self._estimate()
@@ -107,6 +107,21 @@ class Filter(ABC):
     @abstractmethod
     def _record(self) -> Any:
         """What :meth:`trajectory` needs of this time, with its time as ``t``."""
+
+    def _seek(self, m: BearingRange) -> Any:
+        """The state from a measurement alone, for an unknown start; None where it does not tell one."""
+        return None
+
+    def _begin(self, m: BearingRange | Tick) -> None:
+        """Start without a prior, at the first measurement that tells something of the pose."""
+        if isinstance(m, Tick):
+            return
+        self._t, self._odometry = m.t, self._motion.state(m.t)
+        self._state = self._seek(m)
+        if self._state is not None:
+            self._records.append(self._record())
+        elif not self.supports_unknown_start:
+            self.diagnostics.ignore("before the start")
 
     def _take(self, m: BearingRange | Tick) -> None:
         checkpoint = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))

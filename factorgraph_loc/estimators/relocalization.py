@@ -32,7 +32,9 @@ REFINED = 24  # candidates
 SAME = 9.0  # Mahalanobis distance squared between poses that are one hypothesis
 NEGLIGIBLE = 1e-3  # weight of a hypothesis
 MARGIN = 5.0  # m, how far beyond the landmarks of the map the robot may be
-REFUTED = 10.0  # in log-likelihood
+WIDE = 3.0  # m, standard deviation of a hypothesis that is no Gaussian
+# what a hypothesis must explain to refute a track: that many landmarks and that share of the sightings, and so much more of them
+REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
 
 CLEAR_WEIGHT = 0.99
 # the largest standard deviations of a clear hypothesis: m (or that of a single range, where this is larger), rad
@@ -60,7 +62,8 @@ class Relocalizer:
 
     def __init__(self, motion: Motion, positions: Array) -> None:
         self._motion = motion
-        self._log_volume = math.log(2.0 * math.pi * np.prod(np.ptp(positions, axis=0) + 2.0 * MARGIN))
+        extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(2)
+        self._log_volume = math.log(2.0 * math.pi * np.prod(extent + 2.0 * MARGIN))
         self._model = BearingRangeModel()
         self._sightings: dict[tuple[float, float], list[Sighting]] = {}
         self._window: Window | None = None
@@ -125,15 +128,32 @@ class Relocalizer:
         self._hypotheses = self._weighed(window, poses, covariances, squared)
         self._best = self._clear(window)
 
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Poses (N, 3) at the last sighting, drawn from the hypotheses; in place of those that are too wide to be Gaussian, from
+        the likelihood of that sighting alone (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
+        if self._window is None:
+            return np.empty((0, 3))
+        narrow = [h for h in self._hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
+        weights = np.array([h.weight for h in narrow])
+        counts = rng.multinomial(count, np.append(weights, max(0.0, 1.0 - weights.sum())))
+        poses = [self._window.drawn(rng, int(counts[-1]))]
+        for h, n in zip(narrow, counts, strict=False):
+            body = se2.world_to_body(h.pose, h.covariance)
+            poses.append(se2.compose(h.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, int(n)))))
+        return np.concatenate(poses)
+
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """Whether the clear hypothesis explains the sightings so much better than a track's ``pose`` (3,) at the last sighting,
-        with body-frame ``covariance`` (3, 3), that the track must be wrong."""
+        """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: the clear
+        hypothesis explains nearly all sightings, and far more of them. Landmarks that the map has in wrong places also
+        agree on some place, but on one that the others speak against."""
         if self._best is None or self._window is None:
+            return False
+        if self._hypotheses[0].share < REFUTING_SHARE or self._hypotheses[0].landmarks < REFUTING_LANDMARKS:
             return False
         window, scale = self._window, self._model.robust
         track = robust_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
         other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
-        return bool(track - other > REFUTED)
+        return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _weighed(self, window: Window, poses: Array, covariances: Array, squared: Array) -> tuple[Hypothesis, ...]:
         """Those that differ, with their posterior probabilities beside that of being elsewhere, where nothing is explained."""

@@ -51,14 +51,29 @@ class Window:
 
     def circles(self) -> Array:
         """Present poses (N, 3) that put the landmark seen last on its range and bearing, in all directions from it."""
-        (k,) = self._recent()[:1]
+        k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
         grid = np.meshgrid(np.arange(CIRCLE) * 2.0 * np.pi / CIRCLE, np.array(ranges), np.array(bearings))
-        heading, distance, bearing = (g.ravel() for g in grid)
-        turned = np.column_stack((np.zeros((len(heading), 2)), heading))
-        there = se2.transform_from(turned, located(self._model, distance, bearing))
-        return se2.compose(np.column_stack((self.points[k] - there, heading)), self._forth[k])
+        return self._placed(k, *(g.ravel() for g in grid))
+
+    def drawn(self, rng: np.random.Generator, count: int) -> Array:
+        """Present poses (N, 3) drawn from the likelihood of the last sighting alone."""
+        k, noise = len(self.points) - 1, rng.standard_normal((2, count))
+        headings = rng.uniform(-np.pi, np.pi, count)
+        ranges = np.abs(self._ranges[k] + self._sigmas[k, 0] * noise[0])
+        bearings = self._bearings[k] + self._sigmas[k, 1] * noise[1]
+        if self._missing[k, 0]:
+            ranges = rng.uniform(RADII[0], RADII[-1], count)
+        if self._missing[k, 1]:
+            bearings = rng.uniform(-np.pi, np.pi, count)
+        return self._placed(k, headings, ranges, bearings)
+
+    def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
+        """Present poses (N, 3) that had the headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
+        turned = np.column_stack((np.zeros((len(headings), 2)), headings))
+        there = se2.transform_from(turned, located(self._model, ranges, bearings))
+        return se2.compose(np.column_stack((self.points[k] - there, headings)), self._forth[k])
 
     def alignments(self) -> Array:
         """Present poses (N, 3) that put two landmarks seen with range and bearing where the map has them."""

@@ -22,6 +22,12 @@ class TrackMonitor:
 
     def __init__(self) -> None:
         self._stamps: list[tuple[float, int, int]] = []
+        self._since: float | None = None
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """When most landmarks began to lie beyond, None if all is well."""
+        return self._since
 
     def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
         """Take the landmarks of a stamp, with the ``pose`` (3,) predicted there and its body-frame ``covariance`` (3, 3)."""
@@ -30,16 +36,21 @@ class TrackMonitor:
         squared = np.sum(residual * np.linalg.solve(spread, residual[..., None])[..., 0], axis=1)
         self._stamps = [s for s in self._stamps if s[0] < t][-KEPT:]
         self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
+        last = self._last()
+        share = sum(s[1] for s in last) / max(1, sum(s[2] for s in last))
+        if self._since is None and share > SHARE:
+            self._since = last[0][0]
+        elif share < SHARE / 2.0:
+            self._since = None
 
     def clear(self) -> None:
         """Forget the stamps: the track begins anew."""
         self._stamps.clear()
+        self._since = None
 
-    @property
-    def suspicious_since(self) -> float | None:
-        """The first of the last stamps, if most landmarks in them lie beyond; None if all is well."""
+    def _last(self) -> list[tuple[float, int, int]]:
+        """The fewest last stamps that are enough to judge by, none if there are too few."""
         for i in range(len(self._stamps) - STAMPS, -1, -1):
             if self._stamps[i][0] <= self._stamps[-1][0] - DURATION:
-                beyond, count = (sum(column) for column in list(zip(*self._stamps[i:], strict=True))[1:])
-                return self._stamps[i][0] if beyond > SHARE * count else None
-        return None
+                return self._stamps[i:]
+        return []
