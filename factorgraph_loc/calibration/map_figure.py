@@ -1,0 +1,58 @@
+"""The picture of a map: what was given, what was learnt, and where the robot was."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgraph_loc.calibration.mapping import LandmarkMap
+from factorgraph_loc.evaluation.figures import COLOURS, grid, legend
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CORNERS = 60  # of an ellipse that is drawn as a polygon
+
+
+def figure(log: str, made: LandmarkMap, poses: Array) -> Figure:
+    """Given and learnt landmarks, these with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
+    given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
+    learnt = [e for e in made.entries if e.learnt is not None]
+    places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
+    everything = np.concatenate((given.reshape(-1, 2), places, poses[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map")
+    axis = axes[0, 0]
+    axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
+    if len(given):
+        axis.plot(*given.T, "k^", markersize=9, markerfacecolor="none", label="given map", zorder=3)
+    for entry in learnt:
+        assert entry.learnt is not None
+        colour = COLOURS[1] if entry.flagged else COLOURS[0]
+        kind = "wrong in the given map" if entry.flagged else "learnt"
+        x, y = entry.learnt.position
+        axis.plot(x, y, "x" if entry.flagged else "+", color=colour, markersize=9, label=kind, zorder=4)
+        axis.plot(*_ellipse(entry.learnt.position, entry.learnt.covariance), color=colour, label="2 sigma", zorder=4)
+        axis.annotate(entry.landmark, (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
+        if entry.flagged and entry.given is not None:
+            axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    legend(out, [axis])
+    return out
+
+
+def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
+    """A given map that could not be brought together with the new one has another frame."""
+    return made.judged or verdict == "given"
+
+
+def _ellipse(centre: Array, covariance: Array) -> Array:
+    """Outline (2, CORNERS) of two standard deviations."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+    circle = np.stack((np.cos(angle), np.sin(angle)))
+    return np.asarray(centre[:, None] + vectors @ (2.0 * np.sqrt(np.maximum(values, 0.0))[:, None] * circle))

@@ -1,0 +1,162 @@
+"""``fgloc map``: a map of identified landmarks from a log, and what it says about the map that the log has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import (
+    DataRoot,
+    Json,
+    LogName,
+    LogOptions,
+    Overwrite,
+    Prior,
+    Reader,
+    ReaderOption,
+    RigFile,
+    Settings,
+    WorldFile,
+    parse_settings,
+)
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.calibration.mapping import LandmarkMap
+    from factorgraph_loc.log import Log
+
+SUFFIX = ".world.toml"
+MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
+START_SIGMA = 1e-3  # m and rad; without a map the start is what defines the frame
+SOURCES = {"log": "the log's start", "reference": "its reference"}
+HEADER = ("landmark", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
+OutWorld = Annotated[
+    Path, typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture goes beside it.")
+]
+
+
+def map_(
+    log: LogName,
+    out: OutWorld,
+    estimator: Annotated[
+        str, typer.Option("--estimator", "-e", metavar="NAME", help=f"One of {', '.join(MAPPERS)}.")
+    ] = MAPPERS[0],
+    extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
+    prior: Prior = None,
+    set_: Settings = None,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Make a map of the landmarks in a log; where the log has a map, check that."""
+    picture = _picture_beside(out, overwrite=overwrite)
+    if estimator not in MAPPERS:
+        raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
+    settings = parse_settings(set_ or (), [estimator])[estimator]
+    if "landmarks" in settings:
+        raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
+    from factorgraph_loc.calibration import map_figure, mapping
+    from factorgraph_loc.evaluation.figures import save
+    from factorgraph_loc.experiments.run import RunConfig, run
+    from factorgraph_loc.files import replacing
+    from factorgraph_loc.world import write_world
+    from factors import se2
+
+    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
+    mapping.check(loaded)
+    if extend and not loaded.world.landmarks:
+        raise InputError(f"{loaded.name}: has no map that could be extended; leave --extend out")
+    source = ""
+    if extend:
+        started, config = loaded, RunConfig(estimator, settings | {"landmarks": "extended"}, prior=prior)
+    else:
+        started, source = _started_exactly(loaded, prior)
+        config = RunConfig(estimator, settings | {"landmarks": "unknown"}, prior="log")
+    with show.progress(estimator, counted=False) as report:
+        result = run(started, config, lambda share: report(share, 1.0))
+    made = mapping.make_map(loaded, result.learnt.landmarks, extend=extend)
+    trajectory = se2.compose(made.frame, result.final.poses)
+    try:
+        with replacing(picture) as temporary:
+            save(map_figure.figure(loaded.name, made, trajectory), temporary)
+        write_world(made.world, out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    for warning in result.warnings:
+        show.note(f"warning: {warning}")
+    frame = "that of the given map" if extend or made.judged else f"that of the start: {source}"
+    if json:
+        show.document(_document(made, frame) | {"files": {"map": str(out), "picture": str(picture)}})
+        return
+    _print_table(made)
+    typer.echo()
+    for line in (made.summary(), *made.notes, f"the frame of the new map is {frame}"):
+        typer.echo(line)
+    typer.echo(f"\nthe map is in {out}, a picture of it in {picture}")
+
+
+def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
+    """The log with a start that is certain, and where that lies, in words."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
+    from factorgraph_loc.log import StartPose
+
+    start, source = resolve_prior(log, prior)
+    if start is None:
+        t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
+    else:
+        t, pose = start.t, start.pose
+        x, y, heading = pose
+        source = f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {SOURCES.get(source, '--prior')}"
+    return replace(log, start=StartPose(t, pose, np.full(3, START_SIGMA))), source
+
+
+def _print_table(made: LandmarkMap) -> None:
+    rows = []
+    for entry in made.entries:
+        given = (None, None) if entry.given is None else entry.given
+        learnt = (None, None) if entry.learnt is None else entry.learnt.position
+        numbers = (*given, *learnt, entry.sigma, entry.distance)
+        rows.append((entry.landmark, *(show.number(value) for value in numbers), entry.verdict))
+    show.table(HEADER, rows)
+
+
+def _document(made: LandmarkMap, frame: str) -> dict[str, Any]:
+    landmarks = [
+        {
+            "landmark": entry.landmark,
+            "given": None if entry.given is None else entry.given.tolist(),
+            "learnt": None if entry.learnt is None else entry.learnt.position.tolist(),
+            "covariance": None if entry.learnt is None else entry.learnt.covariance.tolist(),
+            "sigma": entry.sigma,
+            "distance": entry.distance,
+            "verdict": entry.verdict,
+            "flagged": entry.flagged,
+        }
+        for entry in made.entries
+    ]
+    return {"landmarks": landmarks, "summary": made.summary(), "notes": [*made.notes], "frame": frame}
+
+
+def _picture_beside(out: Path, *, overwrite: bool) -> Path:
+    """The picture's path; InputError if the map's name is not one, or something is there already."""
+    name = out.name.removesuffix(SUFFIX)
+    if name in ("", out.name):
+        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {SUFFIX}")
+    if not out.parent.is_dir():
+        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
+    picture = out.with_name(f"{name}.map.png")
+    for path in (out, picture):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists already; choose another name or give --overwrite")
+    return picture

@@ -1,0 +1,137 @@
+"""`fgloc map`, from the arguments to the files, on a small simulated log."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from factorgraph_loc.log import BearingRangeStream, Log, StartPose, VelocityStream
+from factorgraph_loc.readers import write_native
+from factorgraph_loc.rig import BearingRangeSettings, Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World, read_world
+from factors import se2
+
+SPEED, TURN, SECONDS = 0.4, 0.25, 60.0
+NAMES = ["1", "2", "3", "4", "5", "6", "7"]
+PLACES = np.array([(4.0, -1.0), (5.0, 3.0), (1.0, 5.5), (-3.0, 4.5), (-4.0, 0.5), (0.5, -2.5), (0.5, 1.8)])
+
+
+def world(places):
+    return World(landmarks={n: Landmark(x=x, y=y) for n, (x, y) in zip(NAMES, places.tolist(), strict=True)})
+
+
+@pytest.fixture(scope="session")
+def circling():
+    """A robot that drives in circles from (0, 0, 0), among seven landmarks."""
+    rng = np.random.default_rng(7)
+    t = np.arange(0.0, SECONDS, 0.1)
+    poses = se2.exp(np.column_stack((SPEED * t, 0.0 * t, TURN * t)))
+    rows = np.repeat(np.arange(0, len(t), 5), len(NAMES))
+    local = se2.transform_to(poses[rows], np.tile(PLACES, (len(rows) // len(NAMES), 1)))
+    ranges = np.hypot(*local.T) + 0.05 * rng.standard_normal(len(rows))
+    bearings = np.arctan2(local[:, 1], local[:, 0]) + 0.02 * rng.standard_normal(len(rows))
+    streams = {
+        "odometry": VelocityStream(t, np.full(len(t), SPEED), np.full(len(t), TURN)),
+        "bearing_range": BearingRangeStream(t[rows], NAMES * (len(rows) // len(NAMES)), ranges, se2.wrap(bearings)),
+    }
+    rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.05, bearing_sigma=0.02))
+    return Log("circling", rig, world(PLACES), streams, Trajectory(t, poses))
+
+
+@pytest.fixture
+def on_disk(circling, tmp_path):
+    """``on_disk(**changes)``: the path of the log with other fields."""
+
+    def write(**changes):
+        write_native(replace(circling, **changes), tmp_path / "log")
+        return tmp_path / "log"
+
+    return write
+
+
+def test_a_map_with_swapped_landmarks_is_corrected_and_can_be_used(fgloc, on_disk, tmp_path):
+    wrong = PLACES.copy()
+    wrong[[1, 4]] = wrong[[4, 1]]
+    folder, out = on_disk(world=world(wrong)), tmp_path / "new.world.toml"
+    result = fgloc("map", folder, "-o", out)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert any(line.startswith("2 ") and line.endswith("swapped with 5") for line in map(str.rstrip, lines))
+    summary = "7 landmarks are in the new map: 5 agreeing with the given one, 2 wrong in the given map (2, 5)"
+    assert summary in lines
+    assert str(out) in lines[-1]
+    made = read_world(out)
+    np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
+    assert all(landmark.covariance for landmark in made.landmarks.values())
+    with Image.open(tmp_path / "new.map.png") as picture:
+        assert picture.width == 1600
+    run = fgloc("run", folder, "-e", "ekf", "--world", out, "-o", tmp_path / "run", "--json")
+    assert json.loads(run.stdout)["causal.position_rmse"] < 0.15
+
+
+def test_without_a_map_the_frame_is_the_start(fgloc, on_disk, tmp_path):
+    folder = on_disk(world=World(), reference=None)
+    result = fgloc("map", folder, "-e", "ekf", "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 0, result.output
+    assert "that of the start: the first pose is the origin (0, 0, 0)" in result.stdout
+    np.testing.assert_allclose(read_world(tmp_path / "a.world.toml").positions(), PLACES, atol=0.3)
+    result = fgloc("map", folder, "-e", "ekf", "-o", tmp_path / "b.world.toml", "--prior", "10,20,1.5")
+    assert "the robot starts at (10.000 m, 20.000 m, 1.500 rad), from --prior" in result.stdout
+    there = se2.transform_from(np.array((10.0, 20.0, 1.5)), PLACES)
+    np.testing.assert_allclose(read_world(tmp_path / "b.world.toml").positions(), there, atol=0.3)
+
+
+def test_a_map_is_extended(fgloc, on_disk, tmp_path):
+    part = World(landmarks=dict(list(world(PLACES).landmarks.items())[:4]))
+    start = StartPose(0.0, np.zeros(3), np.full(3, 0.05))
+    folder = on_disk(world=part, reference=None, start=start)
+    result = fgloc("map", folder, "-e", "ekf", "--extend", "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 0, result.output
+    assert "7 landmarks are in the new map: 4 as given, 3 new" in result.stdout
+    made = read_world(tmp_path / "a.world.toml")
+    assert made.landmarks["1"] == part.landmarks["1"]
+    np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
+
+
+def test_json_says_the_same(fgloc, on_disk, tmp_path):
+    result = fgloc("map", on_disk(), "-e", "smoother", "-o", tmp_path / "a.world.toml", "--json")
+    content = json.loads(result.stdout)
+    assert [entry["verdict"] for entry in content["landmarks"]] == ["agrees"] * 7
+    written = tomllib.loads((tmp_path / "a.world.toml").read_text())["landmarks"]
+    assert content["landmarks"][0]["learnt"] == pytest.approx([written["1"]["x"], written["1"]["y"]])
+    assert content["frame"] == "that of the given map"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["-o", "OUT/a.toml"], "expected a name that ends in .world.toml"),
+        (["-o", "OUT/none/a.world.toml"], "there is no folder"),
+        (["-o", "OUT/a.world.toml", "-e", "particle_filter"], "expected one that estimates landmarks"),
+        (["-o", "OUT/a.world.toml", "--set", "batch.landmarks=known"], "--set is batch.landmarks"),
+        (["-o", "OUT/there.world.toml"], "exists already; choose another name or give --overwrite"),
+    ],
+)
+def test_bad_options_are_one_line(fgloc, short_log, tmp_path, options, message):
+    (tmp_path / "there.world.toml").write_text("")
+    result = fgloc("map", short_log, *(option.replace("OUT", str(tmp_path)) for option in options))
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_beacons_cannot_be_mapped(fgloc, short_log, tmp_path):
+    result = fgloc("map", short_log, "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 2
+    assert "no sighting has a bearing; from a range alone a landmark cannot be located" in result.stderr
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_there_must_be_a_map_to_extend(fgloc, on_disk, tmp_path):
+    result = fgloc("map", on_disk(world=World()), "--extend", "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 2
+    assert "has no map that could be extended" in result.stderr
