@@ -126,7 +126,7 @@ def page(calibration: Calibration) -> str:
         "<h2>Accuracy of the EKF</h2>",
         "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the filter is too sure. "
         + (
-            "The rows <i>from the other logs</i> are the honest ones: nothing in that rig has seen the log."
+            "The rows <i>from the other logs</i> are the honest ones: of that rig, only the factor on the noise has seen the log."
             if calibration.held_out
             else "With one log there is no cross-validation: try the rig on another log before you trust it."
         )

@@ -81,8 +81,8 @@ def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array],
         bounds=(low / typical, high / typical),
         loss="soft_l1",
         f_scale=LOSS_SCALE,
-        xtol=1e-5,
-        ftol=1e-7,
+        xtol=1e-4,
+        ftol=1e-6,
     )
     values = np.asarray(found.x * typical)
     residuals = whitened(values)
