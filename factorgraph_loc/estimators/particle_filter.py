@@ -222,7 +222,9 @@ class ParticleFilter(Filter):
     def _record(self) -> Record:
         estimate = self._estimate()
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -np.inf)
-        keep = self._smooth and self._t >= last + self._settings.smoothing_interval - 1e-9
+        # also where the particles jump, as there is nothing to interpolate
+        jumped = bool(self.diagnostics.events) and self.diagnostics.events[-1][0] == self._t
+        keep = self._smooth and (jumped or self._t >= last + self._settings.smoothing_interval - 1e-9)
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _increment(self, start: Record, end: Record) -> Increment:

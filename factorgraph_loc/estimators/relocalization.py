@@ -29,7 +29,8 @@ DURATION = 60.0  # s, how far back sightings count
 INTERVAL = 1.0  # s: errors of one landmark's sightings closer than that are nearly the same, so that they count as one
 ROWS = 60  # the newest sightings that count
 REFINED = 24  # candidates
-SAME = 9.0  # Mahalanobis distance squared between poses that are one hypothesis
+# Mahalanobis distances squared: of poses that are one hypothesis, and of one from where its sightings together lead
+SAME, DIVERGED = 9.0, 25.0
 NEGLIGIBLE = 1e-3  # weight of a hypothesis
 MARGIN = 5.0  # m, how far beyond the landmarks of the map the robot may be
 WIDE = 3.0  # m, standard deviation of a hypothesis that is no Gaussian
@@ -95,8 +96,7 @@ class Relocalizer:
             rows[:] = [r for r in rows if r.odometry.t != odometry.t]
             rows.append(Sighting(odometry, point, float(distance), float(bearing)))
             rows.sort(key=lambda r: r.odometry.t)
-            if len(rows) > 2 and rows[-2].odometry.t < rows[-3].odometry.t + INTERVAL:
-                del rows[-2]
+            rows[:] = _thinned(rows)
         self.forget(odometry.t - DURATION)
 
     def forget(self, before: float) -> None:
@@ -192,12 +192,21 @@ class Relocalizer:
             return None
         pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
         covariance = se2.body_to_world(pose, covariance)
-        if _distance(pose, best.pose, best.covariance) > SAME:
+        if _distance(pose, best.pose, best.covariance + covariance) > DIVERGED:
             return None
         position = max(CLEAR_POSITION, self._model.range_sigma)
         if np.linalg.eigvalsh(covariance[:2, :2])[-1] > position**2 or covariance[2, 2] > CLEAR_HEADING**2:
             return None
         return PosePrior(window.now.t, pose, covariance)
+
+
+def _thinned(rows: list[Sighting]) -> list[Sighting]:
+    """Of the sightings of one landmark those that lie an interval apart, and the last."""
+    kept = rows[:1]
+    for row in rows[1:]:
+        if row.odometry.t >= kept[-1].odometry.t + INTERVAL:
+            kept.append(row)
+    return kept if kept[-1] is rows[-1] else [*kept, rows[-1]]
 
 
 def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:

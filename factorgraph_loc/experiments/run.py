@@ -7,7 +7,7 @@ import math
 import platform
 import resource
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from time import perf_counter
@@ -24,6 +24,7 @@ from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log
 from factorgraph_loc.measurements import IncrementOdometry, Measurement, Tick, VelocityOdometry, YawRate
+from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 TICK_RATE = 10  # Hz, the grid on which trajectories are written and scored
@@ -51,7 +52,9 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
 
     The grid of ticks has 10 Hz and starts at the prior's time. A tick comes after all measurements that arrived up to its time;
     the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
-    its velocity holds on; other measurements older than the prior are counted as ignored. ``progress`` is given the share done.
+    its velocity holds on; other measurements older than the prior are counted as ignored. With an unknown start the grid begins at
+    the first measurement, and the final trajectory, empty if nothing told the pose, where the estimator began to believe
+    something. ``progress`` is given the share done.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
     Whatever the estimator itself raises is passed on.
@@ -97,7 +100,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
         learnt=estimator.learnt(),
         timings=loop.timings(final_seconds),
         versions=versions,
-        warnings=(*log.warnings, *_doubts(log, sensors)),
+        warnings=(*log.warnings, *_doubts(log, sensors), *_never_localized(log, loop.estimates, final)),
     )
 
 
@@ -228,6 +231,14 @@ def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     if "odometry" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
+
+
+def _never_localized(log: Log, estimates: Sequence[PoseEstimate], final: Trajectory) -> tuple[str, ...]:
+    found = {e.status for e in estimates}
+    if "localized" in found or ("ambiguous" not in found and len(final)):  # or it says nothing before the end
+        return ()
+    why = "its landmarks leave several places possible" if "ambiguous" in found else "no landmark of the map was seen"
+    return (f"{log.name}: never localized: {why}",)
 
 
 def _versions() -> dict[str, str]:
