@@ -88,7 +88,7 @@ def _scorable(log: Log) -> Log:
     """The log with a reference dense enough for scoring, where it can be interpolated."""
     reference = log.reference
     assert reference is not None
-    if np.median(np.diff(reference.t)) <= MAX_REFERENCE_GAP:
+    if np.median(np.diff(reference.t)) <= MAX_REFERENCE_GAP + 1e-6:
         return log
     t = np.arange(reference.t[0], reference.t[-1], 0.99 * MAX_REFERENCE_GAP)
     poses = reference.at(t, max_gap=REFERENCE_GAP)

@@ -173,7 +173,10 @@ def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -
     model = odometry.with_constants(model, pooled.as_dict() if pooled else {})
     apart = _apart("odometry", constants, start, kept)
     parts = windows if len(windows) > 1 else windows[0].halves()
-    alone = [odometry.fit_odometry([one], model, apart, sigmas, start) for one in parts]
+    alone = [
+        {n: v for some in apart for n, v in odometry.fit_odometry([one], model, some, sigmas, start).as_dict().items()}
+        for one in parts
+    ]
     learnt = _describe("odometry", everything, pooled, alone, gain, len(logs), denied)
     return learnt, fit_noise(logs, model)
 
@@ -195,7 +198,10 @@ def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], Be
     settings = settings.model_copy(update=pooled.as_dict() if pooled else {})
     apart = _apart("bearing_range", constants, start, kept)
     parts = seen if len(seen) > 1 else seen[0].halves()
-    alone = [sightings.fit_sensor([one], settings, apart, start) for one in parts]
+    alone = [
+        {n: v for some in apart for n, v in sightings.fit_sensor([one], settings, some, start).as_dict().items()}
+        for one in parts
+    ]
     learnt = _describe("bearing_range", everything, pooled, alone, gain, len(seen))
     return learnt, sightings.with_scatter(seen, settings)
 
@@ -214,17 +220,21 @@ def _fit_and_scatter(seen: Sequence[Sightings], before: BearingRangeSettings) ->
 
 def _apart(
     sensor: str, constants: Sequence[Constant], found: Mapping[str, float], kept: Sequence[Constant]
-) -> list[Constant]:
-    """What is fitted to each log alone: what is kept, and what an estimator could learn on each run."""
-    learnable = [c for c in constants if c.name in UNCERTAIN[sensor] and c.is_inside(found[c.name])]
-    return [c for c in constants if c in kept or c in learnable]
+) -> list[list[Constant]]:
+    """What is fitted to each log alone: what is kept with what an estimator could learn on each run, then what is kept.
+
+    The values of the latter come from the second fit: what is not kept may do the same as what is.
+    """
+    kept = list(kept)
+    learnable = [c for c in constants if c.name in UNCERTAIN[sensor] and c.is_inside(found[c.name]) and c not in kept]
+    return [some for some in ([*kept, *learnable] if learnable else [], kept) if some]
 
 
 def _describe(
     sensor: str,
     everything: Fit,
     pooled: Fit | None,
-    alone: Sequence[Fit],
+    alone: Sequence[Mapping[str, float]],
     gain: Array,
     logs: int,
     denied: Collection[str] = (),
@@ -237,7 +247,7 @@ def _describe(
         errors |= pooled.errors_as_dict()
     out = []
     for c, gained in zip(everything.constants, gain, strict=True):
-        parts = np.array([fit.as_dict()[c.name] for fit in alone if c.name in fit.as_dict()])
+        parts = np.array([found[c.name] for found in alone if c.name in found])
         value = values[c.name] if c.name in kept else c.neutral
         spread = 0.0
         if len(parts) > 1:  # about the mean that was fitted to them, or about a value that was not
