@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.calibration.consistency import Consistency, Evaluate, inflated, make_consistent
-from factorgraph_loc.calibration.learn import Knowledge, check, learn
+from factorgraph_loc.calibration.learn import Knowledge, has_heading, learn
 from factorgraph_loc.calibration.windows import REFERENCE_GAP
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
-from factorgraph_loc.log import Log
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
 
@@ -78,6 +79,35 @@ def calibrate(
         held_out=tuple(held_out),
         doubts=_doubts(knowledge, consistency),
     )
+
+
+def check(logs: Sequence[Log]) -> None:
+    """InputError if these logs cannot be calibrated together."""
+    if not logs:
+        raise InputError("there is no log to calibrate from")
+    for log in logs:
+        if log.reference is None or len(log.reference) < 2:
+            raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
+        for sensor in ("odometry", "bearing_range"):
+            if sensor not in log.streams or not len(log.streams[sensor].t):
+                raise InputError(f"{log.name}: has no {sensor}, expected one in every log to calibrate from")
+        if not isinstance(log.streams["bearing_range"], BearingRangeStream):
+            raise InputError(f"{log.name}: its bearing_range holds no sightings of landmarks")
+    first = logs[0]
+    for log in logs[1:]:
+        if type(log.streams["odometry"]) is not type(first.streams["odometry"]):
+            kinds = {VelocityStream: "velocities", IncrementStream: "increments"}
+            ours, theirs = (kinds.get(type(one.streams["odometry"]), "another kind") for one in (log, first))
+            raise InputError(
+                f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
+            )
+        if has_heading(log) != has_heading(first):
+            raise InputError(
+                f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart"
+            )
+    names = [log.name for log in logs]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{twice}: is given twice, or two logs have this name")
 
 
 def _scores(logs: Sequence[Log], rig: Rig, evaluate: Evaluate) -> tuple[Scores, ...]:

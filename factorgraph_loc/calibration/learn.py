@@ -13,7 +13,7 @@ from factorgraph_loc.calibration.robust import Constant, Fit, folds, gains, is_w
 from factorgraph_loc.calibration.sightings import Correlation, Sightings
 from factorgraph_loc.calibration.windows import Windows, cut
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream
+from factorgraph_loc.log import Log
 from factorgraph_loc.rig import BearingRangeSettings, GrowthSettings, OdometryNoise, Rig
 from factors.se2 import Array
 
@@ -75,47 +75,17 @@ class Knowledge:
     notes: tuple[str, ...]
 
 
-def check(logs: Sequence[Log]) -> None:
-    """InputError if these logs cannot be calibrated together."""
-    if not logs:
-        raise InputError("there is no log to calibrate from")
-    for log in logs:
-        if log.reference is None or len(log.reference) < 2:
-            raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
-        for sensor in ("odometry", "bearing_range"):
-            if sensor not in log.streams or not len(log.streams[sensor].t):
-                raise InputError(f"{log.name}: has no {sensor}, expected one in every log to calibrate from")
-        if not isinstance(log.streams["bearing_range"], BearingRangeStream):
-            raise InputError(f"{log.name}: its bearing_range holds no sightings of landmarks")
-    first = logs[0]
-    for log in logs[1:]:
-        if type(log.streams["odometry"]) is not type(first.streams["odometry"]):
-            kinds = {VelocityStream: "velocities", IncrementStream: "increments"}
-            ours, theirs = (kinds.get(type(one.streams["odometry"]), "another kind") for one in (log, first))
-            raise InputError(
-                f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
-            )
-        if _has_heading(log) != _has_heading(first):
-            raise InputError(
-                f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart"
-            )
-    names = [log.name for log in logs]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"{twice}: is given twice, or two logs have this name")
-
-
 def learn(logs: Sequence[Log], rig: Rig) -> Knowledge:
     """The rig that ``logs`` tell, starting from ``rig``, whose values stay where a log cannot tell them better.
 
     Raises InputError if a log is too short.
     """
     logs = [replace(log, rig=rig) for log in logs]
-    has_heading = _has_heading(logs[0])
     notes = []
     learnt: list[Learnt] = []
     noise: NoiseFit | None = None
     windows: tuple[Windows, ...] = ()
-    if has_heading:
+    if has_heading(logs[0]):
         windows = tuple(cut(log, odometry.WINDOW) for log in logs)
         for one in windows:
             if len(one.begin) < MIN_WINDOWS:
@@ -309,5 +279,6 @@ def _uncertainties(rig: Rig, learnt: Sequence[Learnt]) -> Rig:
     return rig.model_copy(update=sections)
 
 
-def _has_heading(log: Log) -> bool:
+def has_heading(log: Log) -> bool:
+    """Whether the log's reference has headings that mean something."""
     return log.reference is not None and log.reference.has_heading

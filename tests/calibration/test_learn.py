@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.learn import check, learn
+from factorgraph_loc.calibration.calibrate import check
+from factorgraph_loc.calibration.learn import learn
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import IncrementStream
 from factors import se2
