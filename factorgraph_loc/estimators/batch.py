@@ -14,9 +14,10 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.estimators.base import PoseEstimate
-from factorgraph_loc.estimators.keyframes import Addition, GraphEstimator, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.keyframes import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.variables import Values
+from factorgraph_loc.estimators.relocating import RelocatingGraph
+from factorgraph_loc.estimators.variables import Values, pose_key
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -29,7 +30,7 @@ class BatchSettings(GraphSettings):
     widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
 
 
-class Batch(GraphEstimator):
+class Batch(RelocatingGraph):
     """The batch estimator; see the module."""
 
     def __init__(self, setup: Setup, settings: BatchSettings) -> None:
@@ -58,6 +59,14 @@ class Batch(GraphEstimator):
 
     def _begin(self, first: Keyframe) -> None:
         self._guesses[first.key] = self._pose
+
+    def _begin_again(self, newest: Keyframe) -> None:
+        kept = {k.key for k in self._keyframes}
+        self._guesses = {key: value for key, value in self._guesses.items() if key in kept}
+        self._guesses[newest.key] = self._pose
+
+    def _pose_of(self, keyframe: int) -> Array:
+        return self._guesses[pose_key(keyframe)]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         self._pose, self._covariance = addition.values[keyframe.key], spread

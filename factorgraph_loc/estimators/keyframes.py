@@ -198,6 +198,10 @@ class GraphEstimator(ABC):
         ``guess``: pose and covariance of the newest keyframe after the update, where it is that.
         """
 
+    @abstractmethod
+    def _observed(self, t: float, seen: BearingRangeFactor, guess: Guess) -> None:
+        """Landmarks of the map were seen at ``t`` from a keyframe whose pose is expected to be ``guess``."""
+
     def _is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
         return 0 <= keyframe < len(self._keyframes)
@@ -272,6 +276,8 @@ class GraphEstimator(ABC):
             here = factor.fixed(constants, self._constants[key])
             seen.append(replace(here, point_covariances=self._spreads[key][None]))
         if guess is not None:
+            if known is not None:
+                self._observed(m.t, known.fixed(constants, None), guess)
             if seen:
                 factor = together(seen)
                 update = robust_update(factor, *guess, ITERATIONS_OF_GUESS)

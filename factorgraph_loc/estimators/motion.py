@@ -12,6 +12,7 @@ from factors.odometry import ChainState, Increment
 from factors.odometry_chain import OdometryChain
 from factors.se2 import Array
 
+HORIZON = 5.0  # s of odometry that are kept
 TWIST_TIME = 0.1  # s over which the velocity is taken
 
 
@@ -25,14 +26,24 @@ class Motion:
         self._rig = rig
         self._use_gyro = "imu" in sensors and rig.imu is not None
         self._use_wheels = "odometry" in sensors
-        self._chain = OdometryChain(rig.odometry_model(use_gyro=self._use_gyro), use_gyro=self._use_gyro)
+        self._horizon = HORIZON
+        self._chain = self._new_chain()
         self._diagnostics = diagnostics
+
+    def keep(self, horizon: float) -> None:
+        """Keep the odometry of the last ``horizon`` seconds; to be said before any row comes."""
+        self._horizon = horizon
+        self._chain = self._new_chain()
+
+    def _new_chain(self) -> OdometryChain:
+        model = self._rig.odometry_model(use_gyro=self._use_gyro)
+        return OdometryChain(model, use_gyro=self._use_gyro, horizon=self._horizon)
 
     def add(self, m: Odometry) -> None:
         """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
         if isinstance(m, IncrementOdometry) and self._use_gyro:
             self._use_gyro = False
-            self._chain = OdometryChain(self._rig.odometry_model())
+            self._chain = self._new_chain()
         if isinstance(m, YawRate) and not self._use_gyro:
             self._diagnostics.ignore("yaw rate")
         elif not isinstance(m, YawRate) and not self._use_wheels:

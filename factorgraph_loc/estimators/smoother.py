@@ -15,14 +15,18 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.keyframes import Addition, GraphEstimator, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.keyframes import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
+
+# m, rad: a change below that is not carried on to older poses; they all hang on the constants, and would all be computed anew
+WILDFIRE = 0.01
 
 
 class SmootherSettings(GraphSettings):
@@ -36,7 +40,7 @@ class SmootherSettings(GraphSettings):
     smooth: bool = True
 
 
-class Smoother(GraphEstimator):
+class Smoother(RelocatingGraph):
     """The iSAM2 smoother; see the module."""
 
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
@@ -67,6 +71,14 @@ class Smoother(GraphEstimator):
     def _begin(self, first: Keyframe) -> None:
         self._filtered.append((self._pose, self._covariance))
         self._start_again(first)
+
+    def _begin_again(self, newest: Keyframe) -> None:
+        del self._filtered[newest.index :]
+        self._filtered.append((self._pose, self._covariance))
+        self._start_again(newest)
+
+    def _pose_of(self, keyframe: int) -> Array:
+        return self._filtered[keyframe][0]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         self._filtered.append((addition.values[keyframe.key], spread))
@@ -176,6 +188,7 @@ class Smoother(GraphEstimator):
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky loses long stretches of dead reckoning as indeterminate
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
         parameters.relinearizeSkip = self._settings.relinearize_skip
         if self._settings.lag is None:
             return FullHistory(parameters)

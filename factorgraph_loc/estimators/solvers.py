@@ -13,7 +13,7 @@ from typing import Any, Protocol, cast
 import gtsam
 import numpy as np
 
-from factorgraph_loc.estimators.variables import Node, Values, is_pose, read, to_gtsam
+from factorgraph_loc.estimators.variables import Node, Values, gather, is_pose, read, to_gtsam
 from factors import se2
 from factors.graph import custom_factor, jacobian_factor, read_pose, read_vector
 from factors.se2 import Array
@@ -84,8 +84,12 @@ class FullHistory:
     def _relinearize(self, linears: Iterable[_Linear], moved: Array) -> bool:
         """Replace the factors whose poses are farther than ``moved`` from where they were linearised; whether there were any."""
         graph, slots, changed = gtsam.NonlinearFactorGraph(), [], []
+        estimates: Values = {}
         for linear in linears:
-            point = self._point(linear.node.keys, {})
+            for key in linear.node.keys:
+                if key not in estimates:
+                    estimates[key] = read(self._isam, key)
+            point = gather(estimates, linear.node.keys)
             if linear.is_off(point, moved):
                 linear.point = point
                 slots.append(linear.slot)

@@ -38,15 +38,20 @@ class TrackMonitor:
         self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
         last = self._last()
         share = sum(s[1] for s in last) / max(1, sum(s[2] for s in last))
-        if self._since is None and share > SHARE:
-            self._since = last[0][0]
-        elif share < SHARE / 2.0:
+        if share > SHARE or (self._since is not None and share >= SHARE / 2.0):
+            self._since = self._beginning()
+        else:
             self._since = None
 
     def clear(self) -> None:
         """Forget the stamps: the track begins anew."""
         self._stamps.clear()
         self._since = None
+
+    def _beginning(self) -> float:
+        """The change point: as many landmarks as can be beyond from there on, and within before."""
+        excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
+        return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 
     def _last(self) -> list[tuple[float, int, int]]:
         """The fewest last stamps that are enough to judge by, none if there are too few."""

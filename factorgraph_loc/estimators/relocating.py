@@ -1,0 +1,172 @@
+"""Graphs that find their place: an unknown start, a wrong one, and a robot that was carried elsewhere.
+
+Before the start the last sightings are kept until they tell one place; then they are taken in from their first on. On the
+way, landmarks that are persistently not where they are expected make a suspicion, and a place that explains them much better
+a certainty: the graph goes back to where the suspicion began, and goes on at the new place after a step of unknown length.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from abc import abstractmethod
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status
+from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.landmarks import KnownLandmarks
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
+from factorgraph_loc.estimators.track_monitor import TrackMonitor
+from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factors import se2
+from factors.bearing_range import BearingRangeFactor
+from factors.odometry import ChainState, Increment
+from factors.se2 import Array
+
+# m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
+UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
+SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
+
+
+class RelocatingGraph(GraphEstimator):
+    """A graph estimator that finds its place; see the module."""
+
+    supports_unknown_start = True
+
+    def __init__(self, setup: Setup, settings: GraphSettings) -> None:
+        super().__init__(setup, settings)
+        self._motion.keep(2.0 * DURATION)
+        # where landmarks are estimated too, they cannot tell the place
+        self._relocates = settings.landmarks == "known"
+        self._relocalizer = Relocalizer(self._motion, setup.world.positions())
+        self._monitor = TrackMonitor()
+        # what is seen before the start is counted when it is taken in
+        self._sought = KnownLandmarks(setup, Diagnostics())
+        self._searched: ChainState | None = None
+        self._recent: deque[BearingRange | Tick] = deque()
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if not isinstance(measurement, BearingRange | Tick):
+            super().process(measurement)
+        elif self._prior is None:
+            self._search(measurement)
+        else:
+            self._remember(measurement)
+            super().process(measurement)
+            if isinstance(measurement, BearingRange) and self._monitor.suspicious_since is not None:
+                self._doubt(self._monitor.suspicious_since)
+
+    def estimate(self) -> PoseEstimate:
+        """The newest keyframe, moved along the odometry since; before the start the likeliest place, if there is any.
+
+        ``ambiguous`` before one place is clear, and while the landmarks are not where they are expected.
+        """
+        if self._prior is not None:
+            status: Status = "localized" if self._monitor.suspicious_since is None else "ambiguous"
+            return replace(super().estimate(), status=status)
+        modes = self._modes()
+        if not modes:
+            return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        return PoseEstimate(self._t, modes[0].pose, modes[0].covariance, "ambiguous")
+
+    def belief(self) -> Belief:
+        """The belief behind :meth:`estimate`; before the start all places that the sightings allow."""
+        return super().belief() if self._prior is not None else Belief(tuple(self._modes()))
+
+    def _modes(self) -> list[Mode]:
+        if self._searched is None:
+            return []
+        since = self._motion.relative(self._searched, self._motion.state(self._t))
+        return [
+            Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
+            for h in self._relocalizer.hypotheses
+        ]
+
+    def _remember(self, m: BearingRange | Tick) -> None:
+        self._recent.append(m)
+        while self._recent[0].t < m.t - DURATION:
+            self._recent.popleft()
+
+    def _search(self, m: BearingRange | Tick) -> None:
+        """Before the start: see whether the sightings tell one place by now, and start there."""
+        self._t = max(self._t, m.t)
+        seen = self._sought.factor(m) if isinstance(m, BearingRange) else None
+        if seen is None and self._searched is None:
+            return  # the run begins with the first landmark
+        self._remember(m)
+        if seen is None or not self._relocates:
+            return
+        self._searched = self._motion.state(m.t)
+        self._relocalizer.add(self._searched, seen)
+        self._relocalizer.search()
+        if self._relocalizer.best is None:
+            return
+        replay = sorted(self._recent, key=lambda m: m.t)
+        self.diagnostics.events.append((m.t, "localized"))
+        t = replay[0].t
+        self.initialize(PosePrior(t, self._placed(t), UNKNOWN))
+        self._replay(replay)
+
+    def _doubt(self, since: float) -> None:
+        """See whether another place explains what is seen since then, and go on there."""
+        newest = self._keyframes[-1]
+        if self._searched is not None and newest.t < self._searched.t + SEARCH_INTERVAL:
+            return
+        self._searched = newest.odometry
+        self._relocalizer.forget(since)
+        self._relocalizer.search()
+        if self._relocates and self._relocalizer.refutes(self._pose, self._covariance):
+            what = f"lost: landmarks were not where they were expected since {since:.1f} s; goes on at another place"
+            self.diagnostics.events.append((newest.t, what))
+            self._go_on(since)
+
+    def _go_on(self, since: float) -> None:
+        """Take back what was added since then, and add it once more at the place that was found."""
+        index = max(1, bisect.bisect_left(self._keyframe_times, since))
+        while not self._is_open(index - 1):
+            index += 1
+        t = max(since, self._keyframes[index - 1].t)
+        replay = sorted((m for m in self._recent if m.t >= t), key=lambda m: m.t)
+        t = replay[0].t
+        del self._keyframes[index:], self._keyframe_times[index:]
+        self._ticks = [tick for tick in self._ticks if tick.keyframe < index and tick.t < t]
+        pose = self._placed(t)
+        jump = Increment(se2.between(self._pose_of(index - 1), pose), UNKNOWN, t - self._keyframes[-1].t)
+        keyframe = Keyframe(index, t, self._motion.state(t), jump)
+        self._keyframes.append(keyframe)
+        self._keyframe_times.append(t)
+        self._pose, self._covariance = pose, UNKNOWN
+        self._begin_again(keyframe)
+        self._replay(replay)
+
+    def _placed(self, t: float) -> Array:
+        """Where the robot was at ``t``, from the place that was found and the odometry since."""
+        best = self._relocalizer.best
+        assert best is not None
+        moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
+        return se2.compose(best.pose, se2.inverse(self._recalibrated(moved).delta))
+
+    def _replay(self, measurements: list[BearingRange | Tick]) -> None:
+        self._monitor.clear()
+        for m in measurements:
+            if isinstance(m, Tick):
+                self._pass_time(m.t)
+            else:
+                self._see(m)
+
+    def _observed(self, t: float, seen: BearingRangeFactor, guess: Guess) -> None:
+        self._relocalizer.add(self._motion.state(t), seen)
+        self._monitor.add(t, seen, *guess)
+
+    @abstractmethod
+    def _pose_of(self, keyframe: int) -> Array:
+        """The causal estimate (3,) of a keyframe."""
+
+    @abstractmethod
+    def _begin_again(self, newest: Keyframe) -> None:
+        """Solve the graph anew: keyframes were taken back, and ``newest`` was added."""

@@ -1,0 +1,113 @@
+"""Trials of an unknown start and of kidnapping, made from a recorded log: it is cut, or cut and joined."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import BearingRangeStream, Log, cut, join
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+POSITION, HEADING = 0.5, math.radians(15.0)  # m, rad: an estimate nearer than both is right
+HOLD = 10.0  # s that it must stay right
+LANDMARKS = 3  # different ones that are enough to be localized by
+START_TIME, RECOVERY_TIME = 60.0, 30.0  # s
+BEFORE = 30.0  # s that a robot drives before it is carried off
+JUMP = 0.2  # s between the two parts of a kidnapping
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial. ``right``: localized (or recovered) rightly in time; ``false``: the first claim to be localized was wrong;
+    ``seconds``: until it was right, NaN if it never was."""
+
+    t: float
+    right: bool
+    false: bool
+    seconds: float
+
+
+def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
+    """Unknown starts at ``count`` times spread evenly over a log with reference.
+
+    A start is right if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks where
+    that takes longer, and then stays within 0.5 m and 15 degrees for 10 s.
+    """
+    first, last = log.span()
+    trials = []
+    for i, t in enumerate(first + (last - first) * np.arange(count) / count):
+        deadline = max(START_TIME, _third_landmark(log, float(t)) - float(t))
+        part = cut(log, float(t), float(t) + deadline + 2.0 * HOLD)
+        result = run(part, RunConfig(estimator, settings or {}, prior="unknown", seed=i))
+        claimed = np.array(result.status) == "localized"
+        good = _right(result, part)
+        first_claim = int(np.argmax(claimed)) if claimed.any() else len(claimed)
+        seconds = float(result.t[first_claim] - t) if claimed.any() else math.nan
+        right = bool(claimed.any()) and seconds <= deadline and bool(_holds(result.t, good, first_claim))
+        wrong = bool(claimed.any()) and not bool(good[first_claim])
+        trials.append(Trial(float(t), right, wrong, seconds))
+    return trials
+
+
+def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
+    """A robot that is carried, ``count`` times, from one time of the log to one half the log later (or earlier).
+
+    It is recovered if it is right within 30 s of having seen 3 different landmarks at the new place, for 10 s.
+    """
+    first, last = log.span()
+    trials = []
+    for i in range(count):
+        t = first + BEFORE + (last - first - BEFORE) * i / count
+        other = first + (t - first + 0.5 * (last - first)) % (last - first)
+        deadline = _third_landmark(log, other) - other + RECOVERY_TIME
+        before, after = cut(log, t - BEFORE, t), cut(log, other, other + deadline + 2.0 * HOLD)
+        carried = join(before, after, gap=JUMP)
+        result = run(carried, RunConfig(estimator, settings or {}, prior="reference", seed=i))
+        moved = before.span()[1] + JUMP
+        good = _right(result, carried)
+        later = np.flatnonzero(result.t >= moved)
+        held = [int(k) for k in later if result.t[k] <= moved + deadline and _holds(result.t, good, int(k))]
+        seconds = float(result.t[held[0]] - moved) if held else math.nan
+        claimed = np.array(result.status) == "localized"
+        # a claim after the deadline, at the wrong place
+        false = bool(np.any(claimed[later] & ~good[later] & (result.t[later] > moved + deadline)))
+        trials.append(Trial(float(t), bool(held), false, seconds))
+    return trials
+
+
+def _third_landmark(log: Log, t: float) -> float:
+    """When the third different landmark of the map is seen after ``t``; the log's end if that never happens."""
+    stream = log.streams["bearing_range"]
+    assert isinstance(stream, BearingRangeStream)
+    met: set[str] = set()
+    for stamp, name in zip(stream.t.tolist(), stream.landmark, strict=True):
+        if stamp >= t and name in log.world.landmarks:
+            met.add(name)
+            if len(met) == LANDMARKS:
+                return float(stamp)
+    return log.span()[1]
+
+
+def _right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
+    """Which causal estimates are right; where the reference has a gap, as the one before, or at the beginning as the next."""
+    assert log.reference is not None
+    e = errors(Trajectory(result.t, result.poses), log.reference)
+    right = (e.position < POSITION) & ~(e.heading >= HEADING)
+    scored = np.flatnonzero(np.isfinite(e.reference[:, 0]))
+    if not len(scored):
+        return right
+    return right[scored[np.maximum(np.searchsorted(scored, np.arange(len(right)), side="right") - 1, 0)]]
+
+
+def _holds(t: Array, right: np.typing.NDArray[np.bool_], first: int) -> bool:
+    """Whether all estimates of the following 10 s are right."""
+    during = (t >= t[first]) & (t <= t[first] + HOLD)
+    return bool(right[during].all())
