@@ -34,6 +34,13 @@ class Landmark(FileModel):
                 raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
         return value
 
+    def spread(self) -> Array:
+        """The covariance (2, 2) of the position [m^2]."""
+        if self.covariance is None:
+            return self.sigma**2 * np.eye(2)
+        xx, xy, yy = self.covariance
+        return np.array(((xx, xy), (xy, yy)))
+
 
 class World(FileModel):
     """A map. ``landmarks``: by name, as measurements name them."""

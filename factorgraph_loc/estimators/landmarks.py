@@ -17,6 +17,7 @@ from factors.odometry import Increment
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # of an iterated update, m and rad
+EXACT = 0.1  # a survey that is so much better than the sensor (as a share of its sigma) is taken as exact
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 
 
@@ -37,6 +38,9 @@ class KnownLandmarks:
         self._model = None if settings is None else settings.model()
         landmarks = {} if use == "unknown" else setup.world.landmarks
         self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
+        self._surveys = {name: m.spread() for name, m in landmarks.items()}
+        worst = max((float(np.trace(spread)) for spread in self._surveys.values()), default=0.0)
+        self._survey_matters = settings is not None and worst > (EXACT * settings.range_sigma) ** 2
         self._maps_others = use != "known"
         self._estimated = estimated
         self._diagnostics = diagnostics
@@ -60,7 +64,11 @@ class KnownLandmarks:
         if not rows:
             return None
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
-        return self._factor(self._model, m, rows, points, offset, twist)
+        factor = self._factor(self._model, m, rows, points, offset, twist)
+        if self._survey_matters:
+            spreads = np.array([self._surveys[m.landmarks[i]] for i in rows])
+            factor = replace(factor, point_covariances=spreads)
+        return factor
 
     def others(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
