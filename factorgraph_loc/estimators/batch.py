@@ -18,7 +18,6 @@ from factorgraph_loc.estimators.keyframes import Addition, GraphSettings, Guess,
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.variables import Values, pose_key
-from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
@@ -42,7 +41,7 @@ class Batch(RelocatingGraph):
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
         return replace(super().estimate(), status="unlocalized")
 
-    def trajectory(self) -> Trajectory:
+    def _final(self) -> tuple[Array, Array]:
         """The optimum over the whole log."""
         problem = self._problem()
         start = self._constant_priors()[0] | self._guesses
@@ -55,7 +54,7 @@ class Batch(RelocatingGraph):
             # either way may end in the worse optimum
             best = min(best, problem.solve(values), key=lambda s: s.cost)
         covariances = self._settle(problem, best.values)
-        return self._between(np.array([best.values[k.key] for k in self._keyframes]), covariances)
+        return np.array([best.values[k.key] for k in self._keyframes]), covariances
 
     def _begin(self, first: Keyframe) -> None:
         self._guesses[first.key] = self._pose

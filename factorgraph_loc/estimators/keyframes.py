@@ -175,9 +175,15 @@ class GraphEstimator(ABC):
         }
         return Learnt(values, points)
 
-    @abstractmethod
     def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past at the stamps of the ticks."""
+        """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
+        if self._prior is None:
+            return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+        return self._between(*self._final())
+
+    @abstractmethod
+    def _final(self) -> tuple[Array, Array]:
+        """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3)."""
 
     @abstractmethod
     def _begin(self, first: Keyframe) -> None:

@@ -20,7 +20,6 @@ from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values
-from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
@@ -52,7 +51,7 @@ class Smoother(RelocatingGraph):
         self._filtered: list[tuple[Array, Array]] = []
         self._left: list[tuple[Array, Array]] = []
 
-    def trajectory(self) -> Trajectory:
+    def _final(self) -> tuple[Array, Array]:
         """Full history: the solution of the whole graph. With a window: each pose as it left the window."""
         if not self._settings.smooth:
             estimates = self._filtered
@@ -61,12 +60,12 @@ class Smoother(RelocatingGraph):
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
             values |= {key: self._solver.value(key) for key in self._constants}
             covariances = self._settle(self._problem(), values)
-            return self._between(np.array([values[k.key] for k in self._keyframes]), covariances)
+            return np.array([values[k.key] for k in self._keyframes]), covariances
         else:
             for key in self._constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
             estimates = self._left + [self._marginal(k.key) for k in self._keyframes[len(self._left) :]]
-        return self._between(np.array([p for p, _ in estimates]), np.array([c for _, c in estimates]))
+        return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
 
     def _begin(self, first: Keyframe) -> None:
         self._filtered.append((self._pose, self._covariance))
