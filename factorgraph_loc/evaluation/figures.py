@@ -30,8 +30,8 @@ _WIDTH, _DPI = 16.0, 100
 class Track:
     """What is plotted of one run.
 
-    ``causal`` (None if it never was localized), ``final``; ``update_ms`` (M,) of each update; ``nis``: by sensor, rows (K, 3) of
-    time, normalised innovation squared and degrees of freedom; ``events``: time and text.
+    ``causal`` (None if it never was localized), ``final`` (empty if nothing told the pose); ``update_ms`` (M,) of each update;
+    ``nis``: by sensor, rows (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text.
     """
 
     causal: Trajectory | None
@@ -47,7 +47,8 @@ class Track:
         return cls(result.causal(), result.final, result.timings.update_ms, nis, tuple(result.diagnostics.events))
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
-        return ("causal", self.causal), ("final", self.final)
+        """Both trajectories by name, None where there is nothing to plot."""
+        return ("causal", self.causal), ("final", self.final if len(self.final) else None)
 
 
 def empty(height: float, title: str) -> Figure:

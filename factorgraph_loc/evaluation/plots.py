@@ -48,7 +48,7 @@ def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) ->
     """Write the plots of one run into ``folder`` and return their paths.
 
     ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or where the estimator tells innovations;
-    with a reference ``NAME-errors-ESTIMATOR.png``.
+    with a reference ``NAME-errors-ESTIMATOR.png``. Where nothing told the pose only the first.
     """
     figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
     return _write(figures, folder, name)
@@ -62,6 +62,8 @@ def remove_plots(folder: Path) -> None:
 
 
 def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
+    if not len(track.final):
+        return {}
     figures = {}
     if log.reference is not None:
         figures[f"errors-{estimator}"] = error_bands(log, log.reference, estimator, track)

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from factorgraph_loc.cli.main import app
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
+from factorgraph_loc.readers import write_native
+from factorgraph_loc.rig import BearingRangeSettings, Rig
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import Landmark, World
 
@@ -58,6 +61,32 @@ def test_without_reference(track, tmp_path):
     told = replace(track, nis={"bearing_range": np.array([(1.0, 2.0, 2.0)])})
     paths = plot_run(log, "ekf", told, tmp_path, "log")
     assert {path.name for path in paths} == {"log-trajectories.png", "log-consistency-ekf.png"}
+
+
+def test_a_run_that_nothing_told_the_pose(track, tmp_path):
+    """Its log is plotted, with an empty line; one that found its place stands beside it."""
+    nowhere = Track(None, Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))), track.update_ms)
+    paths = plot_run(log_of(track), "ekf", nowhere, tmp_path, "log")
+    assert [path.name for path in paths] == ["log-trajectories.png"]
+    paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path, "log")
+    assert {path.name for path in paths if "ekf" in path.name or "errors" in path.name} == {"log-errors-batch.png"}
+
+
+@pytest.mark.parametrize("estimator", ["particle_filter", "smoother", "batch"])
+@pytest.mark.parametrize("reference", [True, False])
+def test_a_log_that_never_tells_the_pose_is_run_and_plotted(track, estimator, reference, tmp_path):
+    t = track.final.t
+    streams = {
+        "odometry": VelocityStream(t, np.ones(30), np.zeros(30)),
+        "bearing_range": BearingRangeStream(t[::5], ["ghost"] * 6, np.ones(6), np.zeros(6)),
+    }
+    rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.1))
+    write_native(replace(log_of(track, reference=reference), rig=rig, streams=streams), tmp_path / "log")
+    arguments = ["run", tmp_path / "log", "-e", estimator, "-o", tmp_path / "out", "--prior", "unknown"]
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    assert "warning: log: never localized: no landmark of the map was seen" in result.stderr
+    assert [path.name for path in (tmp_path / "out/plots").iterdir()] == ["log-trajectories.png"]
 
 
 def test_events_are_marked_in_all_panels_and_named_once(track):

@@ -23,7 +23,11 @@ def test_a_job_that_fails_or_dies_takes_nothing_with_it():
 
 def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     nowhere = replace(log, name="no/where", reference=None)
-    configs = [RunConfig(name, seed=seed) for name in ("dead_reckoning", "particle_filter") for seed in (3, 4)]
+    configs = [
+        RunConfig(name, seed=seed, prior="reference")
+        for name in ("dead_reckoning", "particle_filter")
+        for seed in (3, 4)
+    ]
     out = tmp_path / "out"
     done = []
     comparison = compare([log, nowhere], configs, out, progress=lambda *counts: done.append(counts))
@@ -35,7 +39,9 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     ]
     assert len({tuple(row) for row in comparison.rows}) == 1
     assert len(comparison.failures) == 3
-    assert comparison.failures[0].startswith("no/where, dead_reckoning, seed 3: dead_reckoning cannot start")
+    assert comparison.failures[0].startswith(
+        "no/where, dead_reckoning, seed 3: no/where: has no reference to start from"
+    )
 
     assert {path.name for path in (out / "runs/straight/particle_filter/seed4").iterdir()} == set(FILES)
     for table in (pl.read_csv(out / "results.csv"), pl.read_parquet(out / "results.parquet")):
