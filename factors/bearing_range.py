@@ -127,14 +127,24 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 
 def recalibrated(model: BearingRangeModel, parameters: Array) -> BearingRangeModel:
     """The model with :data:`PARAMETERS` changed by (6,) values: the range scale by a share, and the time offset has no part."""
-    x, y, bearing_bias, range_scale, depth_axis, _ = parameters.tolist()
+    x, y, bearing_bias, range_scale, depth_axis = _constants(model, parameters).tolist()
     return replace(
         model,
-        mounting=(model.mounting[0] + x, model.mounting[1] + y, model.mounting[2]),
-        bearing_bias=model.bearing_bias + bearing_bias,
-        range_scale=model.range_scale * (1.0 + range_scale),
-        depth_axis=model.depth_axis + depth_axis,
+        mounting=(x, y, model.mounting[2]),
+        bearing_bias=bearing_bias,
+        range_scale=range_scale,
+        depth_axis=depth_axis,
     )
+
+
+def _constants(model: BearingRangeModel, parameters: Array) -> Array:
+    """The constants (..., 5) of a model that :data:`PARAMETERS` (..., 6) change, in their order."""
+    x, y, _ = model.mounting
+    out: Array = (
+        np.array((x, y, model.bearing_bias, model.range_scale, model.depth_axis)) + parameters[..., :TIME_OFFSET]
+    )
+    out[..., 3] = model.range_scale * (1.0 + parameters[..., 3])
+    return out
 
 
 def whitened(
@@ -193,7 +203,7 @@ def _whitened(
     by_point: Array,
     by_sensor: Array,
 ) -> None:
-    range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
+    range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)
     more = len(by_point) > 0
@@ -201,22 +211,18 @@ def _whitened(
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
         px, py = c * dx + s * dy, c * dy - s * dx  # in the robot's frame
         sx, sy = px - mounting[0], py - mounting[1]
-        distance = max(math.hypot(sx, sy), 1e-6)
+        error[k, 0], error[k, 1], distance, vx, vy, weight = _seen(
+            sx, sy, mounting[2], model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
+        )
         ux, uy = sx / distance, sy / distance
         if not math.isnan(ranges[k]):
-            weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * ranges[k])
-            vx, vy = (ahead_x, ahead_y) if depth else (ux, uy)  # the direction in which the range grows
-            along = vx * sx + vy * sy
-            error[k, 0] = (range_scale * along - ranges[k]) * weight
             weight *= range_scale
             by_pose[k, 0, 0], by_pose[k, 0, 1] = -vx * weight, -vy * weight
             by_pose[k, 0, 2] = (vx * py - vy * px) * weight
             if more:
-                by_sensor[k, 0, 3] = along * weight
+                by_sensor[k, 0, 3] = (vx * sx + vy * sy) * weight
                 by_sensor[k, 0, 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
         if not math.isnan(bearings[k]):
-            turn = math.atan2(sy, sx) - mounting[2] + bearing_bias - bearings[k]
-            error[k, 1] = (turn - 2.0 * math.pi * math.ceil((turn - math.pi) / (2.0 * math.pi))) / bearing_sigma
             weight = 1.0 / (distance * bearing_sigma)
             by_pose[k, 1, 0], by_pose[k, 1, 1] = uy * weight, -ux * weight
             by_pose[k, 1, 2] = (-uy * py - ux * px) * weight
@@ -228,6 +234,33 @@ def _whitened(
                 by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
                 by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
                 by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
+
+
+@numba.njit(cache=True)
+def _seen(
+    sx: float,
+    sy: float,
+    turn: float,
+    model: tuple[float, float, float, float, float],
+    depth: bool,
+    ahead_x: float,
+    ahead_y: float,
+    measured_range: float,
+    measured_bearing: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Whitened errors of the range and bearing of a point that lies (sx, sy) from the sensor, in the robot's axes, zero where
+    missing; its distance; the direction in which the range grows; and the weight of a range."""
+    range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
+    range_error, bearing_error, weight = 0.0, 0.0, 0.0
+    distance = max(math.hypot(sx, sy), 1e-6)
+    vx, vy = (ahead_x, ahead_y) if depth else (sx / distance, sy / distance)
+    if not math.isnan(measured_range):
+        weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * measured_range)
+        range_error = (range_scale * (vx * sx + vy * sy) - measured_range) * weight
+    if not math.isnan(measured_bearing):
+        angle = math.atan2(sy, sx) - turn + bearing_bias - measured_bearing
+        bearing_error = (angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))) / bearing_sigma
+    return range_error, bearing_error, distance, vx, vy, weight
 
 
 def robust_weight(squared: Array, scale: float) -> Array:
@@ -243,11 +276,51 @@ def robust_loss(squared: Array, scale: float) -> Array:
     return 0.5 * np.asarray(squared) / (1.0 + np.asarray(squared) / scale**2)
 
 
-def log_likelihood(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
-    """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3)."""
-    error = residuals(model, poses[:, None, :], points, ranges, bearings)
-    loss: Array = np.sum(robust_loss(np.sum(error**2, axis=-1), model.robust), axis=-1)
+def log_likelihood(
+    model: BearingRangeModel,
+    poses: Array,
+    points: Array,
+    ranges: Array,
+    bearings: Array,
+    parameters: Array | None = None,
+) -> Array:
+    """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3).
+
+    ``parameters`` (N, 6): changes of :data:`PARAMETERS`, as in :func:`recalibrated`, of each pose's own sensor.
+    """
+    changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
+    constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
+    noise = (model.range_sigma, model.range_sigma_relative, model.bearing_sigma)
+    squared = np.empty((len(poses), len(points)))
+    _squared(poses, constants, model.mounting[2], noise, model.depth, points, ranges, bearings, squared)
+    loss: Array = np.sum(robust_loss(squared, model.robust), axis=-1)
     return -loss
+
+
+@numba.njit(cache=True)
+def _squared(
+    poses: Array,
+    constants: Array,
+    turn: float,
+    noise: tuple[float, float, float],
+    depth: bool,
+    points: Array,
+    ranges: Array,
+    bearings: Array,
+    squared: Array,
+) -> None:
+    """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5)."""
+    range_sigma, range_sigma_relative, bearing_sigma = noise
+    for i in range(len(poses)):
+        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        x, y, bearing_bias, range_scale, depth_axis = constants[i]
+        ahead_x, ahead_y = math.cos(turn + depth_axis), math.sin(turn + depth_axis)
+        model = (range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma)
+        for k in range(len(points)):
+            dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
+            sx, sy = c * dx + s * dy - x, c * dy - s * dx - y
+            errors = _seen(sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k])
+            squared[i, k] = errors[0] ** 2 + errors[1] ** 2
 
 
 @dataclass(frozen=True, slots=True)

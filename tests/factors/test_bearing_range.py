@@ -229,6 +229,21 @@ def test_the_likelihood_of_particles_is_the_cost_of_the_factor():
     np.testing.assert_allclose(log_likelihood(model, particles, seen, ranges, bearings), np.negative(costs), atol=1e-12)
 
 
+@given(models, st.integers(0, 10_000))
+def test_each_particle_has_the_likelihood_of_its_own_sensor(model, seed):
+    rng = np.random.default_rng(seed)
+    seen, particles = rng.uniform(-8.0, 8.0, (3, 2)), rng.uniform(-3.0, 3.0, (4, 3))
+    ranges, bearings = rng.uniform(0.2, 9.0, 3), rng.uniform(-3.1, 3.1, 3)
+    ranges[1] = bearings[2] = np.nan
+    changes = 0.1 * rng.standard_normal((4, 6))
+    expected = []
+    for particle, change in zip(particles, changes, strict=True):
+        error = residuals(recalibrated(model, change), particle, seen, ranges, bearings)
+        expected.append(-np.sum(robust_loss(np.sum(error**2, axis=-1), model.robust)))
+    found = log_likelihood(model, particles, seen, ranges, bearings, changes)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
+
+
 def test_a_custom_factor_that_fails_is_silent_and_says_so():
     factor = BearingRangeFactor(BearingRangeModel(), np.array(((1.0, 2.0),)), np.array((2.0,)), np.array((0.1,)))
     failures: list[str] = []
