@@ -81,7 +81,7 @@ class Smoother(RelocatingGraph):
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         self._filtered.append((addition.values[keyframe.key], spread))
-        self._leave(keyframe.t)
+        self._leave(keyframe.t, [key for key in self._constants if key not in addition.values])
         self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
@@ -120,8 +120,11 @@ class Smoother(RelocatingGraph):
             raise RuntimeError("the solution is not finite")
         return value, covariance
 
-    def _leave(self, now: float) -> None:
-        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out."""
+    def _leave(self, now: float, constants: Iterable[int]) -> None:
+        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
+
+        ``constants``: those that are in the solver by now, which are brought up to date.
+        """
         if not isinstance(self._solver, Window) or self._settings.lag is None:
             return
         lag, count = self._settings.lag, len(self._left)
@@ -134,7 +137,7 @@ class Smoother(RelocatingGraph):
         try:
             covariances = self._solver.covariances([k.key for k in leaving])
             self._left += [(self._solver.value(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
-            for key in self._constants:
+            for key in constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
         except RuntimeError:
             self._left += [self._filtered[k.index] for k in leaving]
