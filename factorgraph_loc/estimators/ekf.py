@@ -8,7 +8,7 @@ measurement whose innovation is too large has its noise widened instead of being
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -42,15 +42,20 @@ class EkfSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _State:
-    """``pose`` (3,); ``rest`` (R,): constants, then ``landmarks``; ``covariance`` (3+R, 3+R) of the error state."""
+    """``pose`` (3,); ``rest`` (R,): constants, then ``landmarks``; ``covariance`` (3+R, 3+R) of the error state.
+
+    ``waiting``: landmarks that are not in the state yet.
+    """
 
     pose: Array
     rest: Array
     covariance: Array
     landmarks: tuple[str, ...] = ()
+    waiting: NewLandmarks[bool] = field(default_factory=NewLandmarks)
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        return _State(se2.compose(self.pose, se2.exp(delta[:3])), self.rest + delta[3:], covariance, self.landmarks)
+        pose = se2.compose(self.pose, se2.exp(delta[:3]))
+        return replace(self, pose=pose, rest=self.rest + delta[3:], covariance=covariance)
 
     def first(self, size: int) -> _State:
         """The first ``size`` components of the error state: without landmarks that were met later."""
@@ -93,7 +98,6 @@ class Ekf(Filter):
         self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
-        self._new_landmarks: NewLandmarks[bool] = NewLandmarks()
         # where the constants lie in the state's rest, and where the landmarks begin
         middle = len(self._odometry_constants.names)
         self._first_landmark = middle + len(self._sensor_constants.names)
@@ -210,12 +214,14 @@ class Ekf(Filter):
             jacobian[:, 3 + self._sensor_part.start : 3 + self._sensor_part.stop] = blocks[1]
         carried = jacobian @ s.covariance
         spread = carried @ jacobian.T + noise
-        if not self._new_landmarks.propose(name, point, spread, True):
+        waiting, earlier = s.waiting.propose(name, point, spread, True)
+        if earlier is None:
+            self._state = replace(s, waiting=waiting)
             return
         covariance = np.empty((size + 2, size + 2))
         covariance[:size, :size] = s.covariance
         covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = carried, carried.T, spread
-        self._state = _State(s.pose, np.concatenate((s.rest, point)), covariance, (*s.landmarks, name))
+        self._state = _State(s.pose, np.concatenate((s.rest, point)), covariance, (*s.landmarks, name), waiting)
 
     def _values(self, state: _State, landmark: slice | None) -> list[Array]:
         """The values of a factor."""

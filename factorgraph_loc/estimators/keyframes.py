@@ -302,14 +302,15 @@ class GraphEstimator(ABC):
         shared = (SENSOR_KEY,) if self._sensor_constants.names else ()
         point, (by_pose, *_), noise = factor.locate([guess[0], *(self._constants[key] for key in shared)])
         covariance = by_pose @ guess[1] @ by_pose.T + noise
-        earlier = self._new_landmarks.propose(name, point, covariance, (keyframe.index, factor))
+        sighting = (keyframe.index, factor)
+        self._new_landmarks, earlier = self._new_landmarks.propose(name, point, covariance, sighting)
         if earlier is None:
             return
         self._places[name] = len(self._places)
         key = landmark_key(self._places[name])
         self._constants[key], self._spreads[key] = point, covariance
         addition.values[key] = point
-        for index, sighted in (earlier, (keyframe.index, factor)):
+        for index, sighted in (earlier, sighting):
             if self._is_open(index):
                 node = Node((pose_key(index), *shared, key), sighted, 2)
                 self._keyframes[index].nodes.append(node)

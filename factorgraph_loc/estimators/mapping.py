@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -15,20 +16,23 @@ MAX_PENDING = 5  # sightings that wait for another to agree
 Sighting = TypeVar("Sighting")
 
 
-@dataclass
+@dataclass(frozen=True)
 class NewLandmarks(Generic[Sighting]):
-    """Sightings of landmarks that are not taken in yet: that needs two that agree where it is, as one may be an outlier."""
+    """Sightings of landmarks that are not taken in yet: that needs two that agree where it is, as one may be an outlier.
 
-    _pending: dict[str, list[tuple[Array, Array, Sighting]]] = field(default_factory=dict)
+    A value: filters go back to an earlier one when a measurement is late.
+    """
 
-    def propose(self, name: str, point: Array, covariance: Array, sighting: Sighting) -> Sighting | None:
-        """A sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2): an earlier one that agrees, or None."""
-        pending = self._pending.setdefault(name, [])
-        for earlier, spread, candidate in reversed(pending):
+    pending: Mapping[str, tuple[tuple[Array, Array, Sighting], ...]] = field(default_factory=dict)
+
+    def propose(
+        self, name: str, point: Array, covariance: Array, sighting: Sighting
+    ) -> tuple[NewLandmarks[Sighting], Sighting | None]:
+        """With a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2): what waits from now on, and an
+        earlier sighting that agrees, or None."""
+        waiting = self.pending.get(name, ())
+        for earlier, spread, candidate in reversed(waiting):
             apart = point - earlier
             if apart @ np.linalg.solve(spread + covariance, apart) < GATE:
-                del self._pending[name]
-                return candidate
-        pending.append((point, covariance, sighting))
-        del pending[:-MAX_PENDING]
-        return None
+                return NewLandmarks({other: rows for other, rows in self.pending.items() if other != name}), candidate
+        return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None
