@@ -1,7 +1,7 @@
-"""The inner loop of backward simulation: which particle a later pose came from.
+"""The inner loop of backward simulation: which particle a later state came from.
 
 Godsill, Doucet, West, JASA 99(465), 2004, eq. 7: an ancestor is drawn with its weight times the transition density.
-The kernel is compiled: in numpy it takes ten times as long, and most of a particle filter's run (``scripts/bench``).
+The kernel is compiled: in numpy it takes ten times as long, and most of the final result's time (``scripts/bench``).
 """
 
 import numba
@@ -13,18 +13,42 @@ from factors.se2 import Array
 Indices = NDArray[np.int64]
 
 
-def draw_ancestors(predicted: Array, log_weights: Array, after: Array, covariance: Array, uniform: Array) -> Indices:
-    """One index (M,) into the N particles for each later pose.
+def draw_ancestors(
+    predicted: Array,
+    constants: Array,
+    log_weights: Array,
+    after: Array,
+    constants_after: Array,
+    covariance: Array,
+    uniform: Array,
+) -> Indices:
+    """One index (M,) into the N particles for each later state.
 
-    ``predicted`` (N, 3): the particles moved without noise; ``log_weights`` (N,); ``after`` (M, 3): the later poses;
-    ``covariance`` (3, 3): of the motion's body-frame noise; ``uniform`` (M,): draws from [0, 1).
+    ``predicted`` (N, 3): the particles moved without noise; ``constants`` (N, P): their constants; ``log_weights`` (N,);
+    ``after`` (M, 3) and ``constants_after`` (M, P): the later states; ``covariance`` (3+P, 3+P): of the pose's body-frame error and
+    of the constants; ``uniform`` (M,): draws from [0, 1).
     """
-    whitener = np.linalg.inv(np.linalg.cholesky(covariance))
-    return np.asarray(_draw(predicted, log_weights, after, whitener, uniform))
+    size = constants.shape[1]
+    order = [*range(3, 3 + size), 0, 1, 2]  # of the constants first: what they whiten to is known before the loop
+    whitener = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    by_constants = np.ascontiguousarray(whitener[:, :size].T)
+    return np.asarray(
+        _draw(
+            predicted,
+            constants @ by_constants,
+            log_weights,
+            after,
+            constants_after @ by_constants,
+            np.ascontiguousarray(whitener[size:, size:]),
+            uniform,
+        )
+    )
 
 
-def transition_log_density(predicted: Array, after: Array, covariance: Array) -> Array:
-    """Log-density (M, N), up to a constant, of poses ``after`` (M, 3) given noise-free predictions (N, 3).
+def transition_log_density(
+    predicted: Array, constants: Array, after: Array, constants_after: Array, covariance: Array
+) -> Array:
+    """Log-density (M, N), up to a constant, of states ``after`` (M, 3), (M, P) given noise-free predictions (N, 3), (N, P).
 
     The body-frame error is taken to first order: log(p^-1 * a) is the difference, turned into the frame of p. This is the plain
     twin of what the compiled kernel computes.
@@ -34,13 +58,25 @@ def transition_log_density(predicted: Array, after: Array, covariance: Array) ->
     dx = after[:, None, 0] - predicted[:, 0]
     dy = after[:, None, 1] - predicted[:, 1]
     heading = np.mod(after[:, None, 2] - predicted[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    error = np.stack((c * dx + s * dy, c * dy - s * dx, heading), axis=-1) @ whitener.T
+    pose = np.stack((c * dx + s * dy, c * dy - s * dx, heading), axis=-1)
+    error = np.concatenate((pose, constants_after[:, None] - constants), axis=-1) @ whitener.T
     return np.asarray(-0.5 * np.sum(error**2, axis=-1))
 
 
 @numba.njit(cache=True)
-def _draw(predicted: Array, log_weights: Array, after: Array, whitener: Array, uniform: Array) -> Indices:
+def _draw(
+    predicted: Array,
+    whitened: Array,
+    log_weights: Array,
+    after: Array,
+    whitened_after: Array,
+    whitener: Array,
+    uniform: Array,
+) -> Indices:
+    """``whitened`` (N, P+3) and ``whitened_after`` (M, P+3): the constants' part of the whitened states; ``whitener`` (3, 3): of
+    what is left of the pose's error."""
     count = len(predicted)
+    size = whitened.shape[1] - 3
     cosine, sine = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
     density = np.empty(count)
     rows = np.empty(len(after), np.int64)
@@ -54,7 +90,13 @@ def _draw(predicted: Array, log_weights: Array, after: Array, whitener: Array, u
             e0 = whitener[0, 0] * along
             e1 = whitener[1, 0] * along + whitener[1, 1] * lateral
             e2 = whitener[2, 0] * along + whitener[2, 1] * lateral + whitener[2, 2] * turn
-            density[i] = log_weights[i] - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
+            e0 += whitened_after[j, size] - whitened[i, size]
+            e1 += whitened_after[j, size + 1] - whitened[i, size + 1]
+            e2 += whitened_after[j, size + 2] - whitened[i, size + 2]
+            squared = e0 * e0 + e1 * e1 + e2 * e2
+            for p in range(size):
+                squared += (whitened_after[j, p] - whitened[i, p]) ** 2
+            density[i] = log_weights[i] - 0.5 * squared
             highest = max(highest, density[i])
         total = 0.0
         for i in range(count):

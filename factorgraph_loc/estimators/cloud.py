@@ -1,10 +1,11 @@
-"""A cloud of weighted particles: its moments, its modes, and drawing from it."""
+"""A cloud of weighted particles: its moments, its modes, the density that it stands for, and drawing from it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import Mode
 from factors import se2
@@ -19,13 +20,13 @@ CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is lo
 
 @dataclass(frozen=True)
 class Cloud:
-    """``poses`` (N, 3), ``parameters`` (N, P) of the odometry, and normalised ``log_weights`` (N,).
+    """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
 
     ``localized``: the place is known. ``slow`` and ``fast``: averages of the likelihood over many and over few stamps.
     """
 
     poses: Array
-    parameters: Array
+    constants: Array
     log_weights: Array
     localized: bool = True
     slow: float = 0.0
@@ -38,6 +39,43 @@ class Cloud:
     def moments(self) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame."""
         return pose_moments(self.poses, self.weights)
+
+    def density(self) -> tuple[Cloud, Array]:
+        """The cloud as a density with the moments of what it was drawn from: poses shrunk towards their mean, each with a Gaussian
+        kernel (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8) as wide as befits their number
+        (:func:`silverman`). Given the pose the constants are Gaussian: as particles they would die out, of a few families,
+        long before the landmarks have told them apart.
+
+        Returns the shrunk cloud and the kernel's covariance (3+P, 3+P), of the pose's body-frame perturbation and of the
+        constants. Where the place is not known there are several modes, and the kernel leaves the poses alone.
+        """
+        weights = self.weights
+        middle, _ = self.moments()
+        errors = np.concatenate((se2.log(se2.between(middle, self.poses)), self.constants), axis=1)
+        mean, covariance = vector_moments(errors, weights)
+        covariance[range(3), range(3)] += MINIMUM_VARIANCE
+        # a weighted sample's covariance is by sum(w^2) too small: little, but the constants would lose it with each resampling
+        covariance /= max(1.0 - float(weights @ weights), 0.5)
+        if not self.localized:
+            covariance[:3] = covariance[:, :3] = 0.0
+            return replace(self, constants=np.broadcast_to(mean[3:], self.constants.shape)), covariance
+        kept = 1.0 - silverman(*errors.shape) ** 2
+        by_pose = np.linalg.solve(
+            covariance[:3, :3], covariance[:3]
+        )  # (3, 3+P), of the pose and of the constants given it
+        shrunk = mean + np.sqrt(kept) * (errors[:, :3] - mean[:3]) @ by_pose
+        cloud = replace(self, poses=se2.compose(middle, se2.exp(shrunk[:, :3])), constants=shrunk[:, 3:])
+        return cloud, covariance - kept * covariance[:, :3] @ by_pose
+
+    def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
+        """Particles of equal weight: those of ``rows`` (M,), each with a draw from a ``kernel`` (3+P, 3+P)."""
+        noise = gaussian(kernel, len(rows), rng)
+        return replace(
+            self,
+            poses=se2.compose(self.poses[rows], se2.exp(noise[:, :3])),
+            constants=self.constants[rows] + noise[:, 3:],
+            log_weights=np.full(len(rows), -np.log(len(rows))),
+        )
 
     def modes(self) -> tuple[Mode, ...]:
         """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
@@ -59,12 +97,25 @@ class Cloud:
         return tuple(sorted(found, key=lambda m: -m.weight))
 
 
-def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> Array:
+def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:
     """Indices of ``count`` draws (as many as weights by default) by systematic resampling (Kitagawa, 1996)."""
     count = len(weights) if count is None else count
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
-    return np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1)
+    return np.asarray(np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1))
+
+
+def silverman(count: int, size: int) -> float:
+    """Bandwidth, as a share of the standard deviation, of Gaussian kernels on ``count`` points in ``size`` dimensions
+    (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
+
+
+def gaussian(covariance: Array, count: int, rng: np.random.Generator) -> Array:
+    """Draws (count, D) from a Gaussian whose covariance (D, D) may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
 
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:

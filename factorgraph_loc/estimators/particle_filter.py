@@ -26,13 +26,14 @@ from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import Relocalizer
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
-from factors.bearing_range import BearingRangeFactor, log_likelihood
-from factors.odometry import PARAMETERS, Increment, recalibrated
+from factors import bearing_range, odometry, se2
+from factors.bearing_range import TIME_OFFSET, BearingRangeFactor, log_likelihood
+from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
 
-KERNEL = 0.1  # Liu and West's h: the share of a constant's spread that is drawn anew when resampling
+BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
 SLOW, FAST = 0.01, 0.1  # decay rates of the averages of the likelihood, per stamp
 INJECTED = 0.05  # the least share that is drawn anew while the place is not known
 ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies within so many standard deviations of it
@@ -40,12 +41,15 @@ ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies with
 
 class ParticleFilterSettings(FilterSettings):
     """``particles``: their number. ``resample_below``: effective sample size, as a share, below which they are resampled.
-    ``smoothing_trajectories``: drawn backwards for the final result, through clouds ``smoothing_interval`` seconds apart."""
+    ``smoothing_trajectories``: drawn backwards for the final result, through clouds ``smoothing_interval`` seconds apart.
+    ``self_calibration``: constants to which the rig gives an uncertainty travel with each particle, but not the sensor's time
+    offset, which is taken as the rig has it."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     resample_below: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0)] = 1.0
+    self_calibration: bool = True
 
 
 class ParticleFilter(Filter):
@@ -59,8 +63,15 @@ class ParticleFilter(Filter):
         super().__init__(setup, settings)
         self._settings = settings
         self._rng = setup.rng
-        self._landmarks = KnownLandmarks(setup, self.diagnostics)
-        self._estimated = setup.rig.estimated_odometry()
+        self._odometry_constants = self._sensor_constants = NOTHING
+        sensor = setup.rig.bearing_range
+        if settings.self_calibration:
+            self._odometry_constants = setup.rig.estimated_odometry()
+            self._sensor_constants = Estimated.of(bearing_range.PARAMETERS[:TIME_OFFSET], sensor and sensor.uncertainty)
+        self._landmarks = KnownLandmarks(setup, self.diagnostics, estimated=self._sensor_constants.indices)
+        # where the constants lie in those of the particles
+        middle = len(self._odometry_constants.names)
+        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, None)
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
         self._monitor = TrackMonitor()
         self._lost = False
@@ -73,12 +84,13 @@ class ParticleFilter(Filter):
         return Belief(modes, self._state.poses, self._state.weights)
 
     def learnt(self) -> Learnt:
-        """The odometry's constants that are estimated."""
+        """The constants that are estimated."""
         if self._state is None:
             return Learnt()
-        mean, covariance = vector_moments(self._state.parameters, self._state.weights)
+        mean, covariance = vector_moments(self._state.constants, self._state.weights)
         sigmas = np.sqrt(np.diag(covariance))
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(self._estimated.names, mean, sigmas, strict=True)})
+        names = [*self._odometry_constants.names, *(f"bearing_range.{name}" for name in self._sensor_constants.names)]
+        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, mean, sigmas, strict=True)})
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
@@ -104,7 +116,7 @@ class ParticleFilter(Filter):
         seen = self._landmarks.factor(m)
         if seen is None:
             return None
-        self._relocalizer.add(self._odometry, seen)
+        self._relocalizer.add(self._odometry, self._expected(seen, np.zeros(len(self._sensor_constants.names))))
         self._relocalizer.search()
         return replace(self._cloud(self._relocalizer.sample(self._rng, self._settings.particles)), localized=False)
 
@@ -112,34 +124,47 @@ class ParticleFilter(Filter):
         """Particles at poses (N, 3), whose constants are those of the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
-        parameters = self._rng.standard_normal((count, len(self._estimated.indices))) * self._estimated.sigmas
-        return Cloud(poses, parameters, np.full(count, -np.log(count)))
+        sigmas = np.concatenate((self._odometry_constants.sigmas, self._sensor_constants.sigmas))
+        return Cloud(poses, self._rng.standard_normal((count, len(sigmas))) * sigmas, np.full(count, -np.log(count)))
 
     def _predict(self, increment: Increment) -> None:
         cloud = self._state
         noise = self._rng.standard_normal(cloud.poses.shape) @ np.linalg.cholesky(increment.covariance).T
-        self._state = replace(cloud, poses=se2.compose(self._moved(cloud, increment), se2.exp(noise)))
+        moved, _ = self._moved(cloud, increment)
+        self._state = replace(cloud, poses=se2.compose(moved, se2.exp(noise)))
 
-    def _moved(self, cloud: Cloud, increment: Increment) -> Array:
-        """Poses (N, 3) after the increment, each under its own constants, without noise."""
-        if not cloud.parameters.shape[1]:
-            return se2.compose(cloud.poses, increment.delta)
-        return se2.compose(
-            cloud.poses, recalibrated(increment, self._estimated.full(cloud.parameters, len(PARAMETERS)))[0]
-        )
+    def _moved(self, cloud: Cloud, increment: Increment) -> tuple[Array, Array]:
+        """Poses (N, 3) after the increment, each under its own constants, without noise; and their transition (3, 3+P) from
+        body-frame perturbation and constants, which is that of the mean constants."""
+        by_constants = np.zeros((3, cloud.constants.shape[1]))
+        delta = middle = increment.delta
+        if self._odometry_constants.names:
+            places = list(self._odometry_constants.indices)
+            values = cloud.constants[:, self._odometry_part]
+            delta, _ = recalibrated(increment, self._odometry_constants.full(values, len(odometry.PARAMETERS)))
+            mean = self._odometry_constants.full(cloud.weights @ values, len(odometry.PARAMETERS))
+            middle, jacobian = recalibrated(increment, mean)
+            by_constants[:, self._odometry_part] = jacobian[:, places]
+        transition = np.concatenate((se2.adjoint(se2.inverse(middle)), by_constants), axis=1)
+        return se2.compose(cloud.poses, delta), transition
 
     def _update(self, m: BearingRange) -> None:
         seen = self._landmarks.factor(m)
         if seen is None:
             return
-        self._relocalizer.add(self._odometry, seen)
+        expected = self._expected(seen, self._state.weights @ self._state.constants[:, self._sensor_part])
+        self._relocalizer.add(self._odometry, expected)
         if self._state.localized:
-            self._watch(m.t, seen)
+            self._watch(m.t, expected)
         self._weigh(seen)
         if not self._state.localized:
             self._relocalizer.search()
             self._inject()
             self._settle()
+
+    def _expected(self, seen: BearingRangeFactor, constants: Array) -> BearingRangeFactor:
+        """The factor on the pose alone, of a sensor with these constants (P,)."""
+        return seen.fixed([constants], None) if self._sensor_constants.names else seen
 
     def _watch(self, t: float, seen: BearingRangeFactor) -> None:
         """Report the innovation; see whether the landmarks refute the place."""
@@ -158,31 +183,33 @@ class ParticleFilter(Filter):
             self._event(f"lost: landmarks are not where they were expected since {since:.1f} s")
 
     def _weigh(self, seen: BearingRangeFactor) -> None:
+        """Weigh the particles by the likelihood, by a share of it at a time if it leaves too few effective ones: they are resampled
+        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4)."""
+        likelihood = self._likelihood(seen)
         cloud = self._state
-        likelihood = log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings)
-        log_weights = cloud.log_weights + likelihood
-        log_weights -= log_weights.max()
-        log_weights -= np.log(np.sum(np.exp(log_weights)))
         average = float(cloud.weights @ np.exp(likelihood / len(seen.points)))
         slow = cloud.slow + SLOW * (average - cloud.slow) if cloud.slow else average
         fast = cloud.fast + FAST * (average - cloud.fast) if cloud.fast else average
-        self._state = replace(cloud, log_weights=log_weights, slow=slow, fast=fast)
-        effective = 1.0 / np.sum(np.exp(2.0 * log_weights))
-        if effective < self._settings.resample_below * len(log_weights):
+        self._state = replace(cloud, slow=slow, fast=fast)
+        enough = self._settings.resample_below * len(cloud.poses)
+        left = 1.0
+        while (share := _share(self._state.log_weights, likelihood, left, enough)) < left:
+            self._state = replace(self._state, log_weights=_normalised(self._state.log_weights + share * likelihood))
             self._resample()
+            left -= share
+            likelihood = self._likelihood(seen)
+        self._state = replace(self._state, log_weights=_normalised(self._state.log_weights + left * likelihood))
+
+    def _likelihood(self, seen: BearingRangeFactor) -> Array:
+        """Log-likelihood (N,) of the particles, each with its own constants."""
+        cloud = self._state
+        changes = self._sensor_constants.full(cloud.constants[:, self._sensor_part], len(bearing_range.PARAMETERS))
+        return log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings, changes)
 
     def _resample(self) -> None:
-        cloud = self._state
-        chosen = systematic(cloud.weights, self._rng)
-        parameters = cloud.parameters[chosen]
-        if parameters.shape[1]:
-            mean, spread = parameters.mean(axis=0), parameters.std(axis=0)
-            shrunk = mean + np.sqrt(1.0 - KERNEL**2) * (parameters - mean)
-            parameters = shrunk + KERNEL * spread * self._rng.standard_normal(parameters.shape)
-        count = len(chosen)
-        self._state = replace(
-            cloud, poses=cloud.poses[chosen], parameters=parameters, log_weights=np.full(count, -np.log(count))
-        )
+        chosen = systematic(self._state.weights, self._rng)
+        cloud, kernel = self._state.density()
+        self._state = cloud.drawn(chosen, kernel, self._rng)
 
     def _inject(self) -> None:
         """Draw particles anew from the last sightings: the more, the less likely they are than they used to be."""
@@ -229,3 +256,24 @@ class ParticleFilter(Filter):
 
     def _increment(self, start: Record, end: Record) -> Increment:
         return self._motion.relative(start.odometry, end.odometry)
+
+
+def _share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
+    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles."""
+
+    def effective(share: float) -> float:
+        return float(1.0 / np.sum(np.exp(2.0 * _normalised(log_weights + share * likelihood))))
+
+    if effective(left) >= enough:
+        return left
+    low, high = 0.0, left
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if effective(middle) >= enough else (low, middle)
+    return max(low, SMALLEST * left)
+
+
+def _normalised(log_weights: Array) -> Array:
+    """Log-weights (N,) whose weights sum to one."""
+    log_weights = log_weights - log_weights.max()
+    return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))
