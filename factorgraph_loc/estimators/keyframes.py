@@ -42,16 +42,18 @@ from factors.odometry import PARAMETERS, ChainState, Increment, OdometryFactor, 
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
+KEYFRAME_INTERVAL, MAPPING_KEYFRAME_INTERVAL = 0.09, 0.5  # s
 
 
 class GraphSettings(FileModel):
     """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come.
+    ``keyframe_interval``: by default 0.09 s, and 0.5 s where landmarks are estimated, which makes each update far dearer.
 
     ``self_calibration``: constants to which the rig gives an uncertainty are variables. ``landmarks``: see
     :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
     """
 
-    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] = 0.09
+    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
     keyframe_max_interval: Annotated[float, Field(gt=0.0, le=60.0)] = 1.0
     max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
     self_calibration: bool = True
@@ -106,6 +108,8 @@ class GraphEstimator(ABC):
         self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
+        default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
+        self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         # all variables but the poses: estimate and covariance
@@ -221,7 +225,7 @@ class GraphEstimator(ABC):
 
     def _see(self, m: BearingRange) -> None:
         newest = self._keyframes[-1]
-        if m.t - newest.t >= self._graph_settings.keyframe_interval:
+        if m.t - newest.t >= self._interval:
             self._add_keyframe(m.t, m)
             return
         before = self._keyframe_before(m.t)

@@ -47,20 +47,25 @@ class Smoother(RelocatingGraph):
         self._settings = settings
         self._failed: list[str] = []
         self._solver = self._new_solver()
+        # where landmarks are estimated an update takes long: what is seen between keyframes waits for the next one
+        self._waits = settings.landmarks != "known"
+        self._waiting = Addition()
         # of each keyframe: its causal estimate, and the final one where it has left the window
         self._filtered: list[tuple[Array, Array]] = []
         self._left: list[tuple[Array, Array]] = []
 
     def _final(self) -> tuple[Array, Array]:
-        """Full history: the solution of the whole graph. With a window: each pose as it left the window."""
+        """Full history: the whole graph, solved to the end. With a window: each pose as it left the window."""
+        if self._waiting.nodes:
+            self._update([], {})
         if not self._settings.smooth:
             estimates = self._filtered
         elif isinstance(self._solver, FullHistory):
-            self._solver.converge()
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
             values |= {key: self._solver.value(key) for key in self._constants}
-            covariances = self._settle(self._problem(), values)
-            return np.array([values[k.key] for k in self._keyframes]), covariances
+            problem = self._problem()
+            values = problem.solve(values).values
+            return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
         else:
             for key in self._constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
@@ -85,6 +90,11 @@ class Smoother(RelocatingGraph):
         self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        if self._waits and guess is not None:
+            self._waiting.nodes += addition.nodes
+            self._waiting.values |= addition.values
+            self._pose, self._covariance = guess
+            return
         self._update(addition.nodes, addition.values)
 
     def _is_open(self, keyframe: int) -> bool:
@@ -92,6 +102,7 @@ class Smoother(RelocatingGraph):
 
     def _update(self, nodes: Sequence[Node], values: Values) -> None:
         newest = self._keyframes[-1]
+        nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
         try:
             self._solver.update(nodes, values, newest.t)
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})

@@ -20,10 +20,8 @@ from factors.se2 import Array
 
 RELINEARIZE_SKIP = 10  # updates between checks of which factors of the full history to linearise anew
 RECENT = 200  # variables that are checked then; older ones hardly move before the end
-MOVED = np.array((0.05, 0.05, 0.03))  # m, m, rad: how far a pose may be from where its factors were linearised
+MOVED, TURNED = 0.05, 0.03  # m, rad: how far a variable may be from where its factors were linearised
 MARGIN = 1.0  # s that a pose stays longer in a window
-MAX_FINAL_UPDATES = 20
-CONVERGED = 1e-4  # m, rad: of the final updates
 
 
 class Solver(Protocol):
@@ -62,7 +60,7 @@ class FullHistory:
         self._ours += new
         self._updates += 1
         if self._updates % RELINEARIZE_SKIP == 0:
-            self._relinearize(self._ours[-RECENT:], MOVED)
+            self._relinearize(self._ours[-RECENT:])
 
     def value(self, key: int) -> Array:
         return read(self._isam, key)
@@ -70,19 +68,12 @@ class FullHistory:
     def covariance(self, key: int) -> Array:
         return np.asarray(self._isam.marginalCovariance(key))
 
-    def converge(self) -> None:
-        """Linearise all factors anew and update, until the solution stands still."""
-        for _ in range(MAX_FINAL_UPDATES):
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), force_relinearize=True)
-            if not self._relinearize(self._ours, np.full(3, CONVERGED)):
-                break
-
     def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
         """Values of the variables: as given in ``values``, else as the solver estimates them."""
         return [values[key] if key in values else read(self._isam, key) for key in keys]
 
-    def _relinearize(self, linears: Iterable[_Linear], moved: Array) -> bool:
-        """Replace the factors whose poses are farther than ``moved`` from where they were linearised; whether there were any."""
+    def _relinearize(self, linears: Iterable[_Linear]) -> None:
+        """Replace the factors whose variables have moved from where they were linearised."""
         graph, slots, changed = gtsam.NonlinearFactorGraph(), [], []
         estimates: Values = {}
         for linear in linears:
@@ -90,7 +81,7 @@ class FullHistory:
                 if key not in estimates:
                     estimates[key] = read(self._isam, key)
             point = gather(estimates, linear.node.keys)
-            if linear.is_off(point, moved):
+            if linear.is_off(point):
                 linear.point = point
                 slots.append(linear.slot)
                 changed.append(linear)
@@ -99,7 +90,6 @@ class FullHistory:
             new = self._isam.update(graph, gtsam.Values(), slots).getNewFactorsIndices()
             for linear, slot in zip(changed, new, strict=True):
                 linear.slot = slot
-        return bool(changed)
 
 
 class Window:
@@ -150,14 +140,14 @@ class _Linear:
         values = to_gtsam(dict(zip(self.node.keys, self.point, strict=True)))
         return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, self.point), values)
 
-    def is_off(self, point: Sequence[Array], moved: Array) -> bool:
-        """Whether a pose or a landmark is farther than ``moved`` (m, m, rad) from where it was."""
+    def is_off(self, point: Sequence[Array]) -> bool:
+        """Whether a variable has moved too far from where it was."""
         for key, old, new in zip(self.node.keys, self.point, point, strict=True):
             change = new - old
             if is_pose(key):
                 turn = abs(se2.wrap_scalar(change[2]))
-                if abs(change[0]) > moved[0] or abs(change[1]) > moved[1] or turn > moved[2]:
+                if abs(change[0]) > MOVED or abs(change[1]) > MOVED or turn > TURNED:
                     return True
-            elif np.abs(change).max() > moved[0]:
+            elif np.abs(change).max() > MOVED:
                 return True
         return False
