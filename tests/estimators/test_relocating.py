@@ -1,0 +1,274 @@
+"""Smoother and batch where their place is not known (unknown start, wrong start, kidnapping), and where it always was."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import BearingRangeStream, cut, join
+from factorgraph_loc.readers import load
+
+CONFIGS = {
+    "smoother": RunConfig("smoother"),
+    "smoother_lag": RunConfig("smoother", {"lag": 10.0}),
+    "batch": RunConfig("batch"),
+}
+CAUSAL = ("smoother", "smoother_lag")
+LOST = "lost: landmarks were not where they were expected since {:.1f} s; goes on at another place"
+
+
+@pytest.fixture(scope="module")
+def log(simulate):
+    return simulate(seconds=30.0)
+
+
+@pytest.fixture(scope="module")
+def kidnapped(log, simulate):
+    """After 10 s the robot is carried to where another run is at 25 s."""
+    return join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=40.0), 25.0, 40.0))
+
+
+def with_sightings(log, keep=None, **columns):
+    s = replace(log.streams["bearing_range"], **columns)
+    rows = np.arange(len(s.t)) if keep is None else np.flatnonzero(keep)
+    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
+    return replace(log, streams={**log.streams, "bearing_range": stream})
+
+
+def dirty(log, seed=5):
+    """A tenth of the rows says anything."""
+    rng, s = np.random.default_rng(seed), log.streams["bearing_range"]
+    bad = rng.random(len(s.t)) < 0.1
+    return with_sightings(
+        log,
+        range=np.where(bad, rng.uniform(0.3, 8.0, len(bad)), s.range),
+        bearing=np.where(bad, rng.uniform(-np.pi, np.pi, len(bad)), s.bearing),
+    )
+
+
+def swapped(log, one, other):
+    landmarks = dict(log.world.landmarks)
+    landmarks[one], landmarks[other] = landmarks[other], landmarks[one]
+    return replace(log, world=log.world.model_copy(update={"landmarks": landmarks}))
+
+
+def silent(log, start, end):
+    t = log.streams["bearing_range"].t
+    return with_sightings(log, (t < start) | (t >= end))
+
+
+def without(log, column):
+    return with_sightings(log, **{column: np.full(len(log.streams["bearing_range"].t), np.nan)})
+
+
+def off(trajectory, log):
+    return errors(trajectory, log.reference).position
+
+
+def changes(result):
+    """Each status in its turn, and when it began."""
+    first = [i for i in range(len(result.t)) if i == 0 or result.status[i] != result.status[i - 1]]
+    return [(result.status[i], float(result.t[i])) for i in first]
+
+
+def distance(a, b):
+    """Largest distance [m] between two trajectories at the stamps that both have."""
+    _, i, k = np.intersect1d(a.t, b.t, return_indices=True)
+    return np.hypot(*(a.poses[i] - b.poses[k])[:, :2].T).max()
+
+
+@pytest.mark.parametrize("how", [lambda log: log, dirty], ids=["clean", "dirty"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_unknown_start(name, how, log):
+    log = how(log)
+    result = run(log, replace(CONFIGS[name], prior="unknown"))
+    ((t, event),) = result.diagnostics.events
+    assert event == "localized"
+    if name != "batch":  # which has no causal result
+        (before, _), (between, _), (after, since) = changes(result)
+        assert (before, between, after) == ("unlocalized", "ambiguous", "localized")
+        assert t <= since < min(t + 0.11, 5.0)
+        assert off(result.causal(), log)[0] < 0.3
+        assert off(result.causal(), log).max() < 0.3
+    # what told the place is taken in from its first sighting on
+    assert result.final.t[0] < 0.3
+    assert off(result.final, log).max() < 0.15
+    assert distance(result.final, run(log, CONFIGS[name]).final) < 0.1
+
+
+def test_an_unknown_start_is_found_from_the_past_alone(log):
+    config = replace(CONFIGS["smoother"], prior="unknown")
+    whole, part = run(log, config), run(cut(log, 0.0, 5.0), config)
+    np.testing.assert_array_equal(whole.poses[:45], part.poses[:45])
+    assert whole.status[:45] == part.status[:45]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_wrong_start(name, log):
+    result = run(log, replace(CONFIGS[name], prior="3,3,1.0"))
+    ((t, event),) = result.diagnostics.events
+    assert event == LOST.format(log.streams["bearing_range"].t[0])
+    assert t < 5.0
+    if name != "batch":
+        assert off(result.causal(), log)[result.t > t].max() < 0.3
+    assert off(result.final, log)[result.final.t > 0.2].max() < 0.15
+
+
+@pytest.mark.parametrize("prior", [None, "unknown"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_kidnapped(name, prior, kidnapped, log):
+    result = run(kidnapped, replace(CONFIGS[name], prior=prior))
+    events = [what for _, what in result.diagnostics.events]
+    assert events[:-1] == ([] if prior is None else ["localized"])
+    assert events[-1].startswith("lost: ")
+    t = result.diagnostics.events[-1][0]
+    # a suspicion needs 2 s of landmarks, of which most are where they should not be
+    assert 10.0 < t < 13.0
+    if name != "batch":
+        assert np.nanmax(off(result.causal(), kidnapped)[result.causal().t > t]) < 0.3
+    # the jump is known only after it, but spoils nothing before
+    final = off(result.final, kidnapped)
+    assert np.nanmax(final[result.final.t < 9.8]) < 0.15
+    assert np.nanmax(final[result.final.t > 10.5]) < 0.15
+    undisturbed = run(cut(log, 0.0, 10.0), replace(CONFIGS[name], prior=prior))
+    early = result.final.t < 9.0
+    assert np.hypot(*(result.final.poses[early] - undisturbed.final.poses[: early.sum()])[:, :2].T).max() < 0.05
+    # and no causal estimate is taken back
+    if name != "batch":
+        np.testing.assert_array_equal(result.poses[:90], undisturbed.poses[:90])
+
+
+def test_a_lost_track_is_ambiguous_until_its_place_is_found(log, simulate):
+    """The new place is told by one landmark for a while: seen well enough to doubt the old one, not to find the new one."""
+    elsewhere = cut(simulate(seed=3, seconds=45.0), 25.0, 45.0)
+    s = elsewhere.streams["bearing_range"]
+    alone = with_sightings(elsewhere, (np.array(s.landmark) == s.landmark[0]) | (s.t > 33.0))
+    carried = join(cut(log, 0.0, 10.0), alone)
+    result = run(carried, CONFIGS["smoother"])
+    status = np.array(result.status)
+    ((t, _),) = result.diagnostics.events
+    assert 18.0 < t < 22.0
+    assert np.all(status[(result.t > 13.0) & (result.t < t)] == "ambiguous")
+    assert np.all(status[result.t > t + 0.1] == "localized")
+    assert np.nanmax(off(result.final, carried)[result.final.t > t]) < 0.2
+
+
+@pytest.mark.parametrize(
+    "disturbed",
+    [lambda log: log, dirty, lambda log: swapped(log, "a", "e"), lambda log: swapped(log, "b", "h")],
+    ids=["clean", "dirty", "swapped ae", "swapped bh"],
+)
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_right_track_is_never_left(name, disturbed, log):
+    log = disturbed(log)
+    result = run(log, CONFIGS[name])
+    assert result.diagnostics.events == []
+    assert off(result.final, log).max() < 0.2
+    if name != "batch":
+        assert set(result.status) == {"localized"}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_blackout_is_no_kidnapping(name, log):
+    dark = silent(log, 8.0, 20.0)
+    for prior in (None, "unknown"):
+        result = run(dark, replace(CONFIGS[name], prior=prior))
+        assert [what for _, what in result.diagnostics.events] == ([] if prior is None else ["localized"])
+        assert off(result.final, log)[result.final.t > 21.0].max() < 0.15
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_kidnapped_in_a_blackout(name, kidnapped):
+    result = run(silent(kidnapped, 7.0, 14.0), CONFIGS[name])
+    ((t, event),) = result.diagnostics.events
+    assert event.startswith("lost: ")
+    assert 14.0 < t < 20.0
+    final = off(result.final, kidnapped)
+    assert np.nanmax(final[result.final.t < 7.0]) < 0.15
+    assert np.nanmax(final[result.final.t > 14.5]) < 0.2
+
+
+@pytest.mark.parametrize("missing", ["range", "bearing"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_range_alone_and_bearing_alone(name, missing, log):
+    """Here they tell the place, too."""
+    log = without(log, missing)
+    result = run(log, replace(CONFIGS[name], prior="unknown"))
+    ((t, event),) = result.diagnostics.events
+    assert event == "localized"
+    assert t < 15.0
+    assert off(result.final, log).max() < 0.3
+    if name != "batch":
+        assert off(result.causal(), log)[0] < 0.3
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_one_landmark_does_not_tell_the_place(name, log):
+    """The start stays open, and everything is still there when the others come."""
+    s = log.streams["bearing_range"]
+    lone = with_sightings(log, np.array(s.landmark) == "b")
+    result = run(cut(lone, 0.0, 8.0), replace(CONFIGS[name], prior="unknown"))
+    assert result.diagnostics.events == []
+    assert len(result.final) == 0
+    assert "localized" not in result.status
+    assert result.causal() is None
+    (warning,) = result.warnings
+    assert warning.startswith("simulated: never localized: ")
+    if name != "batch":
+        assert [status for status, _ in changes(result)] == ["unlocalized", "ambiguous"]
+        ambiguous = np.array(result.status) == "ambiguous"
+        assert np.all(np.isfinite(result.poses[ambiguous]))
+        distance_of_b = np.hypot(*(result.poses[ambiguous, :2] - log.world.position("b")).T)
+        truth = np.hypot(*(log.reference.at(result.t[ambiguous])[:, :2] - log.world.position("b")).T)
+        assert np.abs(distance_of_b - truth).max() < 0.5
+
+    late = with_sightings(log, (np.array(s.landmark) == "b") | (s.t > 8.0))
+    result = run(late, replace(CONFIGS[name], prior="unknown"))
+    assert result.final.t[0] < 0.3
+    assert off(result.final, log).max() < 0.3
+
+
+@pytest.mark.parametrize("how", ["no rows", "not in the map", "map to be estimated"])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_nothing_tells_the_place(name, how, log):
+    config, count = replace(CONFIGS[name], prior="unknown"), len(log.streams["bearing_range"].t)
+    if how == "no rows":
+        log = with_sightings(log, np.zeros(count, dtype=bool))
+    elif how == "not in the map":
+        log = with_sightings(log, landmark=["ghost"] * count)
+    else:
+        config = replace(config, settings={**config.settings, "landmarks": "unknown"})
+    result = run(log, config)
+    assert set(result.status) == {"unlocalized"}
+    assert np.all(np.isnan(result.poses))
+    assert len(result.final) == 0
+    assert result.diagnostics.events == []
+    assert len(result.warnings) == 1
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_late_sightings_of_an_unknown_start(name, log):
+    s = log.streams["bearing_range"]
+    order = np.argsort(s.t + np.random.default_rng(3).uniform(0.0, 0.4, len(s.t)), kind="stable")
+    stream = BearingRangeStream(s.t[order], [s.landmark[i] for i in order], s.range[order], s.bearing[order])
+    result = run(
+        replace(log, streams={**log.streams, "bearing_range": stream}), replace(CONFIGS[name], prior="unknown")
+    )
+    assert [what for _, what in result.diagnostics.events] == ["localized"]
+    assert off(result.causal(), log).max() < 0.3
+    assert off(result.final, log).max() < 0.15
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_recorded_start(name, data_root):
+    (log,) = load("mrclam6-robot3", data_root=data_root)
+    log = cut(log, 300.0, 360.0)
+    result = run(log, replace(CONFIGS[name], prior="unknown"))
+    assert [what for _, what in result.diagnostics.events] == ["localized"]
+    found = errors(result.final, log.reference)
+    assert np.nanmax(found.position) < 0.5
+    assert np.nanmax(found.heading) < 0.3
+    if name != "batch":
+        assert off(result.causal(), log)[0] < 0.5
