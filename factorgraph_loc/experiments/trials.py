@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,6 +33,22 @@ class Trial:
     right: bool
     false: bool
     seconds: float
+
+
+@dataclass(frozen=True)
+class TrialJob:
+    """``count`` trials of a ``kind`` on a log, for :func:`run_trials`."""
+
+    kind: Literal["unknown start", "kidnapping"]
+    log: Log
+    estimator: str
+    count: int
+
+
+def run_trials(job: TrialJob) -> list[Trial]:
+    """The trials of a job; jobs can be sent to other processes."""
+    trials = start_trials if job.kind == "unknown start" else kidnapping_trials
+    return trials(job.log, job.estimator, job.count)
 
 
 def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
