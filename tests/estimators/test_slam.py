@@ -121,10 +121,11 @@ def test_what_the_map_lacks_is_added_and_the_rest_taken_as_it_is(name, log):
     assert squared(result, log.world.position).max() < 18.4
     assert score(result, log)["final.position_rmse"] < 0.04
     # with the whole map there is nothing to add
-    settings = {key: value for key, value in extended.settings.items() if key != "landmarks"}
-    whole, known = run(log, extended), run(log, replace(extended, settings=settings))
+    whole = run(log, extended)
     assert whole.learnt.landmarks == {}
-    np.testing.assert_array_equal(whole.final.poses, known.final.poses)
+    known = run(log, replace(extended, settings={**extended.settings, "landmarks": "known"}))
+    # with landmarks to be estimated keyframes lie farther apart
+    assert np.hypot(*(whole.final.poses - known.final.poses)[:, :2].T).max() < (0.0 if name == "ekf" else 0.05) + 1e-9
 
 
 @pytest.mark.parametrize("name", CONFIGS)
