@@ -89,12 +89,12 @@ def test_all_landmarks_are_found(name, log, mapped):
     assert result.diagnostics.events == []
 
 
-@pytest.mark.parametrize(("name", "overconfident"), [("smoother", 1.0), ("ekf", 2.5)])
+@pytest.mark.parametrize(("name", "overconfident"), [("smoother", 1.0), ("ekf", 1.8)])
 def test_errors_of_landmarks_are_as_large_as_stated(name, overconfident, logs, mapped):
     """Over six seeds, bounds of 0.1 % of false alarms on each side if all landmarks of a run are off together, as they nearly are.
 
-    EKF-SLAM states too little (Julier, Uhlmann, "A counter example to the theory of simultaneous localization and map
-    building", 2001).
+    EKF-SLAM states too little, over 24 seeds 1.8 times (Julier, Uhlmann, "A counter example to the theory of simultaneous
+    localization and map building", 2001).
     """
     means = [squared(mapped(name, seed), logs[seed].world.position).mean() for seed in SEEDS]
     low, high = chi2.ppf((0.001, 0.999), 2 * len(SEEDS)) / len(SEEDS)
