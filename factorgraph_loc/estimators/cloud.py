@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ class Cloud:
     def weights(self) -> Array:
         return np.asarray(np.exp(self.log_weights))
 
+    @cached_property
     def moments(self) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame."""
         return pose_moments(self.poses, self.weights)
@@ -50,22 +52,25 @@ class Cloud:
         constants. Where the place is not known there are several modes, and the kernel leaves the poses alone.
         """
         weights = self.weights
-        middle, _ = self.moments()
+        middle, _ = self.moments
         errors = np.concatenate((se2.log(se2.between(middle, self.poses)), self.constants), axis=1)
         mean, covariance = vector_moments(errors, weights)
-        covariance[range(3), range(3)] += MINIMUM_VARIANCE
-        # a weighted sample's covariance is by sum(w^2) too small: little, but the constants would lose it with each resampling
-        covariance /= max(1.0 - float(weights @ weights), 0.5)
+        # The covariance of a weighted sample is by sum(w^2) too small, and by more where many descend from few, of which only what
+        # the kernels drew is independent. It is little, but the constants would lose it with each resampling.
+        lost = float(weights @ weights)
         if not self.localized:
             covariance[:3] = covariance[:, :3] = 0.0
-            return replace(self, constants=np.broadcast_to(mean[3:], self.constants.shape)), covariance
-        kept = 1.0 - silverman(*errors.shape) ** 2
-        by_pose = np.linalg.solve(
-            covariance[:3, :3], covariance[:3]
-        )  # (3, 3+P), of the pose and of the constants given it
-        shrunk = mean + np.sqrt(kept) * (errors[:, :3] - mean[:3]) @ by_pose
+            constants = np.broadcast_to(mean[3:], self.constants.shape)
+            return replace(self, constants=constants), _inflated(covariance, lost)
+        covariance[range(3), range(3)] += MINIMUM_VARIANCE
+        renewed = silverman(*errors.shape) ** 2
+        # regression (3, 3+P) on the pose, of itself and of the constants; and what it explains of the covariance
+        by_pose = np.linalg.solve(covariance[:3, :3], covariance[:3])
+        explained = covariance[:, :3] @ by_pose
+        shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
         cloud = replace(self, poses=se2.compose(middle, se2.exp(shrunk[:, :3])), constants=shrunk[:, 3:])
-        return cloud, covariance - kept * covariance[:, :3] @ by_pose
+        kernel = _inflated(explained, lost / renewed) - (1.0 - renewed) * explained
+        return cloud, kernel + _inflated(covariance - explained, lost)
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
         """Particles of equal weight: those of ``rows`` (M,), each with a draw from a ``kernel`` (3+P, 3+P)."""
@@ -133,6 +138,11 @@ def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
     mean = weights @ values
     error = values - mean
     return mean, (weights[:, None] * error).T @ error
+
+
+def _inflated(covariance: Array, lost: float) -> Array:
+    """A covariance that has lost this share."""
+    return covariance / max(1.0 - lost, 0.5)
 
 
 def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:

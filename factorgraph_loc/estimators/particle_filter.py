@@ -1,8 +1,10 @@
 """Particle filter with systematic resampling, and backward simulation for its final trajectory.
 
 Sequential importance resampling (Gordon, Salmond, Smith, 1993) on log-weights; resampling when the effective sample size falls
-below a share of the particles. Constants of the odometry that are estimated travel with each particle and are
-rejuvenated by the kernel of Liu and West (2001).
+below a share of the particles, from their density instead of the particles themselves (regularised particle filter: Musso,
+Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapter 12), so that they do not deplete where the motion
+adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their stated spread is a
+little too small where landmarks tell next to nothing of them: resampling moves their mean at random.
 
 Where the place is not known, at an unknown start or once the landmarks refute it, a share of the particles is drawn anew at each
 stamp (augmented Monte Carlo localization: Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, table 8.3), not anywhere but from
@@ -80,7 +82,7 @@ class ParticleFilter(Filter):
         """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
         if self._state is None:
             return Belief(())
-        modes = (Mode(1.0, *self._state.moments()),) if self._state.localized else self._state.modes()
+        modes = (Mode(1.0, *self._state.moments),) if self._state.localized else self._state.modes()
         return Belief(modes, self._state.poses, self._state.weights)
 
     def learnt(self) -> Learnt:
@@ -128,25 +130,29 @@ class ParticleFilter(Filter):
         return Cloud(poses, self._rng.standard_normal((count, len(sigmas))) * sigmas, np.full(count, -np.log(count)))
 
     def _predict(self, increment: Increment) -> None:
-        cloud = self._state
-        noise = self._rng.standard_normal(cloud.poses.shape) @ np.linalg.cholesky(increment.covariance).T
-        moved, _ = self._moved(cloud, increment)
-        self._state = replace(cloud, poses=se2.compose(moved, se2.exp(noise)))
+        noise = self._rng.standard_normal((len(self._state.poses), 3)) @ np.linalg.cholesky(increment.covariance).T
+        poses, _ = self._moved(self._state, increment, noise)
+        self._state = replace(self._state, poses=poses)
 
-    def _moved(self, cloud: Cloud, increment: Increment) -> tuple[Array, Array]:
-        """Poses (N, 3) after the increment, each under its own constants, without noise; and their transition (3, 3+P) from
-        body-frame perturbation and constants, which is that of the mean constants."""
+    def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
+        """Poses (N, 3) after the increment, each under its own constants, and with body-frame ``noise`` (N, 3), if any.
+
+        Returns also their transition (3, 3+P) from body-frame perturbation and constants. It is taken at the mean of the constants,
+        from which those of the particles differ so little that what they change on the way adds to the noise.
+        """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
-        delta = middle = increment.delta
+        delta = increment.delta
         if self._odometry_constants.names:
-            places = list(self._odometry_constants.indices)
             values = cloud.constants[:, self._odometry_part]
-            delta, _ = recalibrated(increment, self._odometry_constants.full(values, len(odometry.PARAMETERS)))
-            mean = self._odometry_constants.full(cloud.weights @ values, len(odometry.PARAMETERS))
-            middle, jacobian = recalibrated(increment, mean)
-            by_constants[:, self._odometry_part] = jacobian[:, places]
-        transition = np.concatenate((se2.adjoint(se2.inverse(middle)), by_constants), axis=1)
-        return se2.compose(cloud.poses, delta), transition
+            mean = cloud.weights @ values
+            delta, jacobian = recalibrated(increment, self._odometry_constants.full(mean, len(odometry.PARAMETERS)))
+            by_constants[:, self._odometry_part] = jacobian[:, list(self._odometry_constants.indices)]
+            changed = (values - mean) @ by_constants[:, self._odometry_part].T
+            noise = changed if noise is None else noise + changed
+        poses = se2.compose(cloud.poses, delta)
+        if noise is not None:
+            poses = se2.compose(poses, se2.exp(noise))
+        return poses, np.concatenate((se2.adjoint(se2.inverse(delta)), by_constants), axis=1)
 
     def _update(self, m: BearingRange) -> None:
         seen = self._landmarks.factor(m)
@@ -168,7 +174,7 @@ class ParticleFilter(Filter):
 
     def _watch(self, t: float, seen: BearingRangeFactor) -> None:
         """Report the innovation; see whether the landmarks refute the place."""
-        mean, covariance = self._state.moments()
+        mean, covariance = self._state.moments
         covariance = se2.world_to_body(mean, covariance)
         self._landmarks.report(t, seen, robust_update(seen, mean, covariance, iterations=1))
         self._monitor.add(t, seen, mean, covariance)
@@ -242,7 +248,7 @@ class ParticleFilter(Filter):
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            return PoseEstimate(self._t, *self._state.moments(), "localized")
+            return PoseEstimate(self._t, *self._state.moments, "localized")
         mode = self._state.modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")
 
