@@ -24,7 +24,8 @@ from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
 
-# m, rad: a change below that is not carried on to older poses; they all hang on the constants, and would all be computed anew
+# m, rad: in the full history a change below that is not carried on to older poses; they all hang on the constants, and would all
+# be computed anew
 WILDFIRE = 0.01
 
 
@@ -201,9 +202,9 @@ class Smoother(RelocatingGraph):
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky loses long stretches of dead reckoning as indeterminate
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
-        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
         parameters.relinearizeSkip = self._settings.relinearize_skip
         if self._settings.lag is None:
+            parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
             return FullHistory(parameters)
         parameters.findUnusedFactorSlots = True
         return Window(parameters, self._settings.lag, self._failed.append)
