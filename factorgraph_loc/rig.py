@@ -69,6 +69,7 @@ class OdometrySettings(FileModel):
     direction: Angle = 0.0
     delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
     lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
+    turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0, description="m/rad")] = 0.0
     max_hold: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.5
     unknown_distance: Noise = 0.2
     unknown_rotation: Noise = 0.2
@@ -175,6 +176,7 @@ class Rig(FileModel):
             direction=s.direction,
             delay=s.delay,
             lag=s.lag,
+            turn_slowdown=s.turn_slowdown,
             gyro_bias=imu.bias,
             max_hold=s.max_hold,
             unknown_distance=s.unknown_distance,

@@ -43,7 +43,8 @@ class OdometryModel:
 
     ``scale_distance``, ``scale_rotation``: true over reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
     ``gyro_bias`` [rad/s] are what is reported at rest. ``direction`` [rad]: that of travel, in the robot's frame.
-    ``delay`` and ``lag`` [s] belong to commanded velocities. A velocity is held for at most ``max_hold`` seconds; after
+    ``delay`` and ``lag`` [s] belong to commanded velocities, and so does ``turn_slowdown`` [m/rad]: by how much a robot
+    that turns falls short of the forward speed, per turn rate. A velocity is held for at most ``max_hold`` seconds; after
     that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
     """
 
@@ -54,6 +55,7 @@ class OdometryModel:
     direction: float = 0.0
     delay: float = 0.0
     lag: float = 0.0
+    turn_slowdown: float = 0.0
     gyro_bias: float = 0.0
     max_hold: float = 1.5
     unknown_distance: float = 0.2

@@ -24,7 +24,9 @@ _T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _VX, _VY, _W, _UX, _UY, _UW = rang
 _KNOT, _STATE = 13, 7
 
 # scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
-_Constants = tuple[tuple[float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]]
+_Constants = tuple[
+    tuple[float, float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]
+]
 
 _arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
 
@@ -46,7 +48,7 @@ class OdometryChain:
         self._forgotten = False
         m = model
         self._constants = (
-            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias),
+            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias, m.turn_slowdown),
             (math.cos(m.direction), math.sin(m.direction)),
             (m.lag, m.max_hold),
             (m.gyro_bias, use_gyro),
@@ -136,7 +138,9 @@ class OdometryChain:
 @numba.njit(cache=True)
 def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Constants) -> None:
     """The knots of the rows from ``begin`` to ``end``, each from the knot before it."""
-    (scale_distance, scale_rotation, speed_bias, heading_rate_bias), (c, s), (lag, hold), gyro = constants
+    (scale_distance, scale_rotation, speed_bias, heading_rate_bias, turn_slowdown), (c, s), (lag, hold), gyro = (
+        constants
+    )
     gyro_bias, use_gyro = gyro
     for i in range(begin, end):
         t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
@@ -159,9 +163,11 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
             _move(previous, t - previous[_T], lag, hold, knot)
         if kind == _VELOCITY:
             speed = scale_distance * (a - speed_bias)
+            turn = scale_rotation * (b - heading_rate_bias)
+            speed = math.copysign(max(0.0, abs(speed) - turn_slowdown * abs(turn)), speed)
             knot[_UX], knot[_UY] = speed * c, speed * s
             if not use_gyro:
-                knot[_UW] = scale_rotation * (b - heading_rate_bias)
+                knot[_UW] = turn
         elif kind == _GYRO:
             knot[_UW] = knot[_W] = a - gyro_bias
 

@@ -50,6 +50,7 @@ def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant
         found += [
             Constant("delay", settings.delay, 0.1, 0.0, 2.0),
             Constant("lag", settings.lag, 0.1, 0.0, 5.0),
+            Constant("turn_slowdown", settings.turn_slowdown, 0.05, 0.0, 5.0),
         ]
     return tuple(found)
 

@@ -18,6 +18,7 @@ UNITS = {
     "direction": "rad",
     "delay": "s",
     "lag": "s",
+    "turn_slowdown": "m/rad",
     "x": "m",
     "y": "m",
     "bearing_bias": "rad",

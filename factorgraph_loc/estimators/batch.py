@@ -39,7 +39,8 @@ class Batch(RelocatingGraph):
 
     def estimate(self) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
-        return replace(super().estimate(), status="unlocalized")
+        guess = super().estimate()
+        return guess if self._prior is None else replace(guess, status="unlocalized")
 
     def _final(self) -> tuple[Array, Array]:
         """The optimum over the whole log."""

@@ -35,13 +35,11 @@ SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 class RelocatingGraph(GraphEstimator):
     """A graph estimator that finds its place; see the module."""
 
-    supports_unknown_start = True
-
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
         super().__init__(setup, settings)
         self._motion.keep(2.0 * DURATION)
         # where landmarks are estimated too, they cannot tell the place
-        self._relocates = settings.landmarks == "known"
+        self._relocates = self.supports_unknown_start = settings.landmarks == "known"
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
         self._monitor = TrackMonitor()
         # what is seen before the start is counted when it is taken in
@@ -99,7 +97,7 @@ class RelocatingGraph(GraphEstimator):
         if seen is None and self._searched is None:
             return  # the run begins with the first landmark
         self._remember(m)
-        if seen is None or not self._relocates:
+        if seen is None:
             return
         self._searched = self._motion.state(m.t)
         self._relocalizer.add(self._searched, seen)

@@ -24,10 +24,6 @@ from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
 
-# m, rad: in the full history a change below that is not carried on to older poses; they all hang on the constants, and would all
-# be computed anew
-WILDFIRE = 0.01
-
 
 class SmootherSettings(GraphSettings):
     """``lag`` [s]: length of the window, none for the full history. ``relinearize_*``: how far a variable may move (m and rad;
@@ -204,7 +200,6 @@ class Smoother(RelocatingGraph):
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
         parameters.relinearizeSkip = self._settings.relinearize_skip
         if self._settings.lag is None:
-            parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
             return FullHistory(parameters)
         parameters.findUnusedFactorSlots = True
         return Window(parameters, self._settings.lag, self._failed.append)

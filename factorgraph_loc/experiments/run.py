@@ -66,7 +66,8 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     estimator = registry.create(config.estimator, setup, settings)
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
-            f"{config.estimator} cannot start from an unknown pose on {log.name}, expected a prior {EXPECTED}"
+            f"{config.estimator} with these settings cannot start from an unknown pose on {log.name}, "
+            f"expected a prior {EXPECTED}"
         )
 
     loop = _Loop(estimator, log, sensors, prior, progress or (lambda _: None))

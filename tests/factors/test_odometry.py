@@ -166,3 +166,17 @@ def test_the_factor_without_parameters_is_gtsams(delta, start, moved, seed):
     values.insert(1, gtsam.Pose2(*se2.compose(start, moved)))
     ours = OdometryFactor(increment).cost([read_pose(values, 0), read_pose(values, 1)])
     assert ours == pytest.approx(between_factor(0, 1, increment).error(values), rel=1e-6, abs=1e-9)
+
+
+def test_a_robot_that_turns_is_slower_than_commanded():
+    model = OdometryModel(turn_slowdown=0.1)
+    straight, turning, backwards, on_the_spot = (
+        velocities(model, [(0.0, v, w)]).state(1.0) for v, w in ((0.2, 0.0), (0.2, -0.5), (-0.2, 0.5), (0.0, 0.5))
+    )
+    assert straight.path == pytest.approx(0.2)
+    assert turning.path == pytest.approx(0.15)
+    assert turning.heading == pytest.approx(-0.5)
+    assert backwards.path == pytest.approx(0.15)
+    assert backwards.x < 0.0
+    assert on_the_spot.path == 0.0
+    assert on_the_spot.heading == pytest.approx(0.5)
