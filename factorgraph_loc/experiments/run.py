@@ -66,7 +66,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     estimator = registry.create(config.estimator, setup, settings)
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
-            f"{config.estimator} with these settings cannot start from an unknown pose on {log.name}, "
+            f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
             f"expected a prior {EXPECTED}"
         )
 

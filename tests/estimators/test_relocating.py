@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import BearingRangeStream, cut, join
@@ -229,22 +230,27 @@ def test_one_landmark_does_not_tell_the_place(name, log):
     assert off(result.final, log).max() < 0.3
 
 
-@pytest.mark.parametrize("how", ["no rows", "not in the map", "map to be estimated"])
+@pytest.mark.parametrize("how", ["no rows", "not in the map"])
 @pytest.mark.parametrize("name", CONFIGS)
 def test_nothing_tells_the_place(name, how, log):
     config, count = replace(CONFIGS[name], prior="unknown"), len(log.streams["bearing_range"].t)
     if how == "no rows":
         log = with_sightings(log, np.zeros(count, dtype=bool))
-    elif how == "not in the map":
-        log = with_sightings(log, landmark=["ghost"] * count)
     else:
-        config = replace(config, settings={**config.settings, "landmarks": "unknown"})
+        log = with_sightings(log, landmark=["ghost"] * count)
     result = run(log, config)
     assert set(result.status) == {"unlocalized"}
     assert np.all(np.isnan(result.poses))
     assert len(result.final) == 0
     assert result.diagnostics.events == []
     assert len(result.warnings) == 1
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_landmarks_that_are_to_be_estimated_cannot_tell_the_place(name, log):
+    settings = {**CONFIGS[name].settings, "landmarks": "unknown"}
+    with pytest.raises(InputError, match="cannot start from an unknown pose"):
+        run(log, replace(CONFIGS[name], settings=settings, prior="unknown"))
 
 
 @pytest.mark.parametrize("name", CAUSAL)
