@@ -234,10 +234,8 @@ def test_one_landmark_does_not_tell_the_place(name, log):
 @pytest.mark.parametrize("name", CONFIGS)
 def test_nothing_tells_the_place(name, how, log):
     config, count = replace(CONFIGS[name], prior="unknown"), len(log.streams["bearing_range"].t)
-    if how == "no rows":
-        log = with_sightings(log, np.zeros(count, dtype=bool))
-    else:
-        log = with_sightings(log, landmark=["ghost"] * count)
+    none, renamed = np.zeros(count, dtype=bool), ["ghost"] * count
+    log = with_sightings(log, none) if how == "no rows" else with_sightings(log, landmark=renamed)
     result = run(log, config)
     assert set(result.status) == {"unlocalized"}
     assert np.all(np.isnan(result.poses))
