@@ -23,7 +23,8 @@ from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
-from factors.bearing_range import TIME_OFFSET, BearingRangeFactor
+from factors.bearing_range import TIME_OFFSET
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment, recalibrated
 from factors.se2 import Array
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 import bisect
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
 
 from factorgraph_loc.estimators.base import (
     Belief,
@@ -25,74 +23,25 @@ from factorgraph_loc.estimators.base import (
     PosePrior,
     gaussian_belief,
 )
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, robust_update, together
+from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt, between_keyframes
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update, together
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
-from factorgraph_loc.files import FileModel
 from factorgraph_loc.measurements import BearingRange, Measurement, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
-from factors.bearing_range import TIME_OFFSET, BearingRangeFactor
+from factors.bearing_range import TIME_OFFSET
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
-from factors.odometry import PARAMETERS, ChainState, Increment, OdometryFactor, recalibrated
+from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
 KEYFRAME_INTERVAL, MAPPING_KEYFRAME_INTERVAL = 0.09, 0.5  # s
-
-
-class GraphSettings(FileModel):
-    """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come.
-    ``keyframe_interval``: by default 0.09 s, and 0.5 s where landmarks are estimated, which makes each update far dearer.
-
-    ``self_calibration``: constants to which the rig gives an uncertainty are variables. ``landmarks``: see
-    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
-    """
-
-    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
-    keyframe_max_interval: Annotated[float, Field(gt=0.0, le=60.0)] = 1.0
-    max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
-    self_calibration: bool = True
-    landmarks: MapUse = "known"
-
-
-@dataclass
-class Keyframe:
-    """A pose variable of the graph: its time, the odometry there, and the sightings that hang on it."""
-
-    index: int
-    t: float
-    odometry: ChainState
-    from_previous: Increment | None
-    nodes: list[Node] = field(default_factory=list)
-
-    @property
-    def key(self) -> int:
-        return pose_key(self.index)
-
-
-Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
-
-
-@dataclass
-class Addition:
-    """What a measurement adds to the graph: factors, and new variables with their guesses."""
-
-    nodes: list[Node] = field(default_factory=list)
-    values: Values = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Tick:
-    """A stamp at which the trajectory is wanted, and the motion to it from the keyframe before."""
-
-    t: float
-    keyframe: int
-    since: Increment
 
 
 class GraphEstimator(ABC):
@@ -116,7 +65,7 @@ class GraphEstimator(ABC):
         self._constants, self._spreads = self._constant_priors()
         self._keyframes: list[Keyframe] = []
         self._keyframe_times: list[float] = []
-        self._ticks: list[_Tick] = []
+        self._ticks: list[TickAt] = []
         self._t = -math.inf
         self._prior: PosePrior | None = None
         # of the newest keyframe: pose and body-frame covariance
@@ -221,7 +170,7 @@ class GraphEstimator(ABC):
         if t - self._keyframes[-1].t >= self._graph_settings.keyframe_max_interval:
             self._add_keyframe(t, None)
         before = self._keyframe_before(t)
-        self._ticks.append(_Tick(t, before.index, self._since(before, t)))
+        self._ticks.append(TickAt(t, before.index, self._since(before, t)))
 
     def _see(self, m: BearingRange) -> None:
         newest = self._keyframes[-1]
@@ -371,26 +320,6 @@ class GraphEstimator(ABC):
         return np.array([covariances[k.key] for k in self._keyframes])
 
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
-        """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3).
-
-        A tick between two keyframes follows the odometry from the earlier one; what then misses the later one is spread in
-        proportion to time. The covariance goes linearly from one to the other, plus that of a bridge pinned at both ends.
-        """
-        newest: dict[float, _Tick] = {tick.t: tick for tick in self._ticks}
-        ticks = [newest[t] for t in sorted(newest)]
-        at = np.empty((len(ticks), 3))
-        spread = np.empty((len(ticks), 3, 3))
-        for i, tick in enumerate(ticks):
-            k = tick.keyframe
-            at[i] = se2.compose(poses[k], tick.since.delta)
-            spread[i] = propagate(covariances[k], tick.since)
-            if k + 1 < len(self._keyframes):
-                after = self._keyframes[k + 1]
-                assert after.from_previous is not None
-                whole = self._recalibrated(after.from_previous)
-                share = tick.since.duration / whole.duration
-                missed = se2.log(se2.between(se2.compose(poses[k], whole.delta), poses[k + 1]))
-                at[i] = se2.compose(at[i], se2.exp(share * missed))
-                bridge = share * (1.0 - share) * whole.covariance
-                spread[i] = (1.0 - share) * covariances[k] + share * covariances[k + 1] + bridge
-        return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))
+        """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""
+        steps = [self._recalibrated(k.from_previous) for k in self._keyframes if k.from_previous is not None]
+        return between_keyframes(self._ticks, steps, poses, covariances)

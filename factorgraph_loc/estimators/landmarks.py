@@ -12,7 +12,8 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import BearingRange
 from factors import se2
-from factors.bearing_range import BearingRangeFactor, BearingRangeModel, robust_weight, sigmas
+from factors.bearing_range import BearingRangeModel, robust_weight, sigmas
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import Increment
 from factors.se2 import Array
 

@@ -31,7 +31,8 @@ from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
-from factors.bearing_range import TIME_OFFSET, BearingRangeFactor, log_likelihood
+from factors.bearing_range import TIME_OFFSET, log_likelihood
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
 

@@ -21,7 +21,8 @@ from factorgraph_loc.estimators.landmarks import GATE
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.sighting_window import Sighting, Window
 from factors import se2
-from factors.bearing_range import BearingRangeFactor, BearingRangeModel, robust_loss
+from factors.bearing_range import BearingRangeModel, robust_loss
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import ChainState
 from factors.se2 import Array
 

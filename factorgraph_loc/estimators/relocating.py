@@ -16,14 +16,15 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status
-from factorgraph_loc.estimators.keyframes import GraphEstimator, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.keyframes import GraphEstimator
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange, Measurement, Tick
 from factors import se2
-from factors.bearing_range import BearingRangeFactor
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import ChainState, Increment
 from factors.se2 import Array
 

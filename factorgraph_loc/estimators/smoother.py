@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.keyframes import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.estimators.landmarks import GATE
-from factors.bearing_range import BearingRangeFactor
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.se2 import Array
 
 STAMPS, DURATION = 4, 2.0  # at least as many, over at least so many seconds

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from factors import se2
 from factors.bearing_range import (
-    BearingRangeFactor,
     BearingRangeModel,
     jacobians,
     located,
@@ -22,6 +21,7 @@ from factors.bearing_range import (
     whitened,
     whitened_all,
 )
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import custom_factor, jacobian_factor, read_pose
 
 place = st.floats(-8.0, 8.0)
