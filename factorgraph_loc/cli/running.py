@@ -158,7 +158,12 @@ def _print_consistency(scores: Mapping[str, Any]) -> None:
     for name, value in scores.items():
         if name.startswith("nis.") and name.endswith(".mean_per_dof"):
             sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
-            typer.echo(f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1")
+            # a few gross outliers make a mean of anything
+            share = 100.0 * scores[f"nis.{sensor}.beyond_95"]
+            typer.echo(
+                f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1; "
+                f"{share:.1f} % beyond the 95 % bound, ideally 5"
+            )
 
 
 def _print_learnt(result: RunResult) -> None:
