@@ -26,8 +26,9 @@ JUMP = 0.2  # s between the two parts of a kidnapping
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial. ``right``: localized (or recovered) rightly in time; ``false``: the first claim to be localized was wrong;
-    ``seconds``: until it was right, NaN if it never was."""
+    """One trial. ``right``: localized (or recovered) rightly in time; ``false``: the first claim to be localized was wrong (after a
+    kidnapping: localized is what it claimed when the time was up, without having recovered); ``seconds``: until it was right,
+    NaN if it never was."""
 
     t: float
     right: bool
@@ -52,12 +53,12 @@ def run_trials(job: TrialJob) -> list[Trial]:
 
 
 def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
-    """Unknown starts at ``count`` times spread evenly over a log with reference.
+    """Unknown starts at ``count`` times spread evenly over a log with reference, as long as 3 landmarks are still to be seen.
 
     A start is right if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks where
     that takes longer, and then stays within 0.5 m and 15 degrees for 10 s.
     """
-    first, last = log.span()
+    first, last = log.span()[0], _last_start(log)
     trials = []
     for i, t in enumerate(first + (last - first) * np.arange(count) / count):
         deadline = max(START_TIME, _third_landmark(log, float(t)) - float(t))
@@ -92,9 +93,8 @@ def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[st
         later = np.flatnonzero(result.t >= moved)
         held = [int(k) for k in later if result.t[k] <= moved + deadline and _holds(result.t, good, int(k))]
         seconds = float(result.t[held[0]] - moved) if held else math.nan
-        claimed = np.array(result.status) == "localized"
-        # a claim after the deadline, at the wrong place
-        false = bool(np.any(claimed[later] & ~good[later] & (result.t[later] > moved + deadline)))
+        at_deadline = int(np.searchsorted(result.t, moved + deadline).clip(max=len(result.t) - 1))
+        false = not held and result.status[at_deadline] == "localized"
         trials.append(Trial(float(t), bool(held), false, seconds))
     return trials
 
@@ -110,6 +110,19 @@ def _third_landmark(log: Log, t: float) -> float:
             if len(met) == LANDMARKS:
                 return float(stamp)
     return log.span()[1]
+
+
+def _last_start(log: Log) -> float:
+    """The last time from which 3 different landmarks of the map are still seen; the log's begin if that never happens."""
+    stream = log.streams["bearing_range"]
+    assert isinstance(stream, BearingRangeStream)
+    met: set[str] = set()
+    for stamp, name in zip(stream.t[::-1].tolist(), stream.landmark[::-1], strict=True):
+        if name in log.world.landmarks:
+            met.add(name)
+            if len(met) == LANDMARKS:
+                return float(stamp)
+    return log.span()[0]
 
 
 def _right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
