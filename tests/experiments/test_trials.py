@@ -116,12 +116,16 @@ def test_the_third_landmark_of_the_map(log):
     three = replace(log, world=World(landmarks=landmarks), streams={**log.streams, "bearing_range": stream})
     assert trials._third_landmark(three, 0.0) == s.t[5]
     assert trials._third_landmark(three, float(s.t[6])) == log.span()[1]
+    assert trials._last_start(log) == log.span()[0]
+    assert trials._last_start(three) == s.t[4]
 
 
 @pytest.mark.parametrize(("estimator", "settings"), [("smoother", None), ("particle_filter", {"particles": 500})])
 def test_all_starts_are_right_where_all_landmarks_are_seen(circle, estimator, settings):
     found = start_trials(circle, estimator, 3, settings)
-    assert [trial.t for trial in found] == pytest.approx([0.0, 20.0, 40.0])
+    last = trials._last_start(circle)
+    assert 55.0 < last < 60.0
+    assert [trial.t for trial in found] == pytest.approx([0.0, last / 3.0, 2.0 * last / 3.0])
     assert sum(trial.right for trial in found) == 3
     assert not any(trial.false for trial in found)
     assert max(trial.seconds for trial in found) < 5.0
