@@ -15,6 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
+from factorgraph_loc.grids import write_grid
+from factorgraph_loc.rfid_settings import GridSettings, RfidSettings, SurveySettings
 from factors import bearing_range, odometry
 from factors.bearing_range import BearingRangeModel
 from factors.odometry import Growth, OdometryModel
@@ -50,12 +52,13 @@ class OdometryNoise(FileModel):
 class OdometryUncertainty(FileModel):
     """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
 
-    Those of the scales are shares of the scale; that of the heading-rate bias is in rad/s.
+    Those of the scales are shares of the scale; that of the heading-rate bias is in rad/s, that of the drift in rad/m.
     """
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s")] = 0.0
+    heading_drift: Annotated[float, Field(ge=0.0, le=1.0, description="rad/m")] = 0.0
 
 
 class OdometrySettings(FileModel):
@@ -66,6 +69,7 @@ class OdometrySettings(FileModel):
     scale_rotation: Scale = 1.0
     speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
     heading_rate_bias: Rate = 0.0
+    heading_drift: Annotated[float, Field(ge=-1.0, le=1.0, description="rad/m")] = 0.0
     direction: Angle = 0.0
     delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
     lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
@@ -163,6 +167,8 @@ class Rig(FileModel):
     odometry: OdometrySettings = OdometrySettings()
     imu: ImuSettings | None = None
     bearing_range: BearingRangeSettings | None = None
+    rfid: RfidSettings | None = None
+    survey: SurveySettings = SurveySettings()
 
     def odometry_model(self, *, use_gyro: bool = False) -> OdometryModel:
         """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro."""
@@ -173,6 +179,7 @@ class Rig(FileModel):
             scale_rotation=s.scale_rotation,
             speed_bias=s.speed_bias,
             heading_rate_bias=s.heading_rate_bias,
+            heading_drift=s.heading_drift,
             direction=s.direction,
             delay=s.delay,
             lag=s.lag,
@@ -201,10 +208,21 @@ class Rig(FileModel):
 
 
 def read_rig(path: Path) -> Rig:
-    """Read ``NAME.rig.toml``; InputError names file, key and what is expected."""
-    return parse_model(Rig, read_toml(path), path)
+    """Read ``NAME.rig.toml``; InputError names file, key and what is expected. Grids are looked for beside it."""
+    return placed(parse_model(Rig, read_toml(path), path), path.parent)
+
+
+def placed(rig: Rig, folder: Path) -> Rig:
+    """The rig, whose grids are files in ``folder``."""
+    if rig.rfid is None:
+        return rig
+    models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in rig.rfid.models.items()}
+    return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
 
 def write_rig(rig: Rig, path: Path) -> None:
-    """Write ``NAME.rig.toml``."""
+    """Write ``NAME.rig.toml``, and its grids beside it."""
+    for model in (rig.rfid.models if rig.rfid else {}).values():
+        if isinstance(model, GridSettings) and model.path().resolve() != (path.parent / model.file).resolve():
+            write_grid(model.model(), path.parent / model.file)
     write_toml(path, rig.model_dump(mode="json", exclude_none=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -42,11 +43,29 @@ class Landmark(FileModel):
         return np.array(((xx, xy), (xy, yy)))
 
 
+class Tag(FileModel):
+    """An RFID tag: position [m] as it was surveyed, and the direction that it faces [rad], None where that is not known.
+
+    ``sigma``: standard deviation of its survey in x and y [m]; ``covariance``: (xx, xy, yy) [m^2] in place of it, as of a
+    :class:`Landmark`.
+    """
+
+    x: float
+    y: float
+    z: float = 0.0
+    facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")] | None = None
+    sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: tuple[float, float, float] | None = None
+
+
 class World(FileModel):
-    """A map. ``landmarks``: by name, as measurements name them."""
+    """A map. ``landmarks``: by name, as measurements name them. ``tags``: RFID tags by EPC, as they were surveyed: what a rig
+    knows of the survey's errors is applied where they are used. ``walls``: segments (x1, y1, x2, y2) [m]."""
 
     name: str = "world"
     landmarks: dict[str, Landmark] = Field(default_factory=dict)
+    tags: dict[str, Tag] = Field(default_factory=dict)
+    walls: tuple[tuple[float, float, float, float], ...] = ()
 
     def position(self, landmark: str) -> Array | None:
         """Position (2,) of a landmark, or None if the map lacks it."""

@@ -25,7 +25,7 @@ _KNOT, _STATE = 13, 7
 
 # scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
 _Constants = tuple[
-    tuple[float, float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]
+    tuple[float, float, float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]
 ]
 
 _arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
@@ -48,7 +48,7 @@ class OdometryChain:
         self._forgotten = False
         m = model
         self._constants = (
-            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias, m.turn_slowdown),
+            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias, m.heading_drift, m.turn_slowdown),
             (math.cos(m.direction), math.sin(m.direction)),
             (m.lag, m.max_hold),
             (m.gyro_bias, use_gyro),
@@ -138,9 +138,8 @@ class OdometryChain:
 @numba.njit(cache=True)
 def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Constants) -> None:
     """The knots of the rows from ``begin`` to ``end``, each from the knot before it."""
-    (scale_distance, scale_rotation, speed_bias, heading_rate_bias, turn_slowdown), (c, s), (lag, hold), gyro = (
-        constants
-    )
+    scales, (c, s), (lag, hold), gyro = constants
+    scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, turn_slowdown = scales
     gyro_bias, use_gyro = gyro
     for i in range(begin, end):
         t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
@@ -155,7 +154,8 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
                 forward, sideways = a / duration - speed_bias, b / duration
                 previous[_UX] = scale_distance * (c * forward - s * sideways)
                 previous[_UY] = scale_distance * (s * forward + c * sideways)
-                previous[_UW] = scale_rotation * (phi / duration - heading_rate_bias)
+                speed = math.hypot(previous[_UX], previous[_UY])
+                previous[_UW] = scale_rotation * (phi / duration - heading_rate_bias) + heading_drift * speed
             _move(previous, duration, 0.0, duration, knot)
             knot[_UNKNOWN] += max(0.0, duration - hold)
         else:
@@ -167,7 +167,7 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
             speed = math.copysign(max(0.0, abs(speed) - turn_slowdown * abs(turn)), speed)
             knot[_UX], knot[_UY] = speed * c, speed * s
             if not use_gyro:
-                knot[_UW] = turn
+                knot[_UW] = turn + heading_drift * abs(speed)
         elif kind == _GYRO:
             knot[_UW] = knot[_W] = a - gyro_bias
 

@@ -1,0 +1,33 @@
+"""The tags of a map as arrays, in the world's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.rfid_settings import SurveySettings
+from factorgraph_loc.world import World
+from factors import se2
+from factors.rfid_likelihood import TagArray
+
+
+@dataclass(frozen=True, eq=False)
+class TagMap:
+    """``names``: T EPCs; ``tags``: where they are in the world, the survey's errors corrected; ``index``: places by EPC."""
+
+    names: tuple[str, ...]
+    tags: TagArray
+    index: dict[str, int]
+
+
+def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
+    """The tags of a map, or those of ``names`` that it has."""
+    chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
+    points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
+    facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
+    transform = survey.transform()
+    points[:, :2] = se2.transform_from(transform, points[:, :2])
+    tags = TagArray(points, facing + transform[2])
+    return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)})
