@@ -15,7 +15,7 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEst
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factorgraph_loc.measurements import BearingRange, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.odometry import ChainState, Increment
@@ -59,8 +59,10 @@ class Filter(ABC):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
-        if not isinstance(measurement, BearingRange | Tick):
+        if isinstance(measurement, Odometry):
             self._motion.add(measurement)
+        elif isinstance(measurement, RfidScan):
+            self.diagnostics.ignore("rfid", len(measurement.antennas))
         elif self._state is None:
             self._begin(measurement)
         elif measurement.t >= self._t:

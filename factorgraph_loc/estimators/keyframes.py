@@ -30,7 +30,7 @@ from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
-from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factorgraph_loc.measurements import BearingRange, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
@@ -84,8 +84,10 @@ class GraphEstimator(ABC):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
-        if not isinstance(measurement, BearingRange | Tick):
+        if isinstance(measurement, Odometry):
             self._motion.add(measurement)
+        elif isinstance(measurement, RfidScan):
+            self.diagnostics.ignore("rfid", len(measurement.antennas))
         elif self._prior is None:
             self.diagnostics.ignore("before the start")
         elif measurement.t < max(self._t - self._graph_settings.max_delay, self._prior.t):

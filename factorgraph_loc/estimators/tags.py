@@ -1,0 +1,108 @@
+"""Inventory rounds of RFID antennas, as all estimators take them in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.measurements import RfidScan
+from factorgraph_loc.tag_map import TagMap, tag_map
+from factors import se2
+from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.se2 import Array
+
+CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
+NOTHING_TOLD = 1e-9  # added to an information that may be singular
+
+
+class KnownTags:
+    """Turns scans into looks at the tags of the map; what the map or the rig lacks is counted as ignored."""
+
+    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+        settings = setup.rig.rfid if "rfid" in setup.sensors else None
+        self._diagnostics = diagnostics
+        self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
+        self.map: TagMap = tag_map(setup.world, setup.rig.survey)
+        self.likelihood = None if settings is None else RfidLikelihood(settings.model(), self.map.tags)
+
+    def looks(self, m: RfidScan) -> Looks | None:
+        """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time."""
+        if self.likelihood is None:
+            self._diagnostics.ignore("rfid", len(m.antennas))
+            return None
+        antennas = [self._antennas.get(name, -1) for name in m.antennas]
+        used = sorted(set(antennas) - {-1})
+        if antennas.count(-1):
+            self._diagnostics.ignore("antenna that the rig lacks", antennas.count(-1))
+        if not used or not self.map.names:
+            return None
+        rows = {antenna: k for k, antenna in enumerate(used)}
+        rounds = np.bincount([rows[a] for a in antennas if a >= 0], minlength=len(used)).astype(np.int64)
+        hits = np.zeros((len(used), len(self.map.names)), dtype=np.int64)
+        unknown = 0
+        # a tag counts once a round, as often as it may answer in it
+        for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
+            place = self.map.index.get(name)
+            if place is None:
+                unknown += 1
+            elif antennas[number] >= 0:
+                hits[rows[antennas[number]], place] += 1
+        if unknown:
+            self._diagnostics.ignore("tag not in the map", unknown)
+        return Looks(np.zeros((len(used), 3)), np.array(used, dtype=np.int64), rounds, hits)
+
+
+@dataclass(frozen=True)
+class TagUpdate:
+    """A pose (3,) with body-frame covariance (3, 3) after looks at tags.
+
+    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``surprise`` and ``variance``: how much larger the
+    negative log-likelihood was there than expected, and the variance of that.
+    """
+
+    pose: Array
+    covariance: Array
+    nis: float
+    dof: int
+    surprise: float
+    variance: float
+
+
+def update(likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = 4) -> TagUpdate:
+    """The most likely pose under a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
+
+    A step that does not lower the cost is halved.
+    """
+    prior_information = np.linalg.inv(covariance)
+    sigmas = np.sqrt(np.diag(covariance))
+    score = likelihood.score(pose, looks)
+    gradient, information = score.gradient[0], score.information[0]
+    spread = information + information @ covariance @ information
+    nis = float(gradient @ np.linalg.solve(spread + NOTHING_TOLD * np.eye(3), gradient))
+    dof = int(np.linalg.matrix_rank(information, tol=1e-6)) if nis > 0.0 else 0
+    surprise, variance = float(score.nll[0] - score.expected[0]), float(score.variance[0])
+    best, cost, moved = pose, float(score.nll[0]), np.zeros(3)
+    for _ in range(iterations):
+        total = prior_information + information
+        step = -np.linalg.solve(total, gradient + prior_information @ moved)
+        step *= min(1.0, float(np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12))))
+        if np.all(np.abs(step) < CONVERGED * sigmas):
+            best = se2.compose(best, se2.exp(step))
+            break
+        for _ in range(4):
+            tried = se2.compose(best, se2.exp(step))
+            score = likelihood.score(tried, looks)
+            error = se2.log(se2.between(pose, tried))
+            tried_cost = float(score.nll[0]) + 0.5 * float(error @ prior_information @ error)
+            if tried_cost <= cost:
+                break
+            step = step / 2.0
+        else:
+            break
+        best, cost, moved = tried, tried_cost, error
+        gradient, information = score.gradient[0], score.information[0]
+    return TagUpdate(best, np.linalg.inv(prior_information + information), nis, dof, surprise, variance)
