@@ -17,6 +17,7 @@ READERS: dict[str, str] = {
     "native": "factorgraph_loc.readers.native",
     "mrclam": "factorgraph_loc.readers.mrclam",
     "plaza": "factorgraph_loc.readers.plaza",
+    "rf_robot": "factorgraph_loc.readers.rf_robot",
     "utias_woods": "factorgraph_loc.readers.utias_woods",
 }
 

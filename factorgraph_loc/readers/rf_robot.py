@@ -1,0 +1,194 @@
+"""A robot with three UHF RFID antennas between shelves: a folder with ``tags.csv`` and a folder ``runN`` for each run.
+
+The poses of a run are a reference, not odometry, which is therefore simulated from them:
+:func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import FileModel, read_text
+from factorgraph_loc.log import Log, RfidStream
+from factorgraph_loc.readers import checks, simulated_odometry
+from factorgraph_loc.readers.columns import read_columns
+from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.readers.rounds import ends_of, make_rfid_stream, rounds_from_gaps
+from factorgraph_loc.readers.simulated_odometry import wheel_odometry
+from factorgraph_loc.trajectory import Integers, Trajectory
+from factorgraph_loc.world import Tag, World
+from factors import se2
+from factors.se2 import Array
+
+ANTENNAS = ("first", "second", "third")
+TAG_COLUMNS = ("epc", "label", "x_m", "y_m", "z_m", "facing_deg")
+READ_FIELDS = ("number", "EPC", "port", "carrier MHz", "phase degrees", "RSSI dBm", "reader clock us", "host clock us")
+BOUNDS = {"carrier MHz": (840.0, 960.0), "phase degrees": (0.0, 360.0), "RSSI dBm": (-120.0, 20.0)}
+ROUND_GAP = 0.05  # s, between the inventory rounds of an antenna
+THINNING = 4  # the reference has 200 Hz
+
+
+class Options(FileModel):
+    """``run``: which of the recordings; ``odometry_seed``: of the simulated odometry's errors."""
+
+    run: Annotated[int, Field(ge=0)] = 13
+    odometry_seed: Annotated[int, Field(ge=0)] = 0
+
+
+def read(path: Path | None, options: Options) -> Log:
+    """The run; t = 0 at the first pose of the reference. InputError names file, row and field of what is wrong."""
+    if path is None:
+        raise InputError("rf_robot: the path of the folder with tags.csv is missing")
+    folder = path / f"run{options.run}"
+    if not folder.is_dir():
+        runs = sorted(f.name for f in path.glob("run*") if f.is_dir())
+        raise bad_field(path, "run", options.run, f"a folder of that number, one of {', '.join(runs) or '(none)'}")
+    warnings: list[str] = []
+    reference, t0_ns = read_reference(folder / "reference_pose.txt", warnings)
+    odometry = wheel_odometry(reference, options.odometry_seed)
+    reads = [read_reads(folder / f"{antenna}.txt", warnings) for antenna in ANTENNAS]
+    return Log(
+        name=f"{path.resolve().name}-run{options.run}",
+        rig=DEFAULT_RIG,
+        world=World(name=path.resolve().name, tags=read_tags(path / "tags.csv")),
+        streams={"odometry": odometry, "rfid": make_stream(reads, t0_ns, float(odometry.t[-1]), folder, warnings)},
+        reference=Trajectory(reference.t[::THINNING], reference.poses[::THINNING]),
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+        metadata={"odometry": f"{simulated_odometry.DESCRIPTION}; seed {options.odometry_seed}"},
+    )
+
+
+def read_tags(path: Path) -> dict[str, Tag]:
+    """The surveyed tags by EPC."""
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
+    if tuple(header := next(lines, [])) != TAG_COLUMNS:
+        raise bad_field(path, "header", ",".join(header), ",".join(TAG_COLUMNS), row=1)
+    rows: dict[str, int] = {}
+    tags: dict[str, Tag] = {}
+    for parts in lines:
+        row = lines.line_num
+        if not parts:
+            continue
+        if len(parts) != len(TAG_COLUMNS):
+            raise bad_field(
+                path, "row", ",".join(parts), f"{len(TAG_COLUMNS)} values: {','.join(TAG_COLUMNS)}", row=row
+            )
+        epc = parts[0]
+        if not epc or epc in tags:
+            expected = f"another EPC than in row {rows[epc]}" if epc else "an EPC"
+            raise bad_field(path, "epc", epc, expected, row=row)
+        values = [_number(path, row, field, part) for field, part in zip(TAG_COLUMNS[2:], parts[2:], strict=True)]
+        if abs(values[3]) > 360.0:
+            raise bad_field(path, "facing_deg", values[3], "degrees in -360 to 360", row=row)
+        rows[epc] = row
+        tags[epc] = Tag(x=values[0], y=values[1], z=values[2], facing=math.radians(values[3]))
+    if not tags:
+        raise InputError(f"{path}: holds no tags, expected at least one row")
+    return tags
+
+
+def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
+    """All poses, in seconds after the first, and the time of that."""
+    table, rows = read_columns(path, ("x", "y", "heading", "time"))
+    t_ns = np.rint(table[:, 3] * 1e6).astype(np.int64) * 1000  # a double holds no more digits of such a time
+    keep = checks.in_order(path, rows, t_ns, warnings)
+    if len(keep) < 2 or t_ns[keep[-1]] - t_ns[keep[0]] < 1e9 / simulated_odometry.RATE:
+        raise InputError(f"{path}: holds less than 0.1 s of poses, expected a run of them")
+    t0_ns = int(t_ns[keep[0]])
+    poses = np.column_stack((table[keep, :2], se2.wrap(table[keep, 2])))
+    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses), t0_ns
+
+
+@dataclass(frozen=True)
+class _Reads:
+    """The N reads of one antenna: host stamps [ns], EPCs, and RSSI [dBm], phase [rad], frequency [Hz], each (N,)."""
+
+    t_ns: Integers
+    epc: list[str]
+    rssi: Array
+    phase: Array
+    frequency: Array
+
+
+def read_reads(path: Path, warnings: list[str]) -> _Reads:
+    """The reads in a file of one antenna."""
+    epc: list[str] = []
+    stamps: list[int] = []
+    values: list[tuple[float, ...]] = []
+    rows: list[int] = []
+    for row, line in enumerate(read_text(path).split("\n"), start=1):
+        parts = line.split()
+        if not parts:
+            continue
+        if len(parts) != len(READ_FIELDS):
+            expected = f"{len(READ_FIELDS)} values: {', '.join(READ_FIELDS)}"
+            raise bad_field(path, "row", line.strip(), expected, row=row)
+        values.append(tuple(_number(path, row, READ_FIELDS[i], parts[i]) for i in (3, 4, 5)))
+        if not parts[7].isdigit() or len(parts[7]) > 16:
+            raise bad_field(path, READ_FIELDS[7], parts[7], "a whole number of microseconds", row=row)
+        stamps.append(int(parts[7]) * 1000)
+        epc.append(parts[1])
+        rows.append(row)
+    if not rows:
+        warnings.append(f"{path}: holds no reads")
+    table = np.array(values).reshape(-1, 3)
+    for (field, (low, high)), column in zip(BOUNDS.items(), table.T, strict=True):
+        bad = np.flatnonzero((column < low) | (column > high))
+        if len(bad):
+            raise bad_field(path, field, float(column[bad[0]]), f"{low:g} to {high:g}", row=rows[bad[0]])
+    t_ns = np.array(stamps, dtype=np.int64)
+    back = np.flatnonzero(np.diff(t_ns) < 0) + 1
+    if len(back):
+        i = int(back[0])
+        expected = f"a stamp not before that of the row before, {stamps[i - 1] // 1000}"
+        raise bad_field(path, READ_FIELDS[7], stamps[i] // 1000, expected, row=rows[i])
+    return _Reads(t_ns, epc, table[:, 2], np.radians(table[:, 1]), table[:, 0] * 1e6)
+
+
+def make_stream(reads: list[_Reads], t0_ns: int, end: float, source: Path, warnings: list[str]) -> RfidStream:
+    """The rounds of all antennas that lie within the odometry, 0 to ``end`` seconds."""
+    t_ns = np.concatenate([r.t_ns for r in reads])
+    order = np.argsort(t_ns, kind="stable")
+    t_ns = t_ns[order]
+    antenna = np.repeat(ANTENNAS, [len(r.t_ns) for r in reads])[order].tolist()
+    names = [name for r in reads for name in r.epc]
+    rssi, phase, frequency = (
+        np.concatenate([getattr(r, column) for r in reads])[order] for column in ("rssi", "phase", "frequency")
+    )
+    number = rounds_from_gaps(t_ns, antenna, ROUND_GAP)
+    end_ns = ends_of(t_ns, number)
+    first = np.searchsorted(number, np.arange(len(end_ns)))
+    whole = (t_ns[first] >= t0_ns) & ((end_ns - t0_ns) / 1e9 <= end)
+    keep = whole[number]
+    if left := int(np.count_nonzero(~keep)):
+        warnings.append(f"{source}: {left} of {len(t_ns)} reads lie outside the reference and are left out")
+    renumbered = np.cumsum(whole) - 1
+    return make_rfid_stream(
+        t_ns[keep],
+        renumbered[number[keep]],
+        [names[i] for i in order[keep].tolist()],
+        (rssi[keep], phase[keep], frequency[keep]),
+        end_ns[whole],
+        [antenna[i] for i in first[whole].tolist()],
+        t0_ns,
+    )
+
+
+def _number(path: Path, row: int, field: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise bad_field(path, field, text, "a finite number", row=row)
+    return value
