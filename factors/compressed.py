@@ -1,0 +1,89 @@
+"""Any negative log-likelihood as residuals of least squares: as many rows as it has variables, and one more.
+
+A cost nll >= 0 with gradient g and positive semi-definite curvature H = L L^T (Fisher's information, or Gauss-Newton's) becomes the
+residual ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` with the Jacobian ``[L^T; 0]``. Half of its square is nll exactly, its gradient is g
+and its curvature H, so a solver of least squares takes the scoring step, and judges it by the likelihood itself.
+
+The last row needs ``g^T H^-1 g <= 2 nll``: the parabola's lowest point must not lie below zero, which no likelihood does. Where it
+would, as with too little curvature for the gradient, the curvature along g is raised just so far: ``H + t g g^T`` with
+``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. Without any curvature that is Gauss-Newton's of the plain residual sqrt(2 nll).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from factors.se2 import Array
+
+RELATIVE_RIDGE = 1e-9  # of the mean curvature, so that a direction without any can be divided by
+RIDGE = 1e-10
+LEAST = 1e-12  # a cost of zero has no slope to represent
+
+
+@numba.njit(cache=True)
+def _cholesky(matrix: Array, lower: Array) -> None:
+    d = len(matrix)
+    for i in range(d):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = math.sqrt(max(total, RIDGE)) if i == j else total / lower[j, j]
+
+
+@numba.njit(cache=True)
+def _whitened(lower: Array, vector: Array, out: Array) -> float:
+    """L^-1 v into ``out``; its square is returned."""
+    squared = 0.0
+    for i in range(len(vector)):
+        total = vector[i]
+        for k in range(i):
+            total -= lower[i, k] * out[k]
+        out[i] = total / lower[i, i]
+        squared += out[i] * out[i]
+    return squared
+
+
+@numba.njit(cache=True)
+def _compress(nll: float, gradient: Array, information: Array, residual: Array, jacobian: Array) -> None:
+    d = len(gradient)
+    curvature = information.copy()
+    trace = 0.0
+    for i in range(d):
+        trace += curvature[i, i]
+    for i in range(d):
+        curvature[i, i] += RELATIVE_RIDGE * trace / d + RIDGE
+    lower = np.zeros((d, d))
+    _cholesky(curvature, lower)
+    squared = _whitened(lower, gradient, residual)
+    floor = max(2.0 * nll, LEAST)
+    if squared > floor:
+        raised = 1.0 / floor - 1.0 / squared
+        for i in range(d):
+            for j in range(d):
+                curvature[i, j] += raised * gradient[i] * gradient[j]
+        _cholesky(curvature, lower)
+        squared = _whitened(lower, gradient, residual)
+    residual[d] = math.sqrt(max(2.0 * nll - squared, 0.0))
+    for i in range(d):
+        for j in range(i + 1):
+            jacobian[j, i] = lower[i, j]
+
+
+def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
+    """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and ``information`` (d, d), which is
+    symmetric and positive semi-definite; see the module. All are finite whatever the rank of the information."""
+    d = len(gradient)
+    residual = np.empty(d + 1)
+    jacobian = np.zeros((d + 1, d))
+    _compress(
+        float(nll),
+        np.ascontiguousarray(gradient, dtype=float),
+        np.ascontiguousarray(information, dtype=float),
+        residual,
+        jacobian,
+    )
+    return residual, jacobian
