@@ -1,0 +1,6 @@
+"""Logs that are made, not recorded: worlds, drives through them, and what sensors would have reported."""
+
+from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, preset, read_settings
+from factorgraph_loc.simulation.simulate import simulate
+
+__all__ = ["PRESETS", "SimulationSettings", "preset", "read_settings", "simulate"]

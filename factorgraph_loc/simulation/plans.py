@@ -1,0 +1,111 @@
+"""Floor plans: walls, furniture and shelves as segments, and the surfaces that tags are put on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_loc.simulation.settings import WorldSettings
+from factors.se2 import Array
+
+Segment = tuple[float, float, float, float]
+ROOM_WIDTH = 5.0  # m, about
+CORRIDOR_WIDTH = 2.0
+DOOR_WIDTH = 1.0
+SHELF_DEPTH = 1.0
+AISLE_WIDTH = 3.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Outline and inner walls, and ``boxes`` (furniture or shelves) by their corners (x1, y1, x2, y2), all in metres."""
+
+    width: float
+    depth: float
+    walls: tuple[Segment, ...]
+    boxes: tuple[Segment, ...]
+
+    def segments(self) -> Array:
+        """Everything that nobody drives or sees through: (S, 4)."""
+        return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
+
+    def faces(self) -> tuple[Array, Array]:
+        """The sides of walls and of boxes as segments (F, 4), the free side on the left of each. Inner walls have two."""
+        walls = [
+            face
+            for x1, y1, x2, y2 in self.walls
+            for face in ((x1, y1, x2, y2), (x2, y2, x1, y1))
+            if self._is_inside(face)
+        ]
+        boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
+        return np.array(walls).reshape(-1, 4), np.array(boxes).reshape(-1, 4)
+
+    def _is_inside(self, face: Segment) -> bool:
+        """Whether the left side of a face is in the building."""
+        x1, y1, x2, y2 = face
+        length = math.hypot(x2 - x1, y2 - y1)
+        x, y = (x1 + x2) / 2.0 - 0.05 * (y2 - y1) / length, (y1 + y2) / 2.0 + 0.05 * (x2 - x1) / length
+        return 0.0 < x < self.width and 0.0 < y < self.depth
+
+
+def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
+    """The plan that ``settings`` names; doors and furniture are drawn."""
+    width, depth = settings.width, settings.depth
+    outline = tuple(_sides((0.0, 0.0, width, depth)))
+    if settings.plan == "corridor":
+        return Plan(width, depth, outline, ())
+    if settings.plan == "warehouse":
+        return Plan(width, depth, outline, _shelves(width, depth))
+    return _office(width, depth, outline, rng)
+
+
+def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
+    """Rooms on both sides of a corridor along x, each with a door to it and two pieces of furniture at its outer corners."""
+    rooms = max(1, round(width / ROOM_WIDTH))
+    low, high = (depth - CORRIDOR_WIDTH) / 2.0, (depth + CORRIDOR_WIDTH) / 2.0
+    edges = np.linspace(0.0, width, rooms + 1)
+    walls: list[Segment] = list(outline)
+    boxes: list[Segment] = []
+    for inner, outer in ((low, 0.0), (high, depth)):
+        for left, right in pairwise(edges.tolist()):
+            door = float(rng.uniform(left + 0.6, right - 0.6 - DOOR_WIDTH))
+            walls += [(left, inner, door, inner), (door + DOOR_WIDTH, inner, right, inner)]
+            boxes += _furniture((left, right), inner, outer, rng)
+        walls += [(float(x), inner, float(x), outer) for x in edges[1:-1]]
+    return Plan(width, depth, tuple(walls), tuple(boxes))
+
+
+def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:
+    """A cupboard in each outer corner of a room, where the room is large enough to drive past them."""
+    left, right = span
+    deep, wide = abs(inner - outer), right - left
+    if deep < 3.5 or wide < 4.0:
+        return []
+    out = []
+    for at_left in (True, False):
+        across, along = rng.uniform(0.4, 0.8), rng.uniform(0.8, 1.4)
+        x1, x2 = (left, left + across) if at_left else (right - across, right)
+        y1, y2 = (outer, outer + along) if outer < inner else (outer - along, outer)
+        out.append((float(x1), float(y1), float(x2), float(y2)))
+    return out
+
+
+def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
+    """Rows along x with aisles between them, broken in the middle where they are long."""
+    rows = max(1, math.floor((depth - AISLE_WIDTH) / (SHELF_DEPTH + AISLE_WIDTH)))
+    pitch = (depth - rows * SHELF_DEPTH) / (rows + 1)
+    margin = min(AISLE_WIDTH, width / 4.0)
+    spans = [(margin, width - margin)]
+    if width > 20.0:
+        spans = [(margin, (width - AISLE_WIDTH) / 2.0), ((width + AISLE_WIDTH) / 2.0, width - margin)]
+    bottoms = [pitch + i * (SHELF_DEPTH + pitch) for i in range(rows)]
+    return tuple((x1, y, x2, y + SHELF_DEPTH) for y in bottoms for x1, x2 in spans)
+
+
+def _sides(box: Segment) -> list[Segment]:
+    """The four sides of a box, its inside on the left."""
+    x1, y1, x2, y2 = box
+    return [(x1, y1, x2, y1), (x2, y1, x2, y2), (x2, y2, x1, y2), (x1, y2, x1, y1)]

@@ -1,0 +1,218 @@
+"""What is simulated: the world, the drive, the sensors and their faults; presets of them, and files that change a preset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.rig import Rig, placed, read_rig
+
+Metres = Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
+Seconds = Annotated[float, Field(ge=0.0, le=1e5, description="s")]
+Hertz = Annotated[float, Field(gt=0.0, le=100.0, description="1/s")]
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+Surface = Literal["wall", "shelf", "floor"]
+
+
+class WorldSettings(FileModel):
+    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there.
+
+    ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
+    ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
+    """
+
+    plan: Literal["office", "corridor", "warehouse"] = "office"
+    width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
+    depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
+    tags: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    density: Annotated[float, Field(gt=0.0, le=100.0, description="tags per m^2")] | None = None
+    surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
+    tag_height: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 1.2
+    even: bool = False
+    landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
+
+    @model_validator(mode="after")
+    def _has_one_number(self) -> WorldSettings:
+        if (self.tags is None) == (self.density is None):
+            raise ValueError("expected either tags or density")
+        return self
+
+    def tag_count(self) -> int:
+        if self.tags is not None:
+            return self.tags
+        return round((self.density or 0.0) * self.width * self.depth)
+
+
+class DriveSettings(FileModel):
+    """A drive between random places. ``rate``: of the reference. ``clearance``: from walls, for the path's points."""
+
+    duration: Annotated[float, Field(ge=1.0, le=86_400.0, description="s")] = 600.0
+    speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
+    turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
+    rate: Annotated[float, Field(ge=10.0, le=50.0, description="1/s")] = 10.0
+    clearance: Annotated[float, Field(ge=0.15, le=2.0, description="m")] = 0.3
+
+
+class SightingSettings(FileModel):
+    """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
+    axis, and not through walls."""
+
+    rate: Hertz = 2.0
+    max_range: Metres = 6.0
+    field_of_view: Annotated[float, Field(gt=0.0, le=6.3, description="rad")] = 6.3
+
+
+class Fading(FileModel):
+    """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
+
+    duration: Annotated[float, Field(gt=0.0, le=1000.0, description="s")] = 2.0
+    share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+
+
+class AntennaStop(FileModel):
+    """From ``time`` on an antenna reads nothing. Its rounds end too, unless ``rounds_go_on``, as with a broken cable."""
+
+    antenna: str
+    time: Seconds
+    rounds_go_on: bool = False
+
+
+class ClockJump(FileModel):
+    """From ``time`` on the stamps of the reader are ``jump`` seconds later than they should be."""
+
+    time: Seconds
+    jump: Annotated[float, Field(ge=-60.0, le=60.0, description="s")]
+
+
+class Silence(FileModel):
+    """For ``duration`` seconds no tag is read."""
+
+    time: Seconds
+    duration: Seconds
+
+
+class FaultSettings(FileModel):
+    """What goes wrong with RFID. ``false_reads``: share of the reads that are of a tag and in a round drawn at random, beside those
+    of the model's floor. ``dead``: share of tags that are never read. ``misplaced``: share of tags that are ``misplaced_by``
+    metres off in the map."""
+
+    fading: Fading = Fading()
+    false_reads: Share = 0.0
+    dead: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    misplaced: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    misplaced_by: Metres = 1.0
+    antenna_stop: AntennaStop | None = None
+    clock_jump: ClockJump | None = None
+    silence: Silence | None = None
+
+
+class SimulationSettings(FileModel):
+    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: what estimators are told, and
+    what reads and sightings are drawn from."""
+
+    name: str = "office"
+    world: WorldSettings
+    drive: DriveSettings = DriveSettings()
+    rounds_per_second: Hertz = 2.0
+    sightings: SightingSettings = SightingSettings()
+    faults: FaultSettings = FaultSettings()
+    rig: Rig
+
+    @model_validator(mode="after")
+    def _fits(self) -> SimulationSettings:
+        if self.rig.rfid is None:
+            raise ValueError("the rig has no rfid, expected antennas")
+        if self.world.landmarks and self.rig.bearing_range is None:
+            raise ValueError("the world has landmarks, expected a rig with bearing_range")
+        stop = self.faults.antenna_stop
+        names = list(self.rig.rfid.all_antennas())
+        if stop is not None and stop.antenna not in names:
+            raise ValueError(f"antenna {stop.antenna!r} stops, expected one of {', '.join(names)}")
+        return self
+
+
+# eight antennas at the tags' height; the odometry's noise is that of wheel_odometry
+RACKHAM_RIG: Mapping[str, Any] = {
+    "name": "rackham",
+    "sensors": ["odometry", "rfid"],
+    "odometry": {
+        "noise": {
+            "along": {"per_distance": 0.01},
+            "lateral": {"per_distance": 0.005},
+            "heading": {"per_distance": 0.02618},
+        },
+        "uncertainty": {"scale_distance": 0.02, "scale_rotation": 0.02, "heading_drift": 0.01745},
+    },
+    "rfid": {
+        "preset": "rackham",
+        "preset_z": 1.2,
+        "models": {"default": {"kind": "beam", "p0": 0.9, "r_max": 4.5, "s_r": 0.3, "sigma_phi": 0.698}},
+        "false_read": 1e-3,
+        "tempering": 1.0,
+    },
+    "bearing_range": {"range_sigma": 0.05, "range_sigma_relative": 0.02, "bearing_sigma": 0.02},
+}
+_OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
+# A fade of mean 2 s that takes a share of 0.2 makes the count of reads in many rounds vary 2.4 times as much as independent
+# rounds would, where 0.7 of the rounds outside fades read the tag (1.7 times at 0.5, 3.8 times at 0.9): hence the tempering.
+_BURSTY: Mapping[str, Any] = {
+    "faults": {"fading": {"duration": 2.0, "share": 0.2}},
+    "rig": {"rfid": {"miss": 0.2, "tempering": 0.4}},
+}
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``changes``, tables within tables merged alike."""
+    out = dict(base)
+    for key, value in changes.items():
+        old = out.get(key)
+        out[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    # a number of tags takes the place of a density, and the reverse
+    for key, other in (("tags", "density"), ("density", "tags")):
+        if key in changes and other in out and other not in changes:
+            del out[other]
+    return out
+
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "office": _OFFICE,
+    "sparse": merged(_OFFICE, {"world": {"tags": 15}}),
+    "bursty": merged(_OFFICE, _BURSTY),
+    "corridor": merged(
+        _OFFICE,
+        {"world": {"plan": "corridor", "width": 40.0, "depth": 3.0, "tags": 20, "surfaces": ["wall"], "even": True}},
+    ),
+    "warehouse": {
+        "world": {"plan": "warehouse", "width": 30.0, "depth": 20.0, "density": 0.04, "surfaces": ["shelf"]},
+        "rig": RACKHAM_RIG,
+    },
+}
+
+
+def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
+    """The settings of a preset, with ``changes`` as nested tables. InputError names a wrong preset, key or value."""
+    return parse_model(SimulationSettings, _of_preset(name, changes or {}, "the settings"), "the settings")
+
+
+def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
+    """The settings of a TOML file: ``preset`` (default office), and what differs from it. ``rig`` may be the name of a file below
+    the folder. InputError names file, key and what is expected."""
+    content = merged(read_toml(path), changes or {})
+    base = content.pop("preset", "office")
+    rig = content.get("rig")
+    if isinstance(rig, str):
+        content["rig"] = read_rig(inside(path.parent, rig, path))
+    content.setdefault("name", path.stem)
+    settings = parse_model(SimulationSettings, _of_preset(base, content, path), path)
+    return settings.model_copy(update={"rig": placed(settings.rig, path.parent)})
+
+
+def _of_preset(name: Any, changes: Mapping[str, Any], source: object) -> dict[str, Any]:
+    if not isinstance(name, str) or name not in PRESETS:
+        raise InputError(f"{source}: preset is {name!r}{nearest(str(name), list(PRESETS))}")
+    return merged({"name": name, **PRESETS[name]}, changes)

@@ -1,0 +1,95 @@
+"""A simulated log: world, drive, and what the sensors report, all of one seed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from factorgraph_loc import __version__
+from factorgraph_loc.log import Log, StartPose, Stream
+from factorgraph_loc.readers.simulated_odometry import wheel_odometry
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
+from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
+from factorgraph_loc.simulation.sightings import sighting_stream
+from factorgraph_loc.simulation.trajectories import drive
+from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import se2
+from factors.se2 import Array
+
+START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad
+
+
+def simulate(settings: SimulationSettings, seed: int) -> Log:
+    """The log of ``settings`` and ``seed``; the same both, the same log, to the last bit.
+
+    Streams: odometry, rfid, and bearing_range where the world has landmarks. The reference is the true trajectory. The stated
+    start is the true pose with an error drawn from the deviations that it states (:data:`START_SIGMAS`), as consistency needs
+    it. World, drive and each sensor draw from generators of their own, so that to change one leaves the others as they are.
+    InputError if the settings leave no room for tags or for the robot.
+    """
+    rngs = np.random.default_rng(seed).spawn(7)
+    world = make_world(settings.world, rngs[0])
+    truth = drive(world, settings.drive, rngs[1])
+    streams: dict[str, Stream] = {
+        "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
+        "rfid": _reads(settings, world, truth, rngs[3]),
+    }
+    if world.landmarks and settings.rig.bearing_range is not None:
+        times = _ticks(settings.sightings.rate, truth)
+        model = settings.rig.bearing_range.model()
+        streams["bearing_range"] = sighting_stream(model, world, times, truth.at(times), settings.sightings, rngs[4])
+    surveyed, misplaced = _surveyed(world, settings.faults, rngs[5])
+    error = START_SIGMAS * rngs[6].standard_normal(3)
+    metadata = {"origin": f"simulated by fgloc {__version__}", "preset": settings.name, "seed": str(seed)}
+    if misplaced:
+        metadata["misplaced"] = ", ".join(misplaced)
+    start = truth.poses[0] + error
+    start[2] = se2.wrap_scalar(start[2])
+    return Log(
+        name=f"{settings.name}-{seed}",
+        rig=_rig(settings.rig, streams),
+        world=surveyed,
+        streams=streams,
+        reference=truth,
+        start=StartPose(0.0, start, START_SIGMAS.copy()),
+        metadata=metadata,
+    )
+
+
+def _reads(settings: SimulationSettings, world: World, truth: Trajectory, rng: np.random.Generator) -> Stream:
+    rfid = settings.rig.rfid
+    assert rfid is not None, "the settings have been checked"
+    tags = tag_map(world, settings.rig.survey)
+    times = _ticks(settings.rounds_per_second, truth)
+    probabilities = read_probabilities(rfid, tags.tags, truth.at(times))
+    hits = draw_reads(rfid, probabilities, times, settings.faults, rng)
+    return rfid_stream(list(rfid.all_antennas()), list(tags.names), times, hits, settings.faults)
+
+
+def _ticks(rate: float, truth: Trajectory) -> Array:
+    """Times (N,) of a sensor, the first after one period."""
+    count = int(float(truth.t[-1]) * rate + 1e-9)
+    return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
+
+
+def _surveyed(world: World, faults: FaultSettings, rng: np.random.Generator) -> tuple[World, list[str]]:
+    """The map that estimators are given, and the tags that are misplaced in it."""
+    names = list(world.tags)
+    chosen = rng.permutation(len(names))[: round(faults.misplaced * len(names))]
+    tags = dict(world.tags)
+    for i in sorted(chosen.tolist()):
+        tag, direction = tags[names[i]], rng.uniform(-math.pi, math.pi)
+        x, y = tag.x + faults.misplaced_by * math.cos(direction), tag.y + faults.misplaced_by * math.sin(direction)
+        tags[names[i]] = tag.model_copy(update={"x": x, "y": y})
+    return world.model_copy(update={"tags": tags}), [names[i] for i in sorted(chosen.tolist())]
+
+
+def _rig(rig: Rig, streams: dict[str, Stream]) -> Rig:
+    """The rig, whose estimators use by default what the log has."""
+    sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
+    return rig.model_copy(update={"sensors": sensors})

@@ -1,0 +1,77 @@
+"""Worlds with tags and landmarks: what is put where on a floor plan."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.simulation.plans import make_plan
+from factorgraph_loc.simulation.settings import WorldSettings
+from factorgraph_loc.world import Landmark, Tag, World
+from factors.se2 import Array
+
+STANDOFF = 0.02  # m, of a tag from the surface that it is on
+CANDIDATES = 10  # places that each tag is chosen from, for the farthest from the others
+
+
+def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
+    """A world with walls (those of furniture and shelves too), tags ``T000``... and landmarks ``L000``....
+
+    Tags on surfaces face away from them; those on the floor lie at height 0 and face nowhere. InputError if the plan lacks the
+    surfaces.
+    """
+    plan = make_plan(settings, rng)
+    tags: dict[str, Tag] = {}
+    walls, boxes = plan.faces()
+    count = settings.tag_count()
+    upright = [faces for name, faces in (("wall", walls), ("shelf", boxes)) if name in settings.surfaces]
+    faces = np.concatenate(upright) if upright else np.empty((0, 4))
+    if settings.surfaces == ("shelf",) and not len(faces):
+        raise InputError(f"world: plan {settings.plan} has no shelves of this size, expected other surfaces")
+    on_floor = 0
+    if "floor" in settings.surfaces:
+        on_floor = round(count / len(settings.surfaces)) if len(faces) else count
+    places = _even(settings, count - on_floor) if settings.even else _spread(faces, count - on_floor, rng)
+    for x, y, facing in places.tolist():
+        tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height, facing=facing)
+    for x, y in rng.uniform((0.2, 0.2), (plan.width - 0.2, plan.depth - 0.2), (on_floor, 2)).round(3).tolist():
+        tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=0.0)
+    landmarks = _spread(walls, settings.landmarks, rng)[:, :2].tolist()
+    return World(
+        name=settings.plan,
+        tags=tags,
+        landmarks={f"L{i:03d}": Landmark(x=x, y=y) for i, (x, y) in enumerate(landmarks)},
+        walls=tuple((a, b, c, d) for a, b, c, d in plan.segments().round(3).tolist()),
+    )
+
+
+def _spread(faces: Array, count: int, rng: np.random.Generator) -> Array:
+    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), each the farthest from those before among
+    :data:`CANDIDATES` drawn with equal probability per metre (Mitchell, SIGGRAPH 1991)."""
+    out = np.empty((count, 3))
+    length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    for i in range(count):
+        chosen = rng.choice(len(faces), CANDIDATES, p=length / length.sum())
+        candidates = _places(faces[chosen], rng.uniform(0.05, 0.95, CANDIDATES))
+        gaps = np.hypot(*(candidates[:, None, :2] - out[None, :i, :2]).transpose(2, 0, 1))
+        out[i] = candidates[gaps.min(axis=1).argmax() if i else 0]
+    return out.round(3)
+
+
+def _even(settings: WorldSettings, count: int) -> Array:
+    """``count`` places along the two long walls of the outline, mirrored and turned into each other."""
+    below, above = (count + 1) // 2, count // 2
+    width, depth = settings.width, settings.depth
+    rows = (((0.0, 0.0, width, 0.0), below), ((width, depth, 0.0, depth), above))
+    return np.concatenate([_places(np.tile(face, (n, 1)), (np.arange(n) + 0.5) / max(n, 1)) for face, n in rows]).round(
+        3
+    )
+
+
+def _places(faces: Array, along: Array) -> Array:
+    """Places (N, 3) at shares ``along`` (N,) of faces (N, 4): x, y, and the direction to their left."""
+    dx, dy = faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1]
+    facing = np.arctan2(dx, -dy)
+    x = faces[:, 0] + along * dx + STANDOFF * np.cos(facing)
+    y = faces[:, 1] + along * dy + STANDOFF * np.sin(facing)
+    return np.column_stack((x, y, facing))
