@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array
@@ -42,6 +43,14 @@ class Plan:
         ]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
         return np.array(walls).reshape(-1, 4), np.array(boxes).reshape(-1, 4)
+
+    def open(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 2) are in the building and in none of the boxes."""
+        x, y = points.T
+        out = (x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth)
+        for x1, y1, x2, y2 in self.boxes:
+            out &= (x < x1) | (x > x2) | (y < y1) | (y > y2)
+        return np.asarray(out)
 
     def _is_inside(self, face: Segment) -> bool:
         """Whether the left side of a face is in the building."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.simulation.plans import make_plan
+from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.settings import WorldSettings
 from factorgraph_loc.world import Landmark, Tag, World
 from factors.se2 import Array
 
 STANDOFF = 0.02  # m, of a tag from the surface that it is on
+IN_FRONT = 0.3  # m of a tag there is nothing
 CANDIDATES = 10  # places that each tag is chosen from, for the farthest from the others
 
 
@@ -31,12 +32,12 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     on_floor = 0
     if "floor" in settings.surfaces:
         on_floor = round(count / len(settings.surfaces)) if len(faces) else count
-    places = _even(settings, count - on_floor) if settings.even else _spread(faces, count - on_floor, rng)
+    places = _even(settings, count - on_floor) if settings.even else _spread(plan, faces, count - on_floor, rng)
     for x, y, facing in places.tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height, facing=facing)
     for x, y in rng.uniform((0.2, 0.2), (plan.width - 0.2, plan.depth - 0.2), (on_floor, 2)).round(3).tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=0.0)
-    landmarks = _spread(walls, settings.landmarks, rng)[:, :2].tolist()
+    landmarks = _spread(plan, walls, settings.landmarks, rng)[:, :2].tolist()
     return World(
         name=settings.plan,
         tags=tags,
@@ -45,16 +46,18 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     )
 
 
-def _spread(faces: Array, count: int, rng: np.random.Generator) -> Array:
+def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
     """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), each the farthest from those before among
-    :data:`CANDIDATES` drawn with equal probability per metre (Mitchell, SIGGRAPH 1991)."""
+    :data:`CANDIDATES` drawn with equal probability per metre (Mitchell, SIGGRAPH 1991); none behind a piece of furniture."""
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
     for i in range(count):
         chosen = rng.choice(len(faces), CANDIDATES, p=length / length.sum())
         candidates = _places(faces[chosen], rng.uniform(0.05, 0.95, CANDIDATES))
-        gaps = np.hypot(*(candidates[:, None, :2] - out[None, :i, :2]).transpose(2, 0, 1))
-        out[i] = candidates[gaps.min(axis=1).argmax() if i else 0]
+        x, y, facing = candidates.T
+        in_front = np.column_stack((x + IN_FRONT * np.cos(facing), y + IN_FRONT * np.sin(facing)))
+        gaps = np.hypot(*(candidates[:, None, :2] - out[None, :i, :2]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        out[i] = candidates[np.where(plan.open(in_front), gaps, -1.0).argmax()]
     return out.round(3)
 
 
