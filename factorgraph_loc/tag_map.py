@@ -11,6 +11,7 @@ from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.world import World
 from factors import se2
 from factors.rfid_likelihood import TagArray
+from factors.se2 import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,3 +32,17 @@ def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None 
     points[:, :2] = se2.transform_from(transform, points[:, :2])
     tags = TagArray(points, facing + transform[2])
     return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)})
+
+
+MARGIN = 1.0  # m, how far beyond walls and tags the robot may be
+MARGIN_OF_TAGS = 3.0  # where there are no walls
+
+
+def extent(world: World, tags: TagArray) -> Array:
+    """Where a robot may be that hears these tags: lower and upper corner (2, 2) [m], by the walls or else by the tags."""
+    ends = np.array(world.walls).reshape(-1, 2)
+    margin = MARGIN if len(ends) else MARGIN_OF_TAGS
+    points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends
+    if not len(points):
+        return np.zeros((2, 2))
+    return np.array((points.min(axis=0) - margin, points.max(axis=0) + margin))

@@ -106,7 +106,7 @@ class GridModel:
 
     @property
     def uses_facing(self) -> bool:
-        return self.logits.shape[1] > 1
+        return int(self.logits.shape[1]) > 1
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         step = self.heights[1] - self.heights[0] if len(self.heights) > 1 else 1.0

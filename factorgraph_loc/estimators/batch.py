@@ -72,6 +72,9 @@ class Batch(RelocatingGraph):
         self._pose, self._covariance = addition.values[keyframe.key], spread
         self._guesses |= addition.values
 
+    def _refine(self, newest: Keyframe, guess: Guess) -> None:
+        self._guesses[newest.key] = guess[0]
+
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         self._guesses |= addition.values
         if guess is not None:

@@ -36,7 +36,7 @@ class GraphSettings(FileModel):
 
 @dataclass
 class Keyframe:
-    """A pose variable of the graph: its time, the odometry there, and the sightings that hang on it."""
+    """A pose variable of the graph: its time, the odometry there, and the sightings and scans that hang on it."""
 
     index: int
     t: float

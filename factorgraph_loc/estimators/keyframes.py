@@ -3,6 +3,9 @@
 A keyframe stands at each stamp of landmarks, unless the one before is nearer than ``keyframe_interval``, and at least every
 ``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one, displaced
 by the odometry since.
+
+Scans of RFID antennas come many a second and each tells little. Those from one keyframe to the next, half a second or more apart, make
+one factor, which enters the graph with the next keyframe; until then the newest pose is updated by them alone, as a filter would.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_loc.estimators import landmarks, tags
 from factorgraph_loc.estimators.base import (
     Belief,
     Diagnostics,
@@ -24,13 +28,14 @@ from factorgraph_loc.estimators.base import (
     gaussian_belief,
 )
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt, between_keyframes
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update, together
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.tags import KnownTags, TagUpdate
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
-from factorgraph_loc.measurements import BearingRange, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
@@ -38,10 +43,13 @@ from factors.bearing_range import TIME_OFFSET
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
+from factors.rfid_factor import ROWS, RfidFactor
+from factors.rfid_likelihood import Looks, together
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
 KEYFRAME_INTERVAL, MAPPING_KEYFRAME_INTERVAL = 0.09, 0.5  # s
+SCAN_KEYFRAME_INTERVAL = 0.45  # s between keyframes that stand there for scans
 
 
 class GraphEstimator(ABC):
@@ -59,6 +67,8 @@ class GraphEstimator(ABC):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
+        self._tags = KnownTags(setup, self.diagnostics)
+        self._pending: list[Looks] = []  # from the newest keyframe
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         # all variables but the poses: estimate and covariance
@@ -86,18 +96,12 @@ class GraphEstimator(ABC):
         """Take one measurement, in time or late by at most ``max_delay``."""
         if isinstance(measurement, Odometry):
             self._motion.add(measurement)
-        elif isinstance(measurement, RfidScan):
-            self.diagnostics.ignore("rfid", len(measurement.antennas))
         elif self._prior is None:
             self.diagnostics.ignore("before the start")
         elif measurement.t < max(self._t - self._graph_settings.max_delay, self._prior.t):
-            if isinstance(measurement, BearingRange):
-                self.diagnostics.drop_late("bearing_range", len(measurement.landmarks))
-        elif isinstance(measurement, Tick):
-            self._pass_time(measurement.t)
+            self._drop_late(measurement)
         else:
-            self._t = max(self._t, measurement.t)
-            self._see(measurement)
+            self._take(measurement)
 
     def estimate(self) -> PoseEstimate:
         """The newest keyframe, moved along the odometry since."""
@@ -134,7 +138,25 @@ class GraphEstimator(ABC):
         """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
         if self._prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+        if waiting := self._gather():
+            self._attach(self._keyframes[-1], Addition(waiting), None)
         return self._between(*self._final())
+
+    def _take(self, m: Exteroceptive | Tick) -> None:
+        if isinstance(m, Tick):
+            self._pass_time(m.t)
+            return
+        self._t = max(self._t, m.t)
+        if isinstance(m, RfidScan):
+            self._scan(m)
+        else:
+            self._see(m)
+
+    def _drop_late(self, m: Exteroceptive | Tick) -> None:
+        if isinstance(m, BearingRange):
+            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
+        elif isinstance(m, RfidScan):
+            self.diagnostics.drop_late("rfid", len(m.antennas))
 
     @abstractmethod
     def _final(self) -> tuple[Array, Array]:
@@ -158,6 +180,14 @@ class GraphEstimator(ABC):
 
         ``guess``: pose and covariance of the newest keyframe after the update, where it is that.
         """
+
+    @abstractmethod
+    def _refine(self, newest: Keyframe, guess: Guess) -> None:
+        """Take over pose and covariance of the newest keyframe from scans that are not yet in the graph."""
+
+    @abstractmethod
+    def _scanned(self, t: float, looks: Looks, update: TagUpdate) -> None:
+        """Antennas listened at ``t``; ``update``: what that changed."""
 
     @abstractmethod
     def _observed(self, t: float, seen: BearingRangeFactor, guess: Guess) -> None:
@@ -184,10 +214,46 @@ class GraphEstimator(ABC):
             self.diagnostics.drop_late("bearing_range", len(m.landmarks))
             return
         offset = self._since(before, m.t) if m.t > before.t else None
-        addition = Addition()
+        addition = Addition(self._gather())
         guess = self._sight(before, m, offset, (self._pose, self._covariance) if before is newest else None, addition)
         if addition.nodes:
             self._attach(before, addition, guess)
+
+    def _scan(self, m: RfidScan) -> None:
+        looks = self._tags.looks(m)
+        if looks is None:
+            return
+        if m.t - self._keyframes[-1].t >= SCAN_KEYFRAME_INTERVAL:
+            self._add_keyframe(m.t, None)
+        keyframe, likelihood = self._keyframe_before(m.t), self._tags.likelihood
+        assert likelihood is not None
+        offset = self._since(keyframe, m.t).delta
+        placed = looks.moved(offset) if m.t > keyframe.t else looks
+        if keyframe is not self._keyframes[-1]:
+            if not self._is_open(keyframe.index):
+                self._drop_late(m)
+                return
+            node = Node((keyframe.key,), RfidFactor(likelihood, placed), ROWS)
+            keyframe.nodes.append(node)
+            self._attach(keyframe, Addition([*self._gather(), node]), None)
+            return
+        updated = tags.update(likelihood, placed, self._pose, self._covariance)
+        self.diagnostics.innovation("rfid", m.t, updated.nis, updated.dof)
+        self._pending.append(placed)
+        self._pose, self._covariance = updated.pose, updated.covariance
+        self._refine(keyframe, (updated.pose, updated.covariance))
+        self._scanned(m.t, looks, updated)
+
+    def _gather(self) -> list[Node]:
+        """The scans from the newest keyframe as a factor, which is in no graph yet."""
+        if not self._pending:
+            return []
+        likelihood = self._tags.likelihood
+        assert likelihood is not None
+        node = Node((self._keyframes[-1].key,), RfidFactor(likelihood, together(self._pending)), ROWS)
+        self._pending = []
+        self._keyframes[-1].nodes.append(node)
+        return [node]
 
     def _add_keyframe(self, t: float, m: BearingRange | None) -> None:
         newest = self._keyframes[-1]
@@ -196,7 +262,7 @@ class GraphEstimator(ABC):
         moved = self._recalibrated(increment)
         keyframe = Keyframe(newest.index + 1, t, odometry, increment)
         guess: Guess | None = (se2.compose(self._pose, moved.delta), propagate(self._covariance, moved))
-        addition = Addition()
+        addition = Addition(self._gather())
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
         if m is not None:
@@ -240,7 +306,7 @@ class GraphEstimator(ABC):
             if known is not None:
                 self._observed(m.t, known.fixed(constants, None), guess)
             if seen:
-                factor = together(seen)
+                factor = landmarks.together(seen)
                 update = robust_update(factor, *guess, ITERATIONS_OF_GUESS)
                 self._landmarks.report(m.t, factor, update)
                 guess = se2.compose(guess[0], se2.exp(update.delta)), update.covariance
@@ -310,8 +376,9 @@ class GraphEstimator(ABC):
         factors += [self._odometry_factor(k) for k in self._keyframes[1:]]
         for keyframe in self._keyframes:
             for node in keyframe.nodes:
-                assert isinstance(node.factor, BearingRangeFactor)
-                factors.append((node.factor.widened(width), node.keys))
+                assert node.factor is not None
+                factor = node.factor.widened(width) if isinstance(node.factor, BearingRangeFactor) else node.factor
+                factors.append((factor, node.keys))
         return Problem(factors)
 
     def _settle(self, problem: Problem, values: Values) -> Array:

@@ -46,6 +46,11 @@ class KnownLandmarks:
         self._estimated = estimated
         self._diagnostics = diagnostics
 
+    @property
+    def known(self) -> bool:
+        """Whether there is a sensor of landmarks, and a landmark in the map."""
+        return self._model is not None and bool(self._positions)
+
     def factor(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
     ) -> BearingRangeFactor | None:

@@ -3,6 +3,7 @@
 Before the start the last sightings are kept until they tell one place; then they are taken in from their first on. On the
 way, landmarks that are persistently not where they are expected make a suspicion, and a place that explains them much better
 a certainty: the graph goes back to where the suspicion began, and goes on at the new place after a step of unknown length.
+Where no landmarks are used, scans of RFID tags do the same.
 """
 
 from __future__ import annotations
@@ -21,11 +22,16 @@ from factorgraph_loc.estimators.keyframes import GraphEstimator
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
+from factorgraph_loc.estimators.scan_finder import ScanFinder
+from factorgraph_loc.estimators.scan_monitor import ScanMonitor
+from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.measurements import BearingRange, Measurement, Tick
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.tag_map import extent
 from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import ChainState, Increment
+from factors.rfid_likelihood import Looks
 from factors.se2 import Array
 
 # m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
@@ -42,22 +48,27 @@ class RelocatingGraph(GraphEstimator):
         # where landmarks are estimated too, they cannot tell the place
         self._relocates = self.supports_unknown_start = settings.landmarks == "known"
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
-        self._monitor = TrackMonitor()
+        self._finder = None
+        self._monitor: TrackMonitor | ScanMonitor = TrackMonitor()
+        if self._tags.likelihood is not None and not self._landmarks.known:
+            bounds = extent(setup.world, self._tags.map.tags)
+            self._finder = ScanFinder(self._tags.likelihood, self._motion, bounds, setup.rng)
+            self._monitor = ScanMonitor()
         # what is seen before the start is counted when it is taken in
         self._sought = KnownLandmarks(setup, Diagnostics())
         self._searched: ChainState | None = None
-        self._recent: deque[BearingRange | Tick] = deque()
+        self._recent: deque[Exteroceptive | Tick] = deque()
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
-        if not isinstance(measurement, BearingRange | Tick):
+        if isinstance(measurement, Odometry):
             super().process(measurement)
         elif self._prior is None:
             self._search(measurement)
         else:
             self._remember(measurement)
             super().process(measurement)
-            if isinstance(measurement, BearingRange) and self._monitor.suspicious_since is not None:
+            if not isinstance(measurement, Tick) and self._monitor.suspicious_since is not None:
                 self._doubt(self._monitor.suspicious_since)
 
     def estimate(self) -> PoseEstimate:
@@ -81,29 +92,29 @@ class RelocatingGraph(GraphEstimator):
         if self._searched is None:
             return []
         since = self._motion.relative(self._searched, self._motion.state(self._t))
+        found = self._relocalizer.hypotheses if self._finder is None else self._finder.hypotheses
         return [
             Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
-            for h in self._relocalizer.hypotheses
+            for h in found
         ]
 
-    def _remember(self, m: BearingRange | Tick) -> None:
+    def _best(self) -> PosePrior | None:
+        """The place that was found, at the time of the last search."""
+        return self._relocalizer.best if self._finder is None else self._finder.best
+
+    def _remember(self, m: Exteroceptive | Tick) -> None:
         self._recent.append(m)
         while self._recent[0].t < m.t - DURATION:
             self._recent.popleft()
 
-    def _search(self, m: BearingRange | Tick) -> None:
-        """Before the start: see whether the sightings tell one place by now, and start there."""
+    def _search(self, m: Exteroceptive | Tick) -> None:
+        """Before the start: see whether what was seen tells one place by now, and start there."""
         self._t = max(self._t, m.t)
-        seen = self._sought.factor(m) if isinstance(m, BearingRange) else None
-        if seen is None and self._searched is None:
-            return  # the run begins with the first landmark
+        looked = not isinstance(m, Tick) and self._look(m)
+        if not looked and self._searched is None:
+            return  # the run begins with the first landmark or scan
         self._remember(m)
-        if seen is None:
-            return
-        self._searched = self._motion.state(m.t)
-        self._relocalizer.add(self._searched, seen)
-        self._relocalizer.search()
-        if self._relocalizer.best is None:
+        if not looked or self._best() is None:
             return
         replay = sorted(self._recent, key=lambda m: m.t)
         self.diagnostics.events.append((m.t, "localized"))
@@ -111,17 +122,40 @@ class RelocatingGraph(GraphEstimator):
         self.initialize(PosePrior(t, self._placed(t), UNKNOWN))
         self._replay(replay)
 
+    def _look(self, m: Exteroceptive) -> bool:
+        """Search with one more measurement; False if it tells nothing."""
+        state = self._motion.state(m.t)
+        if isinstance(m, RfidScan):
+            looks = self._tags.looks(m, count=False)
+            if looks is None or self._finder is None:
+                return False
+            self._finder.add(state, looks)
+        else:
+            seen = self._sought.factor(m)
+            if seen is None or self._finder is not None:
+                return False
+            self._relocalizer.add(state, seen)
+            self._relocalizer.search()
+        self._searched = state
+        return True
+
     def _doubt(self, since: float) -> None:
         """See whether another place explains what is seen since then, and go on there."""
-        newest = self._keyframes[-1]
-        if self._searched is not None and newest.t < self._searched.t + SEARCH_INTERVAL:
+        now = self._motion.state(self._t)
+        if self._finder is not None:
+            self._finder.seek(since)
+            refuted = self._finder.refutes(self._pose, self._covariance)
+        elif self._searched is not None and now.t < self._searched.t + SEARCH_INTERVAL:
             return
-        self._searched = newest.odometry
-        self._relocalizer.forget(since)
-        self._relocalizer.search()
-        if self._relocates and self._relocalizer.refutes(self._pose, self._covariance):
-            what = f"lost: landmarks were not where they were expected since {since:.1f} s; goes on at another place"
-            self.diagnostics.events.append((newest.t, what))
+        else:
+            self._relocalizer.forget(since)
+            self._relocalizer.search()
+            refuted = self._relocates and self._relocalizer.refutes(self._pose, self._covariance)
+        self._searched = now
+        if refuted:
+            what = "landmarks were not where" if self._finder is None else "tags were not read as"
+            event = f"lost: {what} they were expected since {since:.1f} s; goes on at another place"
+            self.diagnostics.events.append((now.t, event))
             self._go_on(since)
 
     def _go_on(self, since: float) -> None:
@@ -139,28 +173,36 @@ class RelocatingGraph(GraphEstimator):
         keyframe = Keyframe(index, t, self._motion.state(t), jump)
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
-        self._pose, self._covariance = pose, UNKNOWN
+        self._pose, self._covariance, self._pending = pose, UNKNOWN, []
         self._begin_again(keyframe)
         self._replay(replay)
 
     def _placed(self, t: float) -> Array:
         """Where the robot was at ``t``, from the place that was found and the odometry since."""
-        best = self._relocalizer.best
+        best = self._best()
         assert best is not None
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._recalibrated(moved).delta))
 
-    def _replay(self, measurements: list[BearingRange | Tick]) -> None:
+    def _replay(self, measurements: list[Exteroceptive | Tick]) -> None:
         self._monitor.clear()
+        if self._finder is not None:
+            self._finder.start()
         for m in measurements:
-            if isinstance(m, Tick):
-                self._pass_time(m.t)
-            else:
-                self._see(m)
+            self._take(m)
 
     def _observed(self, t: float, seen: BearingRangeFactor, guess: Guess) -> None:
         self._relocalizer.add(self._motion.state(t), seen)
-        self._monitor.add(t, seen, *guess)
+        if isinstance(self._monitor, TrackMonitor):
+            self._monitor.add(t, seen, *guess)
+
+    def _scanned(self, t: float, looks: Looks, update: TagUpdate) -> None:
+        if self._finder is None or not isinstance(self._monitor, ScanMonitor):
+            return
+        self._finder.add(self._motion.state(t), looks, update.evidence)
+        self._monitor.add(t, update.surprise, update.variance)
+        if self._monitor.suspicious_since is None:
+            self._finder.rest()
 
     @abstractmethod
     def _pose_of(self, keyframe: int) -> Array:

@@ -94,6 +94,9 @@ class Smoother(RelocatingGraph):
             return
         self._update(addition.nodes, addition.values)
 
+    def _refine(self, newest: Keyframe, guess: Guess) -> None:
+        self._filtered[newest.index] = guess
+
     def _is_open(self, keyframe: int) -> bool:
         return super()._is_open(keyframe) and keyframe >= len(self._left)
 

@@ -29,15 +29,19 @@ class KnownTags:
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
         self.likelihood = None if settings is None else RfidLikelihood(settings.model(), self.map.tags)
 
-    def looks(self, m: RfidScan) -> Looks | None:
-        """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time."""
+    def looks(self, m: RfidScan, *, count: bool = True) -> Looks | None:
+        """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time.
+
+        ``count`` off: what is ignored is not counted, as the scan will be looked at once more.
+        """
+        diagnostics = self._diagnostics if count else Diagnostics()
         if self.likelihood is None:
-            self._diagnostics.ignore("rfid", len(m.antennas))
+            diagnostics.ignore("rfid", len(m.antennas))
             return None
         antennas = [self._antennas.get(name, -1) for name in m.antennas]
         used = sorted(set(antennas) - {-1})
         if antennas.count(-1):
-            self._diagnostics.ignore("antenna that the rig lacks", antennas.count(-1))
+            diagnostics.ignore("antenna that the rig lacks", antennas.count(-1))
         if not used or not self.map.names:
             return None
         rows = {antenna: k for k, antenna in enumerate(used)}
@@ -52,7 +56,7 @@ class KnownTags:
             elif antennas[number] >= 0:
                 hits[rows[antennas[number]], place] += 1
         if unknown:
-            self._diagnostics.ignore("tag not in the map", unknown)
+            diagnostics.ignore("tag not in the map", unknown)
         return Looks(np.zeros((len(used), 3)), np.array(used, dtype=np.int64), rounds, hits)
 
 
@@ -60,8 +64,9 @@ class KnownTags:
 class TagUpdate:
     """A pose (3,) with body-frame covariance (3, 3) after looks at tags.
 
-    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``surprise`` and ``variance``: how much larger the
-    negative log-likelihood was there than expected, and the variance of that.
+    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``surprise`` and ``variance``: how much larger
+    the negative log-likelihood was there than expected, and the variance of that; ``evidence``: log-probability of the looks,
+    by Laplace's method.
     """
 
     pose: Array
@@ -70,6 +75,7 @@ class TagUpdate:
     dof: int
     surprise: float
     variance: float
+    evidence: float
 
 
 def update(likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = 4) -> TagUpdate:
@@ -81,7 +87,8 @@ def update(likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Ar
     sigmas = np.sqrt(np.diag(covariance))
     score = likelihood.score(pose, looks)
     gradient, information = score.gradient[0], score.information[0]
-    spread = information + information @ covariance @ information
+    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
+    spread = likelihood.model.tempering * information + information @ covariance @ information
     nis = float(gradient @ np.linalg.solve(spread + NOTHING_TOLD * np.eye(3), gradient))
     dof = int(np.linalg.matrix_rank(information, tol=1e-6)) if nis > 0.0 else 0
     surprise, variance = float(score.nll[0] - score.expected[0]), float(score.variance[0])
@@ -105,4 +112,6 @@ def update(likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Ar
             break
         best, cost, moved = tried, tried_cost, error
         gradient, information = score.gradient[0], score.information[0]
-    return TagUpdate(best, np.linalg.inv(prior_information + information), nis, dof, surprise, variance)
+    posterior = np.linalg.inv(prior_information + information)
+    evidence = 0.5 * float(np.linalg.slogdet(posterior @ prior_information)[1]) - cost
+    return TagUpdate(best, posterior, nis, dof, surprise, variance, evidence)

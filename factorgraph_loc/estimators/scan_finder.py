@@ -1,0 +1,81 @@
+"""Where the robot is from scans of RFID tags, for graphs: the hypotheses of a :class:`Seeker`, beside the track's own evidence.
+
+Before the start every scan goes to a seeker. On the way scans are kept; when the track comes under suspicion a seeker takes those
+since then, and refutes the track if "somewhere else" has become so much likelier than it, by what both predict of the scans.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Mode, PosePrior
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.seeker import Seeker
+from factors import se2
+from factors.odometry import ChainState
+from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.se2 import Array
+
+DURATION = 60.0  # s of scans that are kept
+REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
+APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
+
+
+class ScanFinder:
+    """Hypotheses from scans; see the module. ``bounds`` (2, 2): corners [m] of where the robot may be."""
+
+    def __init__(self, likelihood: RfidLikelihood, motion: Motion, bounds: Array, rng: np.random.Generator) -> None:
+        self._likelihood, self._motion, self._bounds, self._rng = likelihood, motion, bounds, rng
+        self._scans: deque[tuple[ChainState, Looks, float]] = deque()
+        self._seeker: Seeker | None = self._new_seeker()
+        self._since = -np.inf
+
+    @property
+    def hypotheses(self) -> tuple[Mode, ...]:
+        """The places where the robot may be, the likeliest first."""
+        return self._seeker.hypotheses if self._seeker is not None else ()
+
+    @property
+    def best(self) -> PosePrior | None:
+        """The pose at the last scan if one hypothesis is clear, else None."""
+        return self._seeker.best if self._seeker is not None else None
+
+    def add(self, odometry: ChainState, looks: Looks, evidence: float = 0.0) -> None:
+        """Take a scan; ``evidence``: log-probability of it under the track, where there is one."""
+        self._scans.append((odometry, looks, evidence))
+        while self._scans[0][0].t < odometry.t - DURATION:
+            self._scans.popleft()
+        if self._seeker is not None:
+            self._seeker.add(odometry, looks)
+
+    def seek(self, since: float) -> None:
+        """Look for another place from the scans since then, if that has not begun."""
+        if self._seeker is None:
+            self._seeker, self._since = self._new_seeker(), since
+            for odometry, looks, _ in self._scans:
+                if odometry.t >= since:
+                    self._seeker.add(odometry, looks)
+
+    def start(self) -> None:
+        """A track begins at the best hypothesis, with the scans again that led to it."""
+        self._scans.clear()
+        self.rest()
+
+    def rest(self) -> None:
+        """The track is trusted."""
+        self._seeker = None
+
+    def refutes(self, pose: Array, covariance: Array) -> bool:
+        """Whether there is another place than ``pose`` (3,), body-frame ``covariance`` (3, 3), that explains the scans much better."""
+        if self._seeker is None or (best := self._seeker.best) is None:
+            return False
+        track = sum(evidence for odometry, _, evidence in self._scans if odometry.t >= self._since)
+        error = se2.log(se2.between(pose, best.pose))
+        spread = covariance + se2.world_to_body(best.pose, best.covariance)
+        apart = float(error @ np.linalg.solve(spread, error)) > APART
+        return apart and self._seeker.log_evidence - track > REFUTING
+
+    def _new_seeker(self) -> Seeker:
+        return Seeker(self._likelihood, self._motion, self._bounds, self._rng)
