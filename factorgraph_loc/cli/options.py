@@ -69,7 +69,7 @@ class LogOptions:
         """The logs of several names; a name may stand for several logs."""
         from factorgraph_loc.readers import load
 
-        options = dict(_key_and_value(text, "--reader-option") for text in self.reader_option or ())
+        options = dict(key_and_value(text, "--reader-option") for text in self.reader_option or ())
         return [
             log
             for name in names
@@ -109,7 +109,7 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
 
     settings: dict[str, dict[str, Any]] = {name: {} for name in estimators}
     for text in texts:
-        name, value = _key_and_value(text, "--set")
+        name, value = key_and_value(text, "--set")
         estimator, *keys = name.split(".")
         if not keys or not all(keys):
             raise InputError(f"--set is {text!r}, expected NAME.key=value, such as smoother.lag=10")
@@ -125,7 +125,7 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
     return settings
 
 
-def _key_and_value(text: str, option: str) -> tuple[str, Any]:
+def key_and_value(text: str, option: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip():
         raise InputError(f"{option} is {text!r}, expected KEY=VALUE")

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array
 
@@ -64,7 +65,7 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
     """The plan that ``settings`` names; doors and furniture are drawn."""
     width, depth = settings.width, settings.depth
     outline = tuple(_sides((0.0, 0.0, width, depth)))
-    if settings.plan == "corridor":
+    if settings.plan == "hall":
         return Plan(width, depth, outline, ())
     if settings.plan == "warehouse":
         return Plan(width, depth, outline, _shelves(width, depth))
@@ -73,6 +74,8 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
 
 def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
     """Rooms on both sides of a corridor along x, each with a door to it and two pieces of furniture at its outer corners."""
+    if width < 4.0 or depth < 6.0:
+        raise InputError(f"world: an office of {width:g} x {depth:g} m has no rooms, expected at least 4 x 6 m")
     rooms = max(1, round(width / ROOM_WIDTH))
     low, high = (depth - CORRIDOR_WIDTH) / 2.0, (depth + CORRIDOR_WIDTH) / 2.0
     edges = np.linspace(0.0, width, rooms + 1)

@@ -20,13 +20,13 @@ Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there.
+    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there; ``hall``: one room with nothing in it.
 
     ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
     ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
     """
 
-    plan: Literal["office", "corridor", "warehouse"] = "office"
+    plan: Literal["office", "hall", "warehouse"] = "office"
     width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
     depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
     tags: Annotated[int, Field(ge=0, le=10_000)] | None = None
@@ -51,11 +51,11 @@ class WorldSettings(FileModel):
 class DriveSettings(FileModel):
     """A drive between random places. ``rate``: of the reference. ``clearance``: from walls, for the path's points."""
 
-    duration: Annotated[float, Field(ge=1.0, le=86_400.0, description="s")] = 600.0
+    duration: Annotated[float, Field(ge=1.0, le=14_400.0, description="s")] = 600.0
     speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
     turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
     rate: Annotated[float, Field(ge=10.0, le=50.0, description="1/s")] = 10.0
-    clearance: Annotated[float, Field(ge=0.15, le=2.0, description="m")] = 0.3
+    clearance: Annotated[float, Field(ge=0.25, le=2.0, description="m")] = 0.3
 
 
 class SightingSettings(FileModel):
@@ -185,7 +185,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "bursty": merged(_OFFICE, _BURSTY),
     "corridor": merged(
         _OFFICE,
-        {"world": {"plan": "corridor", "width": 40.0, "depth": 3.0, "tags": 20, "surfaces": ["wall"], "even": True}},
+        {"world": {"plan": "hall", "width": 40.0, "depth": 3.0, "tags": 20, "surfaces": ["wall"], "even": True}},
     ),
     "warehouse": {
         "world": {"plan": "warehouse", "width": 30.0, "depth": 20.0, "density": 0.04, "surfaces": ["shelf"]},

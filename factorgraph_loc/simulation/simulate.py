@@ -9,7 +9,9 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.log import Log, StartPose, Stream
 from factorgraph_loc.readers.simulated_odometry import wheel_odometry
+from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.recorded import RecordedLooks
 from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
 from factorgraph_loc.simulation.sightings import sighting_stream
@@ -21,53 +23,73 @@ from factorgraph_loc.world import World
 from factors import se2
 from factors.se2 import Array
 
+SPARSE = 20  # poses, of which one is enough to tell how well recorded looks match
 START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad
 
 
-def simulate(settings: SimulationSettings, seed: int) -> Log:
+def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | None = None) -> Log:
     """The log of ``settings`` and ``seed``; the same both, the same log, to the last bit.
 
     Streams: odometry, rfid, and bearing_range where the world has landmarks. The reference is the true trajectory. The stated
     start is the true pose with an error drawn from the deviations that it states (:data:`START_SIGMAS`), as consistency needs
     it. World, drive and each sensor draw from generators of their own, so that to change one leaves the others as they are.
+    With ``recorded`` the robot carries the antennas of those recordings, and reads what they read (:mod:`.recorded`).
     InputError if the settings leave no room for tags or for the robot.
     """
     rngs = np.random.default_rng(seed).spawn(7)
+    rig = settings.rig
+    if recorded is not None:
+        rig = rig.model_copy(update={"rfid": recorded.rfid, "survey": SurveySettings()})
     world = make_world(settings.world, rngs[0])
     truth = drive(world, settings.drive, rngs[1])
     streams: dict[str, Stream] = {
         "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
-        "rfid": _reads(settings, world, truth, rngs[3]),
+        "rfid": _reads(settings, rig, world, truth, recorded, rngs[3]),
     }
-    if world.landmarks and settings.rig.bearing_range is not None:
+    if world.landmarks and rig.bearing_range is not None:
         times = _ticks(settings.sightings.rate, truth)
-        model = settings.rig.bearing_range.model()
+        model = rig.bearing_range.model()
         streams["bearing_range"] = sighting_stream(model, world, times, truth.at(times), settings.sightings, rngs[4])
     surveyed, misplaced = _surveyed(world, settings.faults, rngs[5])
-    error = START_SIGMAS * rngs[6].standard_normal(3)
+    start = truth.poses[0] + START_SIGMAS * rngs[6].standard_normal(3)
+    start[2] = se2.wrap_scalar(start[2])
     metadata = {"origin": f"simulated by fgloc {__version__}", "preset": settings.name, "seed": str(seed)}
+    warnings = []
+    if recorded is not None:
+        metadata["reads"] = "outcomes of recorded rounds at like range, bearing, height and facing"
+        share = recorded.unmatched(tag_map(world, rig.survey).tags, truth.poses[::SPARSE])
+        if share > 0.1:
+            warnings.append(f"rfid: {share:.0%} of the looks in reach have no recorded one that is alike")
     if misplaced:
         metadata["misplaced"] = ", ".join(misplaced)
-    start = truth.poses[0] + error
-    start[2] = se2.wrap_scalar(start[2])
     return Log(
         name=f"{settings.name}-{seed}",
-        rig=_rig(settings.rig, streams),
+        rig=_with_sensors(rig, streams),
         world=surveyed,
         streams=streams,
         reference=truth,
         start=StartPose(0.0, start, START_SIGMAS.copy()),
+        warnings=tuple(warnings),
         metadata=metadata,
     )
 
 
-def _reads(settings: SimulationSettings, world: World, truth: Trajectory, rng: np.random.Generator) -> Stream:
-    rfid = settings.rig.rfid
+def _reads(
+    settings: SimulationSettings,
+    rig: Rig,
+    world: World,
+    truth: Trajectory,
+    recorded: RecordedLooks | None,
+    rng: np.random.Generator,
+) -> Stream:
+    rfid = rig.rfid
     assert rfid is not None, "the settings have been checked"
-    tags = tag_map(world, settings.rig.survey)
+    tags = tag_map(world, rig.survey)
     times = _ticks(settings.rounds_per_second, truth)
-    probabilities = read_probabilities(rfid, tags.tags, truth.at(times))
-    hits = draw_reads(rfid, probabilities, times, settings.faults, rng)
+    poses = truth.at(times)
+    # recorded outcomes are probabilities of zero and one
+    p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rng)
+    hits = draw_reads(rfid, p, times, settings.faults, rng)
     return rfid_stream(list(rfid.all_antennas()), list(tags.names), times, hits, settings.faults)
 
 
@@ -89,7 +111,7 @@ def _surveyed(world: World, faults: FaultSettings, rng: np.random.Generator) -> 
     return world.model_copy(update={"tags": tags}), [names[i] for i in sorted(chosen.tolist())]
 
 
-def _rig(rig: Rig, streams: dict[str, Stream]) -> Rig:
+def _with_sensors(rig: Rig, streams: dict[str, Stream]) -> Rig:
     """The rig, whose estimators use by default what the log has."""
     sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
     return rig.model_copy(update={"sensors": sensors})

@@ -1,0 +1,89 @@
+"""``fgloc simulate``: logs that are made, not recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import DataRoot, LogOptions, key_and_value, parse_seeds
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.simulation import SimulationSettings
+
+
+def simulate(
+    what: Annotated[
+        str, typer.Argument(metavar="PRESET", help="office, sparse, bursty, corridor, warehouse, or a TOML file.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="To write; with --seeds, a folder of them.")
+    ],
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of everything that is drawn; the same seed gives the same bytes.")
+    ] = 0,
+    seeds: Annotated[
+        str | None, typer.Option(metavar="A:B", help="A log of each seed from A to B-1, in FOLDER/NAME-SEED.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Of the drive [s]; that of the presets is 600.")
+    ] = None,
+    tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A setting, e.g. faults.misplaced=0.1; may be repeated."),
+    ] = None,
+    recorded: Annotated[
+        str | None,
+        typer.Option(metavar="LOG", help="Draw each read from those of this recording, with its antennas (semi-real)."),
+    ] = None,
+    data_root: DataRoot = None,
+) -> None:
+    """Make logs with known truth: a world, a drive, and what odometry and RFID antennas report on it."""
+    chosen = [seed] if seeds is None else list(parse_seeds(seeds))
+    from factorgraph_loc.readers import write_native
+    from factorgraph_loc.simulation import recorded_looks
+    from factorgraph_loc.simulation import simulate as make
+
+    settings = _settings(what, _changes(duration, tags, set_ or []))
+    looks = None
+    if recorded is not None:
+        looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
+    folders = [out if seeds is None else out / f"{settings.name}-{number}" for number in chosen]
+    for number, folder in zip(chosen, folders, strict=True):
+        log = make(settings, number, looks)
+        for warning in log.warnings:
+            show.note(f"warning: {log.name}: {warning}")
+        try:
+            write_native(log, folder)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+        typer.echo(f"wrote {folder}")
+
+
+def _settings(what: str, changes: dict[str, Any]) -> SimulationSettings:
+    """Those of a preset, or of a file where the name looks like one."""
+    from factorgraph_loc.simulation import preset, read_settings
+
+    if what.endswith(".toml"):
+        return read_settings(Path(what), changes)
+    return preset(what, changes)
+
+
+def _changes(duration: float | None, tags: int | None, texts: list[str]) -> dict[str, Any]:
+    """The options as nested tables; the named ones go before ``--set``."""
+    changes: dict[str, Any] = {}
+    pairs = [key_and_value(text, "--set") for text in texts]
+    pairs += [(key, value) for key, value in (("drive.duration", duration), ("world.tags", tags)) if value is not None]
+    for name, value in pairs:
+        *tables, key = name.split(".")
+        inner = changes
+        for table in tables:
+            inner = inner.setdefault(table, {})
+            if not isinstance(inner, dict):
+                raise InputError(f"--set is {name}={value}, but {table} is set to {inner!r} already")
+        inner[key] = value
+    return changes
