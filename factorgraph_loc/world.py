@@ -1,16 +1,38 @@
-"""What is around the robot: landmarks with their positions, read from and written to ``NAME.world.toml``."""
+"""What is around the robot: landmarks and tags with their positions, read from and written to ``NAME.world.toml``.
+
+Many tags are better kept in a table beside it, ``NAME.tags.csv``.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 
-from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
+from factorgraph_loc.csv_cells import read_cells
+from factorgraph_loc.errors import bad_field
+from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
 from factors.se2 import Array
+
+TAG_COLUMNS = ("epc", "x", "y", "z", "facing")
+TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
+
+
+def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    xx, xy, yy = value
+    # of a singular matrix the determinant may round to a little below zero
+    if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + 1e-9):
+        raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
+    return value
+
+
+Covariance = Annotated[tuple[float, float, float], AfterValidator(_positive_semidefinite)]
 
 
 class Landmark(FileModel):
@@ -23,17 +45,7 @@ class Landmark(FileModel):
     x: float
     y: float
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
-    covariance: tuple[float, float, float] | None = None
-
-    @field_validator("covariance")
-    @classmethod
-    def _is_positive_semidefinite(cls, value: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if value is not None:
-            xx, xy, yy = value
-            # of a singular matrix the determinant may round to a little below zero
-            if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + 1e-9):
-                raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
-        return value
+    covariance: Covariance | None = None
 
     def spread(self) -> Array:
         """The covariance (2, 2) of the position [m^2]."""
@@ -55,7 +67,7 @@ class Tag(FileModel):
     z: float = 0.0
     facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")] | None = None
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
-    covariance: tuple[float, float, float] | None = None
+    covariance: Covariance | None = None
 
 
 class World(FileModel):
@@ -79,9 +91,50 @@ class World(FileModel):
 
 def read_world(path: Path) -> World:
     """Read ``NAME.world.toml``; InputError names file, key and what is expected."""
-    return parse_model(World, read_toml(path), path)
+    return parse_world(read_toml(path), path, path.parent)
+
+
+def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
+    """A map as it stands in a file ``source``; tables that it names lie below ``folder``. InputError as of :func:`read_world`."""
+    tags = content.get("tags")
+    if isinstance(tags, str):
+        content = {**content, "tags": read_tags(inside(folder, tags, source))}
+    return parse_model(World, content, source)
+
+
+def read_tags(path: Path) -> dict[str, Tag]:
+    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and, if they are known, sigma; a facing may be empty.
+
+    InputError names file, row and field of what is wrong. An EPC that stands there twice is an error: no estimator could tell which
+    of the two it hears, and only who surveyed them can.
+    """
+    cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
+    numbers = {name: cells.numbers(name) for name in shape[1:]}
+    tags: dict[str, Tag] = {}
+    rows: dict[str, int] = {}
+    for i, (row, epc) in enumerate(zip(cells.rows, cells.columns["epc"], strict=True)):
+        if not epc or epc in tags:
+            expected = f"another EPC than in row {rows[epc]}" if epc else "the EPC of a tag"
+            raise bad_field(path, "epc", epc, expected, row=row)
+        values = {name: float(column[i]) for name, column in numbers.items() if not math.isnan(column[i])}
+        tags[epc] = parse_model(Tag, values, f"{path}:{row}")
+        rows[epc] = row
+    return tags
 
 
 def write_world(world: World, path: Path) -> None:
-    """Write ``NAME.world.toml``."""
-    write_toml(path, world.model_dump(mode="json", exclude_none=True))
+    """Write ``NAME.world.toml``, and the tags beside it as ``NAME.tags.csv``; in the same file where one has a covariance."""
+    content = world.model_dump(mode="json", exclude_none=True)
+    if world.tags and all(tag.covariance is None for tag in world.tags.values()):
+        content["tags"] = f"{path.name.removesuffix('.toml').removesuffix('.world')}.tags.csv"
+        _write_tags(world.tags, path.parent / content["tags"])
+    write_toml(path, content)
+
+
+def _write_tags(tags: Mapping[str, Tag], path: Path) -> None:
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(TAG_COLUMNS_WITH_SIGMA)
+    # csv writes a float with all its digits, and None as an empty cell
+    rows.writerows((epc, tag.x, tag.y, tag.z, tag.facing, tag.sigma) for epc, tag in tags.items())
+    write_text(path, text.getvalue())

@@ -42,13 +42,8 @@ def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]
     return keep
 
 
-def sightings_in_order(
-    source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
-) -> Integers:
-    """Indices (M,) of the sightings to keep, in order of arrival: of one landmark at one stamp the last.
-
-    A row at most 0.5 s older than the newest before it is late and kept, an older one an InputError.
-    """
+def arrivals(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> None:
+    """Stamps (N,) in order of arrival: one at most 0.5 s older than the newest before it is late, an older one an InputError."""
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
     too_late = np.flatnonzero(late > MAX_LATE_NS)
@@ -58,6 +53,13 @@ def sightings_in_order(
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):
         warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
+
+
+def sightings_in_order(
+    source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
+) -> Integers:
+    """Indices (M,) of the sightings to keep, in order of arrival: of one landmark at one stamp the last."""
+    arrivals(source, rows, t_ns, warnings)
     last = {key: i for i, key in enumerate(zip(t_ns.tolist(), landmarks, strict=True))}
     if dropped := len(t_ns) - len(last):
         warnings.append(f"{source}: {dropped} rows see a landmark that a later row sees at the same stamp: left out")

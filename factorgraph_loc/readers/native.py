@@ -18,6 +18,7 @@ from factorgraph_loc.log import (
     BearingRangeStream,
     IncrementStream,
     Log,
+    RfidStream,
     StartPose,
     Stream,
     VelocityStream,
@@ -25,11 +26,13 @@ from factorgraph_loc.log import (
 )
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.manifests import StartSettings
+from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, read_rounds, tables_of
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
-from factorgraph_loc.rig import Rig, read_rig, write_rig
+from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.rig import Rig, placed, read_rig, write_rig
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows, write_tum
-from factorgraph_loc.world import World, read_world, write_world
+from factorgraph_loc.world import World, parse_world, read_world, write_world
 from factors.se2 import Array
 
 RUN_FILE = "run.toml"
@@ -40,7 +43,10 @@ SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
     "odometry": (VELOCITIES, INCREMENTS),
     "imu": (("t_ns", "w"),),
     "bearing_range": (("t_ns", "landmark", "range", "bearing"),),
+    "rfid": (READS,),
+    "inventories": (INVENTORIES,),  # of the sensor rfid too
 }
+ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 SUFFIXES = (".csv", ".parquet")
 
 
@@ -72,13 +78,21 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     tables = read_tables(path, warnings)
     if "odometry" not in tables:
         raise InputError(f"{path}: has no odometry, which every estimator needs")
-    t0_ns = min(int(table.t_ns.min()) for table in tables.values())
+    rig = rig_of(run, run_path)
+    reads, inventories = tables.pop("rfid", None), tables.pop("inventories", None)
+    rounds = None
+    if reads is not None or inventories is not None:
+        rounds = read_rounds(reads, inventories, rig.rfid.round_gap if rig.rfid else ROUND_GAP, warnings)
+    stamps = [table.t_ns for table in tables.values()] + ([rounds.end_ns] if rounds else [])
+    t0_ns = min(int(t_ns.min()) for t_ns in stamps)
     streams: dict[str, Stream] = {}
     for sensor, table in tables.items():
         streams[sensor] = make_stream(sensor, table, t0_ns, warnings)
+    if rounds:
+        streams["rfid"] = rounds.stream(t0_ns)
     return Log(
         name=run.name or path.resolve().name,
-        rig=rig_of(run, run_path),
+        rig=rig,
         world=world_of(run, run_path),
         streams=streams,
         reference=read_reference(path / REFERENCE, t0_ns, run.has_heading, warnings),
@@ -94,7 +108,7 @@ def rig_of(run: RunFile, source: Path) -> Rig:
         return DEFAULT_RIG
     if isinstance(run.rig, str):
         return read_rig(inside(source.parent, run.rig, source))
-    return parse_model(Rig, run.rig, f"{source} [rig]")
+    return placed(parse_model(Rig, run.rig, f"{source} [rig]"), source.parent)
 
 
 def world_of(run: RunFile, source: Path) -> World:
@@ -102,11 +116,11 @@ def world_of(run: RunFile, source: Path) -> World:
         return World()
     if isinstance(run.world, str):
         return read_world(inside(source.parent, run.world, source))
-    return parse_model(World, run.world, f"{source} [world]")
+    return parse_world(run.world, f"{source} [world]", source.parent)
 
 
 def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
-    """The tables that hold rows, by sensor. A table of a sensor that this version does not read is a warning."""
+    """The tables that hold rows, by name. A table of a sensor that this version does not read is a warning."""
     tables = {}
     for sensor, shapes in SHAPES.items():
         files = [folder / f"{sensor}{suffix}" for suffix in SUFFIXES if (folder / f"{sensor}{suffix}").is_file()]
@@ -150,9 +164,10 @@ def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRang
     if len(turned):
         i = int(turned[0])
         raise bad_field(table.path, "bearing", float(bearings[i]), "radians, not degrees", row=int(table.rows[i]))
-    keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, table.names, warnings)
+    names = table.names["landmark"]
+    keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
     t = checks.seconds(table.t_ns[keep], t0_ns)
-    return BearingRangeStream(t, [table.names[i] for i in keep], ranges[keep], bearings[keep])
+    return BearingRangeStream(t, [names[i] for i in keep], ranges[keep], bearings[keep])
 
 
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
@@ -167,7 +182,7 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
     """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
-    written, and of a start's deviations in x and y only the larger one.
+    written, and of a start's deviations in x and y only the larger one. InputError if inventory rounds of one antenna overlap.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
@@ -188,6 +203,11 @@ def write_files(log: Log, folder: Path, format: str) -> None:
     write_rig(log.rig, folder / run["rig"])
     write_world(log.world, folder / run["world"])
     for sensor, stream in log.streams.items():
+        if isinstance(stream, RfidStream):
+            reads, inventories = tables_of(stream, log.t0_ns, log.name)
+            write_table(folder / f"{sensor}.{format}", reads)
+            write_table(folder / f"inventories.{format}", inventories)
+            continue
         columns = {"t_ns": absolute(stream.t, log.t0_ns), **columns_of(stream)}
         write_table(folder / f"{sensor}.{format}", columns)
     if log.reference is not None:

@@ -6,8 +6,6 @@ The poses of a run are a reference, not odometry, which is therefore simulated f
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, read_text
 from factorgraph_loc.log import Log, RfidStream
@@ -30,7 +29,7 @@ from factors import se2
 from factors.se2 import Array
 
 ANTENNAS = ("first", "second", "third")
-TAG_COLUMNS = ("epc", "label", "x_m", "y_m", "z_m", "facing_deg")
+TAG_COLUMNS = ("epc", "x_m", "y_m", "z_m", "facing_deg")
 READ_FIELDS = ("number", "EPC", "port", "carrier MHz", "phase degrees", "RSSI dBm", "reader clock us", "host clock us")
 BOUNDS = {"carrier MHz": (840.0, 960.0), "phase degrees": (0.0, 360.0), "RSSI dBm": (-120.0, 20.0)}
 ROUND_GAP = 0.05  # s, between the inventory rounds of an antenna
@@ -70,28 +69,23 @@ def read(path: Path | None, options: Options) -> Log:
 
 def read_tags(path: Path) -> dict[str, Tag]:
     """The surveyed tags by EPC."""
-    lines = csv.reader(io.StringIO(read_text(path), newline=""))
-    if tuple(header := next(lines, [])) != TAG_COLUMNS:
-        raise bad_field(path, "header", ",".join(header), ",".join(TAG_COLUMNS), row=1)
+    cells, _ = read_cells(path, (TAG_COLUMNS,))
+    numbers = [cells.numbers(name) for name in TAG_COLUMNS[1:]]
     rows: dict[str, int] = {}
     tags: dict[str, Tag] = {}
-    for parts in lines:
-        row = lines.line_num
-        if not parts:
-            continue
-        if len(parts) != len(TAG_COLUMNS):
-            raise bad_field(
-                path, "row", ",".join(parts), f"{len(TAG_COLUMNS)} values: {','.join(TAG_COLUMNS)}", row=row
-            )
-        epc = parts[0]
+    for row, epc, (x, y, z, facing) in zip(
+        cells.rows, cells.columns["epc"], np.stack(numbers, axis=1).tolist(), strict=True
+    ):
         if not epc or epc in tags:
-            expected = f"another EPC than in row {rows[epc]}" if epc else "an EPC"
+            expected = f"another EPC than in row {rows[epc]}" if epc else "the EPC of a tag"
             raise bad_field(path, "epc", epc, expected, row=row)
-        values = [_number(path, row, field, part) for field, part in zip(TAG_COLUMNS[2:], parts[2:], strict=True)]
-        if abs(values[3]) > 360.0:
-            raise bad_field(path, "facing_deg", values[3], "degrees in -360 to 360", row=row)
+        for name, value in zip(TAG_COLUMNS[1:], (x, y, z, facing), strict=True):
+            if math.isnan(value):
+                raise bad_field(path, name, "", "a number", row=row)
+        if abs(facing) > 360.0:
+            raise bad_field(path, "facing_deg", facing, "degrees in -360 to 360", row=row)
         rows[epc] = row
-        tags[epc] = Tag(x=values[0], y=values[1], z=values[2], facing=math.radians(values[3]))
+        tags[epc] = Tag(x=x, y=y, z=z, facing=math.radians(facing))
     if not tags:
         raise InputError(f"{path}: holds no tags, expected at least one row")
     return tags

@@ -195,7 +195,7 @@ WARNED = {
         "1 rows come before the first odometry",
     ),
     "no sightings": ("bearing_range.csv", HEADER, "bearing_range.csv: holds no rows"),
-    "of a later version": ("rfid.csv", "x\n", "this version does not read rfid.csv"),
+    "of a later version": ("sonar.csv", "x\n", "this version does not read sonar.csv"),
     "no rig": ("run.toml", "[world.landmarks]\nA = { x = 1, y = 1 }\nB = { x = 1, y = 1 }\n", "no rig is given"),
 }
 

@@ -1,0 +1,82 @@
+"""The cells of a CSV with a header, and what is checked of any of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import nearest, read_text
+from factors.se2 import Array
+
+Shape = tuple[str, ...]  # the names of columns
+
+
+@dataclass(frozen=True)
+class Cells:
+    """N rows of a CSV: ``rows`` N, where each stands in ``path`` as an editor counts lines; ``columns``: N cells by name."""
+
+    path: Path
+    rows: Sequence[int]
+    columns: Mapping[str, Sequence[str]]
+
+    def numbers(self, name: str) -> Array:
+        """A column (N,), an empty cell as NaN; InputError at what is no number, or is written as NaN or infinite."""
+        cells = self.columns[name]
+        values = np.empty(len(cells))
+        for i, cell in enumerate(cells):
+            try:
+                values[i] = float(cell) if cell else np.nan
+            except ValueError:
+                raise bad_field(self.path, name, cell, "a number", row=self.rows[i]) from None
+        bad = np.flatnonzero(~np.isfinite(values) & np.array([bool(cell) for cell in cells], dtype=bool))
+        if len(bad):
+            raise bad_field(self.path, name, cells[bad[0]], "a finite number", row=self.rows[bad[0]])
+        return values
+
+
+def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
+    """The cells of a CSV, and the first of ``shapes`` whose columns it has, in any order.
+
+    Blank lines are passed over. InputError names file and row of what is wrong.
+    """
+    rows: list[int] = []
+    cells: list[list[str]] = []
+    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        if not any(header):
+            raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
+        shape = shape_of(path, header, shapes)
+        for parts in reader:
+            if len(parts) <= 1 and not "".join(parts).strip():
+                continue
+            if len(parts) != len(header):
+                expected = f"{len(header)} values: {','.join(header)}"
+                raise bad_field(path, "row", ",".join(parts), expected, row=reader.line_num)
+            rows.append(reader.line_num)
+            cells.append(parts)
+    except csv.Error as error:
+        raise InputError(f"{path}:{reader.line_num}: is not CSV: {error}") from error
+    columns = [[parts[i] for parts in cells] for i in range(len(header))]
+    return Cells(path, rows, dict(zip(header, columns, strict=True))), shape
+
+
+def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
+    """The first of ``shapes`` whose columns are all in ``header``; InputError if there is none."""
+    if len(set(header)) < len(header):
+        raise bad_field(path, "header", ",".join(header), "each column once", row=1)
+    for shape in shapes:
+        if set(shape) <= set(header):
+            return shape
+    # the shape that is meant is the one with most of its columns there
+    meant = max(shapes, key=lambda shape: len(set(shape) & set(header)))
+    missing = next(column for column in meant if column not in header)
+    hint = nearest(missing, [column for column in header if column not in meant])
+    expected = " or ".join(",".join(shape) for shape in shapes)
+    raise InputError(f"{path}:1: column {missing} is missing{hint if 'mean' in hint else ''}, expected {expected}")

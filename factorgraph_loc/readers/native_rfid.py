@@ -1,0 +1,144 @@
+"""The two RFID tables of the native format: ``rfid.csv``, a row for each read, and ``inventories.csv``, one for each round.
+
+Without the second the rounds are found from the gaps between reads; then a round that read nothing is not known of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.log import RfidStream
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.rounds import (
+    OUTSIDE,
+    ends_of,
+    make_rfid_stream,
+    rounds_from_gaps,
+    rounds_from_inventories,
+)
+from factorgraph_loc.readers.tables import Table
+from factorgraph_loc.trajectory import Integers
+from factors.se2 import Array
+
+READS = ("t_ns", "antenna", "epc", "rssi", "phase", "frequency")
+INVENTORIES = ("t_ns", "antenna", "duration")
+MAX_DURATION = 3600.0  # s
+FREQUENCIES = (1e8, 1e10)  # Hz
+
+Columns = Mapping[str, Array | Integers | Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """N reads, each in one of R rounds: see :func:`~factorgraph_loc.readers.rounds.make_rfid_stream`."""
+
+    t_ns: Integers
+    number: Integers
+    epc: list[str]
+    columns: tuple[Array, Array, Array]
+    end_ns: Integers
+    antenna: list[str]
+
+    def stream(self, t0_ns: int) -> RfidStream:
+        return make_rfid_stream(self.t_ns, self.number, self.epc, self.columns, self.end_ns, self.antenna, t0_ns)
+
+
+def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warnings: list[str]) -> Rounds:
+    """The reads in their rounds; ``gap`` [s] between rounds where there are no ``inventories``.
+
+    InputError names file, row and field of what is wrong; reads outside every inventory are left out, with a warning.
+    """
+    if reads is not None:
+        _check_reads(reads)
+    if inventories is not None:
+        return _from_inventories(reads, inventories, warnings)
+    assert reads is not None
+    checks.arrivals(reads.path, reads.rows, reads.t_ns, warnings)
+    order = np.argsort(reads.t_ns, kind="stable")
+    antenna = [reads.names["antenna"][i] for i in order.tolist()]
+    t_ns = reads.t_ns[order]
+    number = rounds_from_gaps(t_ns, antenna, gap)
+    end_ns = ends_of(t_ns, number)
+    first = np.searchsorted(number, np.arange(len(end_ns)))
+    return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
+
+
+def _from_inventories(reads: Table | None, inventories: Table, warnings: list[str]) -> Rounds:
+    end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
+    duration = inventories.numbers["duration"]
+    bad = np.flatnonzero(~((duration >= 0.0) & (duration <= MAX_DURATION)))  # an empty one is not a number
+    if len(bad):
+        i = int(bad[0])
+        expected = f"seconds in 0 to {MAX_DURATION:g}"
+        raise bad_field(inventories.path, "duration", float(duration[i]), expected, row=int(inventories.rows[i]))
+    checks.arrivals(inventories.path, inventories.rows, end_ns, warnings)
+    if reads is None:
+        nothing = np.zeros(0)
+        none = np.zeros(0, dtype=np.int64)
+        return Rounds(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
+    duration_ns = np.rint(duration * 1e9).astype(np.int64)
+    number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
+    keep = np.flatnonzero(number != OUTSIDE)
+    if left := len(number) - len(keep):
+        warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside every inventory and are left out")
+    return _rounds(reads, keep, number[keep], end_ns, antenna)
+
+
+def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
+    epc = [reads.names["epc"][i] for i in rows.tolist()]
+    rssi, phase, frequency = (reads.numbers[name][rows] for name in READS[3:])
+    return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
+
+
+def _check_reads(reads: Table) -> None:
+    phase, frequency = reads.numbers["phase"], reads.numbers["frequency"]
+    low, high = FREQUENCIES
+    for name, values, bad, expected in (
+        ("phase", phase, np.abs(phase) > 2.0 * np.pi, "radians, not degrees"),
+        ("frequency", frequency, (frequency < low) | (frequency > high), f"Hz, {low:g} to {high:g}"),
+    ):
+        if len(rows := np.flatnonzero(bad)):
+            i = int(rows[0])
+            raise bad_field(reads.path, name, float(values[i]), expected, row=int(reads.rows[i]))
+
+
+def tables_of(stream: RfidStream, t0_ns: int, source: str) -> tuple[Columns, Columns]:
+    """The columns of both tables. InputError if rounds of one antenna overlap: the tables tell them apart by time alone."""
+    number = _numbered(stream)
+    _, first = np.unique(number, return_index=True)
+    antenna = [stream.antenna[i] for i in first.tolist()]
+    end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
+    age_ns = np.rint(stream.age * 1e9).astype(np.int64)
+    order = np.argsort(number, kind="stable")
+    reads = order[[bool(stream.epc[i]) for i in order.tolist()]]
+    read_ns = end_ns[reads] - age_ns[reads]
+    duration_ns = np.zeros(len(first), dtype=np.int64)
+    np.maximum.at(duration_ns, number[reads], age_ns[reads])
+    by = [stream.antenna[i] for i in reads.tolist()]
+    found = rounds_from_inventories(read_ns, by, end_ns[first], antenna, duration_ns)
+    if len(wrong := reads[found != number[reads]]):
+        where = f"antenna {stream.antenna[wrong[0]]} at t = {stream.t[wrong[0]]:.3f} s"
+        raise InputError(f"{source}: inventory rounds of {where} overlap, expected one after another")
+    return (
+        {
+            "t_ns": read_ns,
+            "antenna": by,
+            "epc": [stream.epc[i] for i in reads.tolist()],
+            "rssi": stream.rssi[reads],
+            "phase": stream.phase[reads],
+            "frequency": stream.frequency[reads],
+        },
+        {"t_ns": end_ns[first], "antenna": antenna, "duration": duration_ns / 1e9},
+    )
+
+
+def _numbered(stream: RfidStream) -> Integers:
+    """The number (N,) of each row's round among all rounds, in the order in which they come."""
+    scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0).tolist()
+    numbers: dict[tuple[int, int], int] = {}
+    keys = zip(scan, stream.round.tolist(), strict=True)
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
