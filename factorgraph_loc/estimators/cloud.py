@@ -16,6 +16,7 @@ from factors.se2 import Array
 MINIMUM_VARIANCE = 1e-10
 MODES = 5  # at most
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
+BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
 CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is looked for
 
 
@@ -108,6 +109,32 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
     return np.asarray(np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1))
+
+
+def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
+    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles."""
+
+    def effective(share: float) -> float:
+        return effective_size(normalised(log_weights + share * likelihood))
+
+    if effective(left) >= enough:
+        return left
+    low, high = 0.0, left
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if effective(middle) >= enough else (low, middle)
+    return max(low, SMALLEST * left)
+
+
+def effective_size(log_weights: Array) -> float:
+    """Of normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
+    return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
+
+
+def normalised(log_weights: Array) -> Array:
+    """Log-weights (N,) whose weights sum to one."""
+    log_weights = log_weights - log_weights.max()
+    return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))
 
 
 def silverman(count: int, size: int) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, systematic, vector_moments
+from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
@@ -36,7 +36,6 @@ from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
 
-BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
 SLOW, FAST = 0.01, 0.1  # decay rates of the averages of the likelihood, per stamp
 INJECTED = 0.05  # the least share that is drawn anew while the place is not known
 ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies within so many standard deviations of it
@@ -200,12 +199,12 @@ class ParticleFilter(Filter):
         self._state = replace(cloud, slow=slow, fast=fast)
         enough = self._settings.resample_below * len(cloud.poses)
         left = 1.0
-        while (share := _share(self._state.log_weights, likelihood, left, enough)) < left:
-            self._state = replace(self._state, log_weights=_normalised(self._state.log_weights + share * likelihood))
+        while (share := largest_share(self._state.log_weights, likelihood, left, enough)) < left:
+            self._state = replace(self._state, log_weights=normalised(self._state.log_weights + share * likelihood))
             self._resample()
             left -= share
             likelihood = self._likelihood(seen)
-        self._state = replace(self._state, log_weights=_normalised(self._state.log_weights + left * likelihood))
+        self._state = replace(self._state, log_weights=normalised(self._state.log_weights + left * likelihood))
 
     def _likelihood(self, seen: BearingRangeFactor) -> Array:
         """Log-likelihood (N,) of the particles, each with its own constants."""
@@ -263,24 +262,3 @@ class ParticleFilter(Filter):
 
     def _increment(self, start: Record, end: Record) -> Increment:
         return self._motion.relative(start.odometry, end.odometry)
-
-
-def _share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles."""
-
-    def effective(share: float) -> float:
-        return float(1.0 / np.sum(np.exp(2.0 * _normalised(log_weights + share * likelihood))))
-
-    if effective(left) >= enough:
-        return left
-    low, high = 0.0, left
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2.0
-        low, high = (middle, high) if effective(middle) >= enough else (low, middle)
-    return max(low, SMALLEST * left)
-
-
-def _normalised(log_weights: Array) -> Array:
-    """Log-weights (N,) whose weights sum to one."""
-    log_weights = log_weights - log_weights.max()
-    return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))

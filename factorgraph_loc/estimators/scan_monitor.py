@@ -1,0 +1,59 @@
+"""Whether a track is lost: told by what RFID antennas read and did not read."""
+
+from __future__ import annotations
+
+import math
+
+DURATION = 5.0  # s over which scans are taken together
+KEPT = 60.0  # s
+SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations: a suspicion arises above the one, and goes below the other
+SCANS = 4  # at least
+
+
+class ScanMonitor:
+    """Whether scans are much less likely than they would be if the track were right.
+
+    That is a suspicion: dead tags and a wrong map look the same. Whether there is a better place a :class:`Seeker` tells.
+    """
+
+    def __init__(self) -> None:
+        self._scans: list[tuple[float, float, float]] = []
+        self._since: float | None = None
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """When the scans began to be unlikely [s], None if all is well."""
+        return self._since
+
+    def add(self, t: float, surprise: float, variance: float) -> None:
+        """Take a scan: how much larger its negative log-likelihood is than expected, and the variance of that, both at the
+        predicted pose. Scans from ``t`` on that were taken before are forgotten."""
+        self._scans = [s for s in self._scans if t - KEPT <= s[0] < t]
+        self._scans.append((t, surprise, variance))
+        z = self._z()
+        if z > SUSPICIOUS or (self._since is not None and z > CALM):
+            self._since = self._beginning()
+        else:
+            self._since = None
+
+    def clear(self) -> None:
+        """Forget the scans: the track begins anew."""
+        self._scans.clear()
+        self._since = None
+
+    def _z(self) -> float:
+        """The summed surprise of the last scans, in standard deviations."""
+        last = [s for s in self._scans if s[0] > self._scans[-1][0] - DURATION]
+        if len(last) < SCANS:
+            return 0.0
+        return sum(s[1] for s in last) / math.sqrt(sum(s[2] for s in last) + 1e-9)
+
+    def _beginning(self) -> float:
+        """The change point: from there on the sum of the surprises is largest."""
+        total, most, begin = 0.0, -math.inf, self._scans[-1][0]
+        for t, surprise, variance in reversed(self._scans):
+            # scans as they are expected count against
+            total += surprise - math.sqrt(variance)
+            if total > most:
+                most, begin = total, t
+        return begin
