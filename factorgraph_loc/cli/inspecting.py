@@ -23,6 +23,7 @@ from factorgraph_loc.cli.options import (
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
+    from factorgraph_loc.evaluation.inspect_rfid import RfidSummary
     from factorgraph_loc.log import Log
 
 
@@ -100,7 +101,7 @@ def _print(log: Log, found: Inspection) -> None:
         "log": log.name,
         "span": f"{last - first:.1f} s",
         "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors)}",
-        "world": f"{log.world.name}, {len(log.world.landmarks)} landmarks",
+        "world": f"{log.world.name}, {len(log.world.landmarks)} landmarks, {len(log.world.tags)} tags",
         "start": "stated by the log" if log.start is not None else "not stated",
     }
     if log.reference is None:
@@ -115,10 +116,25 @@ def _print(log: Log, found: Inspection) -> None:
     header = ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps")
     show.table(header, [_row(name, stream) for name, stream in streams.items()])
     typer.echo()
+    if found.rfid is not None:
+        _print_rfid(found.rfid)
     if not found.problems:
         typer.echo("nothing looks wrong")
     for problem in found.problems:
         typer.echo(f"! {problem}")
+
+
+def _print_rfid(found: RfidSummary) -> None:
+    known = f"{found.known} tags of the map"
+    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
+    typer.echo(f"RFID: {found.reads} reads of {known} and of {unknown}, in {found.rounds} rounds, {found.scans} scans")
+    header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
+    rows = [
+        (name, str(a.reads), str(a.rounds), show.number(a.rate, 2), str(a.silent), show.number(a.last, 1))
+        for name, a in found.antennas.items()
+    ]
+    show.table(header, rows)
+    typer.echo()
 
 
 def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
@@ -133,12 +149,13 @@ def _document(log: Log, found: Inspection) -> dict[str, Any]:
         "metadata": dict(log.metadata),
         "span": last - first,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
-        "world": {"name": log.world.name, "landmarks": len(log.world.landmarks)},
+        "world": {"name": log.world.name, "landmarks": len(log.world.landmarks), "tags": len(log.world.tags)},
         "start": None if log.start is None else {"t": log.start.t, "pose": log.start.pose.tolist()},
         "streams": {name: asdict(stream) for name, stream in found.streams.items()},
         "reference": None if found.reference is None else asdict(found.reference),
         "unseen": found.unseen,
         "unknown": dict(found.unknown),
         "suspects": [asdict(suspect) | {"offset": suspect.offset.tolist()} for suspect in found.suspects],
+        "rfid": None if found.rfid is None else asdict(found.rfid),
         "problems": found.problems,
     }

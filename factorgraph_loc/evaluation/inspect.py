@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.evaluation.inspect_rfid import RfidSummary, rfid_problems, summarize_rfid
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.world import World
 from factors import se2
@@ -56,7 +57,8 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a log holds. ``unseen``: landmarks of the map without a sighting; ``unknown``: sightings by name that the map lacks."""
+    """What a log holds. ``unseen``: landmarks of the map without a sighting; ``unknown``: sightings by name that the map lacks.
+    ``rfid``: None where the log has no reads of tags."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
@@ -64,6 +66,7 @@ class Inspection:
     unknown: Mapping[str, int]
     suspects: tuple[Suspect, ...]
     problems: tuple[str, ...]
+    rfid: RfidSummary | None = None
 
 
 def inspect(log: Log) -> Inspection:
@@ -81,7 +84,10 @@ def inspect(log: Log) -> Inspection:
     problems += [f"landmark {name} of the map is never seen" for name in unseen]
     problems += [f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()]
     problems += [str(suspect) for suspect in suspects]
-    return Inspection(streams, reference, unseen, unknown, suspects, tuple(problems))
+    rfid = summarize_rfid(log)
+    if rfid is not None:
+        problems += rfid_problems(log, rfid)
+    return Inspection(streams, reference, unseen, unknown, suspects, tuple(problems), rfid)
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:

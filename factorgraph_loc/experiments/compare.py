@@ -21,7 +21,7 @@ from factorgraph_loc.evaluation.tables import comparison_cells, markdown
 from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.processes import run_each
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
 from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
 
@@ -121,7 +121,7 @@ def _is_deterministic(estimator: str) -> bool:
 def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
     if not logs or not configs:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
-    streams = list(dict.fromkeys(name for log in logs for name in log.streams))
+    streams = [*dict.fromkeys(name for log in logs for name in log.streams), *OF_READS]
     for config in configs:
         registry.settings_of(config.estimator, config.settings)
         check_prior(config.prior)

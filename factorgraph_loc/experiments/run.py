@@ -23,13 +23,16 @@ from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
 from factorgraph_loc.files import nearest
-from factorgraph_loc.log import Log
+from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import IncrementOdometry, Measurement, Tick, VelocityOdometry, YawRate
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
 from factors.se2 import Array
 
 TICK_RATE = 10  # Hz, the grid on which trajectories are written and scored
 _ODOMETRY = (VelocityOdometry, IncrementOdometry, YawRate)
+OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
+_SHOWN = 5  # names in a warning
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,8 @@ class RunConfig:
     """What is run on a log.
 
     ``estimator``: its name in the registry; ``settings``: overrides of its settings. ``sensors``: names of the streams that it
-    may use, None for those of the rig. ``prior``: see :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
-    ``seed``: of the estimator's random generator.
+    may use, None for those of the rig; ``rssi`` and ``phase`` are what the reads of ``rfid`` tell besides. ``prior``: see
+    :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator.
     """
 
     estimator: str
@@ -63,7 +66,8 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     sensors = _sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
     prior, prior_source = resolve_prior(log, config.prior)
-    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
+    world, unread = _readable(log, sensors)
+    setup = registry.Setup(log.rig, world, sensors, np.random.default_rng(config.seed))
     estimator = registry.create(config.estimator, setup, settings)
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
@@ -102,7 +106,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
         learnt=estimator.learnt(),
         timings=loop.timings(final_seconds),
         versions=versions,
-        warnings=(*log.warnings, *_doubts(log, sensors), *_never_localized(log, loop.estimates, final)),
+        warnings=(*log.warnings, *_doubts(log, sensors), *unread, *_never_localized(log, loop.estimates, final)),
     )
 
 
@@ -207,28 +211,59 @@ class _Loop:
 
 
 def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
-    stamps: list[Array] = [log.streams[s].t + log.rig.time_offset(s) for s in sensors if len(log.streams[s].t)]
+    streams = {s: log.streams[s].t for s in sensors if s in log.streams}
+    stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
     if not stamps:
         raise InputError(f"{log.name}: has no measurements of {', '.join(sensors)}")
     return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
 
 
 def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The streams to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
+    """The sensors to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
+    there = (*log.streams, *(s for s in OF_READS if _is_read(log, s)))
     if asked is not None:
         for sensor in asked:
-            if sensor not in log.streams:
-                raise InputError(f"{log.name}: has no sensor {sensor!r}{nearest(sensor, list(log.streams))}")
-    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in log.streams)
+            if sensor in OF_READS and "rfid" not in asked:
+                raise InputError(f"{log.name}: {sensor} comes with reads of tags, expected rfid among the sensors too")
+            if sensor in OF_READS and sensor not in there:
+                raise InputError(f"{log.name}: has no sensor {sensor!r}: none of its reads has a value of it")
+            if sensor not in there:
+                raise InputError(f"{log.name}: has no sensor {sensor!r}{nearest(sensor, list(there))}")
+    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in there)
     if not sensors:
         raise InputError(
-            f"{log.name}: has none of the rig's sensors {', '.join(log.rig.sensors)}{nearest('', list(log.streams))}"
+            f"{log.name}: has none of the rig's sensors {', '.join(log.rig.sensors)}{nearest('', list(there))}"
         )
     return sensors
 
 
+def _is_read(log: Log, sensor: str) -> bool:
+    """Whether any read has a value of ``sensor``, one of ``OF_READS``."""
+    stream = log.streams.get("rfid")
+    return isinstance(stream, RfidStream) and bool(np.any(np.isfinite(getattr(stream, sensor))))
+
+
+def _readable(log: Log, sensors: tuple[str, ...]) -> tuple[World, tuple[str, ...]]:
+    """The map without the tags that the whole log never reads, and a warning that names them.
+
+    Such a tag is broken, hidden or gone; to an estimator it would be evidence, round after round, against all places near it.
+    """
+    stream = log.streams.get("rfid")
+    if "rfid" not in sensors or not isinstance(stream, RfidStream):
+        return log.world, ()
+    read = set(stream.epc)
+    unread = [epc for epc in log.world.tags if epc not in read]
+    if not unread:
+        return log.world, ()
+    names = ", ".join(unread[:_SHOWN]) + (", ..." if len(unread) > _SHOWN else "")
+    tags = {epc: tag for epc, tag in log.world.tags.items() if epc in read}
+    return log.world.model_copy(update={"tags": tags}), (
+        f"{log.name}: {len(unread)} of {len(log.world.tags)} tags of the map are never read and are left out: {names}",
+    )
+
+
 def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
-    missing = [s for s in log.rig.sensors if s not in log.streams]
+    missing = [s for s in log.rig.sensors if s not in log.streams and not (s in OF_READS and _is_read(log, s))]
     doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in missing]
     if "odometry" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")

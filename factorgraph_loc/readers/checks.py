@@ -42,13 +42,14 @@ def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]
     return keep
 
 
-def arrivals(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> None:
-    """Stamps (N,) in order of arrival: one at most 0.5 s older than the newest before it is late, an older one an InputError."""
+def arrivals(
+    source: object, rows: Integers, t_ns: Integers, warnings: list[str], *, max_late_ns: int | None = MAX_LATE_NS
+) -> None:
+    """Stamps (N,) in order of arrival: one older than the newest before it is late, by more than ``max_late_ns`` an InputError."""
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
-    too_late = np.flatnonzero(late > MAX_LATE_NS)
-    if len(too_late):
-        i = int(too_late[0])
+    if max_late_ns is not None and np.any(late > max_late_ns):
+        i = int(np.argmax(late > max_late_ns))
         expected = f"a stamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):

@@ -26,7 +26,7 @@ from factorgraph_loc.log import (
 )
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.manifests import StartSettings
-from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, read_rounds, tables_of
+from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, READS_IN_INVENTORIES, read_rounds, tables_of
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rfid_settings import RfidSettings
@@ -43,7 +43,7 @@ SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
     "odometry": (VELOCITIES, INCREMENTS),
     "imu": (("t_ns", "w"),),
     "bearing_range": (("t_ns", "landmark", "range", "bearing"),),
-    "rfid": (READS,),
+    "rfid": (READS_IN_INVENTORIES, READS),
     "inventories": (INVENTORIES,),  # of the sensor rfid too
 }
 ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
@@ -182,7 +182,7 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
     """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
-    written, and of a start's deviations in x and y only the larger one. InputError if inventory rounds of one antenna overlap.
+    written, and of a start's deviations in x and y only the larger one.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
@@ -204,7 +204,7 @@ def write_files(log: Log, folder: Path, format: str) -> None:
     write_world(log.world, folder / run["world"])
     for sensor, stream in log.streams.items():
         if isinstance(stream, RfidStream):
-            reads, inventories = tables_of(stream, log.t0_ns, log.name)
+            reads, inventories = tables_of(stream, log.t0_ns)
             write_table(folder / f"{sensor}.{format}", reads)
             write_table(folder / f"inventories.{format}", inventories)
             continue

@@ -1,6 +1,7 @@
 """The two RFID tables of the native format: ``rfid.csv``, a row for each read, and ``inventories.csv``, one for each round.
 
-Without the second the rounds are found from the gaps between reads; then a round that read nothing is not known of.
+A read belongs to the round of its antenna that holds its stamp, or to the one that it names. Without the second table the rounds
+are found from the gaps between reads; then a round that read nothing is not known of.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import bad_field
 from factorgraph_loc.log import RfidStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.rounds import (
@@ -25,6 +26,7 @@ from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
 READS = ("t_ns", "antenna", "epc", "rssi", "phase", "frequency")
+READS_IN_INVENTORIES = (*READS, "inventory")
 INVENTORIES = ("t_ns", "antenna", "duration")
 MAX_DURATION = 3600.0  # s
 FREQUENCIES = (1e8, 1e10)  # Hz
@@ -75,22 +77,43 @@ def _from_inventories(reads: Table | None, inventories: Table, warnings: list[st
         i = int(bad[0])
         expected = f"seconds in 0 to {MAX_DURATION:g}"
         raise bad_field(inventories.path, "duration", float(duration[i]), expected, row=int(inventories.rows[i]))
-    checks.arrivals(inventories.path, inventories.rows, end_ns, warnings)
+    # a reader's clock that jumps is a fault of the recording: what it stamped in the past is for the estimators to drop
+    checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
     if reads is None:
         nothing = np.zeros(0)
         none = np.zeros(0, dtype=np.int64)
         return Rounds(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
-    duration_ns = np.rint(duration * 1e9).astype(np.int64)
-    number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
+    if "inventory" in reads.numbers:
+        number = _told(reads, end_ns, antenna)
+    else:
+        duration_ns = np.rint(duration * 1e9).astype(np.int64)
+        number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
     keep = np.flatnonzero(number != OUTSIDE)
     if left := len(number) - len(keep):
         warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside every inventory and are left out")
     return _rounds(reads, keep, number[keep], end_ns, antenna)
 
 
+def _told(reads: Table, end_ns: Integers, antenna: list[str]) -> Integers:
+    """The rounds (N,) that the reads themselves name, by their places in the other table, from 1."""
+    named = reads.numbers["inventory"]
+    with np.errstate(invalid="ignore"):
+        bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
+    expected = f"the number of a row of inventories, 1 to {len(end_ns)}"
+    if not bad.any():
+        number = named.astype(np.int64) - 1
+        bad = np.array([antenna[k] for k in number.tolist()], dtype=str) != np.array(reads.names["antenna"], dtype=str)
+        bad |= end_ns[number] < reads.t_ns
+        expected = "an inventory of the same antenna that ends after the read"
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
+        raise bad_field(reads.path, "inventory", float(named[i]), expected, row=int(reads.rows[i]))
+    return number
+
+
 def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
     epc = [reads.names["epc"][i] for i in rows.tolist()]
-    rssi, phase, frequency = (reads.numbers[name][rows] for name in READS[3:])
+    rssi, phase, frequency = (reads.numbers[name][rows] for name in ("rssi", "phase", "frequency"))
     return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
@@ -106,33 +129,31 @@ def _check_reads(reads: Table) -> None:
             raise bad_field(reads.path, name, float(values[i]), expected, row=int(reads.rows[i]))
 
 
-def tables_of(stream: RfidStream, t0_ns: int, source: str) -> tuple[Columns, Columns]:
-    """The columns of both tables. InputError if rounds of one antenna overlap: the tables tell them apart by time alone."""
+def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
+    """The columns of both tables, rows in the order of the rounds; a round lasts from its first read to its end."""
     number = _numbered(stream)
     _, first = np.unique(number, return_index=True)
-    antenna = [stream.antenna[i] for i in first.tolist()]
     end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)
     order = np.argsort(number, kind="stable")
-    reads = order[[bool(stream.epc[i]) for i in order.tolist()]]
-    read_ns = end_ns[reads] - age_ns[reads]
+    reads = order[np.array([bool(stream.epc[i]) for i in order.tolist()], dtype=bool)]
     duration_ns = np.zeros(len(first), dtype=np.int64)
     np.maximum.at(duration_ns, number[reads], age_ns[reads])
-    by = [stream.antenna[i] for i in reads.tolist()]
-    found = rounds_from_inventories(read_ns, by, end_ns[first], antenna, duration_ns)
-    if len(wrong := reads[found != number[reads]]):
-        where = f"antenna {stream.antenna[wrong[0]]} at t = {stream.t[wrong[0]]:.3f} s"
-        raise InputError(f"{source}: inventory rounds of {where} overlap, expected one after another")
     return (
         {
-            "t_ns": read_ns,
-            "antenna": by,
+            "t_ns": end_ns[reads] - age_ns[reads],
+            "antenna": [stream.antenna[i] for i in reads.tolist()],
             "epc": [stream.epc[i] for i in reads.tolist()],
             "rssi": stream.rssi[reads],
             "phase": stream.phase[reads],
             "frequency": stream.frequency[reads],
+            "inventory": number[reads] + 1,
         },
-        {"t_ns": end_ns[first], "antenna": antenna, "duration": duration_ns / 1e9},
+        {
+            "t_ns": end_ns[first],
+            "antenna": [stream.antenna[i] for i in first.tolist()],
+            "duration": duration_ns / 1e9,
+        },
     )
 
 

@@ -52,7 +52,7 @@ def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[st
 
 
 def _kind(column: str) -> type[pl.DataType]:
-    if column == STAMP:
+    if column in {STAMP, "inventory"}:
         return pl.Int64
     return pl.String if column in NAMES else pl.Float64
 
@@ -63,7 +63,7 @@ def _read_csv(path: Path, shapes: Sequence[Shape]) -> Table:
         path,
         np.array(cells.rows, dtype=np.int64),
         _stamps(path, cells.rows, cells.columns[STAMP]),
-        {name: cells.numbers(name) for name in shape if _kind(name) is pl.Float64},
+        {name: cells.numbers(name) for name in shape if name not in NAMES and name != STAMP},
         {name: _texts(path, cells.rows, name, cells.columns[name]) for name in shape if name in NAMES},
     )
 
