@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
@@ -76,6 +76,8 @@ class Fading(FileModel):
 
 class AntennaStop(FileModel):
     """From ``time`` on an antenna reads nothing. Its rounds end too, unless ``rounds_go_on``, as with a broken cable."""
+
+    model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
 
     antenna: str
     time: Seconds
@@ -166,16 +168,21 @@ _BURSTY: Mapping[str, Any] = {
 }
 
 
+EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # a change to one takes the other away
+
+
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``changes``, tables within tables merged alike."""
+    """``base`` with ``changes``, tables within tables merged alike; a table of another ``kind`` takes the place of the old one."""
+    if "kind" in changes and changes["kind"] != base.get("kind"):
+        return dict(changes)
     out = dict(base)
+    for pair in EXCLUSIVE:
+        for key, other in (pair, pair[::-1]):
+            if key in changes and other not in changes:
+                out.pop(other, None)
     for key, value in changes.items():
         old = out.get(key)
         out[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    # a number of tags takes the place of a density, and the reverse
-    for key, other in (("tags", "density"), ("density", "tags")):
-        if key in changes and other in out and other not in changes:
-            del out[other]
     return out
 
 
@@ -196,23 +203,26 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
     """The settings of a preset, with ``changes`` as nested tables. InputError names a wrong preset, key or value."""
-    return parse_model(SimulationSettings, _of_preset(name, changes or {}, "the settings"), "the settings")
+    content = merged(_preset(name, "the settings"), changes or {})
+    return parse_model(SimulationSettings, content, "the settings")
 
 
 def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
     """The settings of a TOML file: ``preset`` (default office), and what differs from it. ``rig`` may be the name of a file below
     the folder. InputError names file, key and what is expected."""
-    content = merged(read_toml(path), changes or {})
-    base = content.pop("preset", "office")
-    rig = content.get("rig")
-    if isinstance(rig, str):
-        content["rig"] = read_rig(inside(path.parent, rig, path))
-    content.setdefault("name", path.stem)
-    settings = parse_model(SimulationSettings, _of_preset(base, content, path), path)
-    return settings.model_copy(update={"rig": placed(settings.rig, path.parent)})
+    content = read_toml(path)
+    base = _preset(content.pop("preset", "office"), path)
+    base["name"] = path.stem
+    folder = path.parent
+    if isinstance(content.get("rig"), str):
+        file = inside(folder, content.pop("rig"), path)
+        base["rig"] = read_rig(file).model_dump(mode="json", exclude_none=True)
+        folder = file.parent
+    settings = parse_model(SimulationSettings, merged(merged(base, content), changes or {}), path)
+    return settings.model_copy(update={"rig": placed(settings.rig, folder)})
 
 
-def _of_preset(name: Any, changes: Mapping[str, Any], source: object) -> dict[str, Any]:
+def _preset(name: Any, source: object) -> dict[str, Any]:
     if not isinstance(name, str) or name not in PRESETS:
         raise InputError(f"{source}: preset is {name!r}{nearest(str(name), list(PRESETS))}")
-    return merged({"name": name, **PRESETS[name]}, changes)
+    return {"name": name, **PRESETS[name]}

@@ -1,0 +1,96 @@
+"""``fgloc simulate``: folders that can be read back, the same bytes for the same seed, and errors of one line."""
+
+import pytest
+
+from factorgraph_loc.readers import load
+from factorgraph_loc.simulation import preset, simulate
+
+
+def content(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_a_log_is_written_and_read_back(fgloc, tmp_path):
+    done = fgloc("simulate", "sparse", "-o", tmp_path / "log", "--seed", 4, "--duration", 30, "--tags", 12)
+    assert done.exit_code == 0, done.stderr
+    assert str(tmp_path / "log") in done.stdout
+    (log,) = load(str(tmp_path / "log"))
+    made = simulate(preset("sparse", {"drive": {"duration": 30.0}, "world": {"tags": 12}}), 4)
+    assert log.world.tags == made.world.tags
+    assert list(log.streams["rfid"].epc) == list(made.streams["rfid"].epc)
+    assert list(log.streams["rfid"].antenna) == list(made.streams["rfid"].antenna)
+    assert log.streams["rfid"].t.tolist() == made.streams["rfid"].t.tolist()
+    assert log.streams["odometry"].dtheta.tolist() == made.streams["odometry"].dtheta.tolist()
+    assert log.rig == made.rig
+    assert log.metadata == made.metadata
+
+
+def test_the_same_seed_gives_the_same_bytes(fgloc, tmp_path):
+    options = ("--duration", 20, "--set", "world.landmarks=4", "--set", "faults.false_reads=0.1")
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert fgloc("simulate", "office", "-o", tmp_path / name, "--seed", seed, *options).exit_code == 0
+    first = content(tmp_path / "a")
+    assert {"odometry.csv", "rfid.csv", "inventories.csv", "bearing_range.csv", "reference.tum"} <= set(first)
+    assert first == content(tmp_path / "b")
+    assert first["rfid.csv"] != content(tmp_path / "c")["rfid.csv"]
+
+
+def test_several_seeds_make_several_folders(fgloc, tmp_path):
+    done = fgloc("simulate", "corridor", "-o", tmp_path / "logs", "--seeds", "3:5", "--duration", 5)
+    assert done.exit_code == 0, done.stderr
+    assert sorted(folder.name for folder in (tmp_path / "logs").iterdir()) == ["corridor-3", "corridor-4"]
+    alone = fgloc("simulate", "corridor", "-o", tmp_path / "alone", "--seed", 4, "--duration", 5)
+    assert alone.exit_code == 0
+    assert content(tmp_path / "alone") == content(tmp_path / "logs" / "corridor-4")
+
+
+def test_a_file_of_settings_takes_the_place_of_a_preset(fgloc, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('preset = "warehouse"\n[drive]\nduration = 500\nspeed = 1.0\n')
+    done = fgloc("simulate", path, "-o", tmp_path / "log", "--duration", 5)
+    assert done.exit_code == 0, done.stderr
+    (log,) = load(str(tmp_path / "log"))
+    assert log.name == "mine-0"
+    assert log.span()[1] == 5.0
+
+
+def test_reads_may_come_from_another_log(fgloc, tmp_path):
+    assert fgloc("simulate", "office", "-o", tmp_path / "donor", "--duration", 60).exit_code == 0
+    done = fgloc("simulate", "sparse", "-o", tmp_path / "log", "--duration", 20, "--recorded", tmp_path / "donor")
+    assert done.exit_code == 0, done.stderr
+    (log,) = load(str(tmp_path / "log"))
+    assert "recorded" in log.metadata["reads"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("ofice",), "did you mean office?"),
+        (("missing.toml",), "missing.toml: cannot be read"),
+        (("office", "--seeds", "5:5"), "expected a number such as 3, or a range"),
+        (("office", "--tags", -1), "world.tags is -1"),
+        (("office", "--duration", 0), "drive.duration is 0"),
+        (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
+        (("office", "--set", "world.tags"), "expected KEY=VALUE"),
+        (("office", "--set", "world=3", "--set", "world.tags=3"), "world is set to 3 already"),
+        (
+            ("office", "--set", "drive.clearance=2.0", "--set", "world.plan=hall", "--set", "world.depth=3"),
+            "no place that",
+        ),
+        (("office", "--recorded", "nowhere"), "nowhere: is neither a file"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line(fgloc, tmp_path, arguments, message):
+    done = fgloc("simulate", *arguments, "-o", tmp_path / "log")
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "log").exists()
+
+
+def test_a_folder_that_holds_something_is_left_alone(fgloc, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    done = fgloc("simulate", "office", "-o", tmp_path, "--duration", 5)
+    assert done.exit_code == 2
+    assert "not an empty folder" in done.stderr
+    assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -1,0 +1,183 @@
+"""Reads: as often as the model says, and each fault does what it is for.
+
+Bounds on frequencies are five standard deviations of a binomial: a false alarm in 2 million tests each.
+"""
+
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.measurements import RfidScan
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities
+from factorgraph_loc.simulation.settings import FaultSettings
+from factorgraph_loc.tag_map import tag_map
+from factors.rfid import BeamModel
+
+TIMES = np.arange(1, 2001) * 0.5
+
+
+def drawn(faults, p, seed=0, rfid=None):
+    rfid = rfid or preset("office").rig.rfid
+    return draw_reads(rfid, p, TIMES, FaultSettings.model_validate(faults), np.random.default_rng(seed))
+
+
+def flat(p):
+    return np.full((len(TIMES), 8, 10), p)
+
+
+def five_sigma(p, n):
+    return 5.0 * np.sqrt(p * (1.0 - p) / n)
+
+
+def scans(log):
+    return [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
+
+
+def reads_of(log):
+    """Times and EPCs of all reads."""
+    stream = log.streams["rfid"]
+    rows = [(t, epc) for t, epc in zip(stream.t.tolist(), stream.epc, strict=True) if epc]
+    return np.array([t for t, _ in rows]), np.array([epc for _, epc in rows])
+
+
+def test_rounds_of_all_antennas_end_together_twice_a_second(office):
+    found = scans(office)
+    np.testing.assert_allclose([scan.t for scan in found], np.arange(1, 1201) * 0.5)
+    assert all(scan.antennas == tuple("12345678") for scan in found)
+
+
+def test_tags_are_read_as_often_as_the_model_says(office):
+    """The model's formula written out once more, at the true poses, in ten classes of probability."""
+    tags = tag_map(office.world, office.rig.survey)
+    beam, p, hits = BeamModel(), [], []
+    for scan, pose in zip(scans(office), office.reference.at(np.arange(1, 1201) * 0.5), strict=True):
+        for i in range(8):
+            yaw = pose[2] + i * np.pi / 4.0
+            x, y = pose[:2] + 0.25 * np.array((np.cos(yaw), np.sin(yaw)))
+            dx, dy = tags.tags.points[:, 0] - x, tags.tags.points[:, 1] - y
+            bearing = np.remainder(np.arctan2(dy, dx) - yaw + np.pi, 2.0 * np.pi) - np.pi
+            near = 1.0 / (1.0 + np.exp(-(beam.r_max - np.hypot(dx, dy)) / beam.s_r))
+            p.append(1e-3 + 0.999 * beam.p0 * near * np.exp(-0.5 * (bearing / beam.sigma_phi) ** 2))
+            row = np.zeros(len(tags.names))
+            row[[tags.index[scan.tags[k]] for k in np.flatnonzero(scan.antenna == i)]] = 1.0
+            hits.append(row)
+    p, hits = np.concatenate(p), np.concatenate(hits)
+    edges = np.array((0.0, 1.01e-3, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.85, 1.0))
+    for low, high in pairwise(edges):
+        chosen = (p >= low) & (p < high)
+        assert chosen.sum() > 500, (low, high)
+        bound = 5.0 * np.sqrt((p[chosen] * (1.0 - p[chosen])).sum())
+        assert abs(hits[chosen].sum() - p[chosen].sum()) < bound, (low, high)
+
+
+def test_fades_take_their_share_and_last_and_leave_the_model_right():
+    rfid = preset("bursty").rig.rfid
+    fading = {"fading": {"duration": 2.0, "share": 0.2}}
+    hits = drawn(fading, flat(0.799), rfid=rfid)  # all that the misses leave: outside a fade every round reads
+    faded = ~hits
+    n = faded.size
+    # neighbours in time go together: a fade of 4 rounds in the mean leaves about n / 8 independent values
+    assert abs(faded.mean() - 0.201) < five_sigma(0.2, n / 8.0)
+    starts = (faded[1:] & ~faded[:-1]).sum()
+    ends_of_rounds = faded[1:].sum() / starts * 0.5
+    # sampled every 0.5 s, fades shorter than that are missed: the mean of the seen ones is a little longer
+    exact = 0.5 / ((1.0 - np.exp(-0.5 / (2.0 * 0.8))) * 0.8)
+    assert ends_of_rounds == pytest.approx(exact, rel=0.05)
+
+
+def test_without_fades_rounds_are_independent():
+    hits = drawn({}, flat(0.5)).astype(float) - 0.5
+    together = 4.0 * (hits[1:] * hits[:-1]).mean()
+    assert abs(together) < 5.0 / np.sqrt(hits[1:].size)
+
+
+def test_false_reads_are_their_share_of_all():
+    p = np.zeros((len(TIMES), 8, 10))
+    p[:, :, 0] = 0.5
+    hits = drawn({"false_reads": 0.2}, p)
+    false = hits[:, :, 1:].sum() / 0.9  # one in ten falls on the tag that is read rightly
+    n = int(hits[:, :, 0].sum() + false)
+    assert abs(false / n - 0.2) < five_sigma(0.2, n) + 0.01  # some fall on a read that is there
+
+
+def test_dead_tags_are_never_read(make):
+    log = make(faults={"dead": 0.25, "false_reads": 0.2}, drive={"duration": 300.0})
+    assert len(set(reads_of(log)[1])) == 30
+
+
+def test_misplaced_tags_are_wrong_in_the_map_by_the_distance_and_read_where_they_are(make):
+    right, wrong = make(), make(faults={"misplaced": 0.1, "misplaced_by": 1.5})
+    moved = [
+        np.hypot(a.x - b.x, a.y - b.y)
+        for a, b in zip(right.world.tags.values(), wrong.world.tags.values(), strict=True)
+    ]
+    assert np.count_nonzero(moved) == 4
+    np.testing.assert_allclose([d for d in moved if d], 1.5)
+    assert len(wrong.metadata["misplaced"].split(", ")) == 4
+    assert right.streams["rfid"].epc == wrong.streams["rfid"].epc
+
+
+@pytest.mark.parametrize("go_on", [False, True])
+def test_an_antenna_stops(make, go_on):
+    log = make(faults={"antenna_stop": {"antenna": 3, "time": 20.0, "rounds_go_on": go_on}})
+    for scan in scans(log):
+        stopped = scan.t >= 20.0
+        assert ("3" in scan.antennas) == (not stopped or go_on)
+        if stopped:
+            assert "3" not in {scan.antennas[k] for k in scan.antenna}
+
+
+def test_the_readers_clock_jumps(make):
+    log = make(faults={"clock_jump": {"time": 30.0, "jump": 0.75}})
+    t = np.unique(log.streams["rfid"].t)
+    assert t[58] == 29.5
+    assert t[59] == 30.75
+    assert log.streams["odometry"].t[-1] == 60.0
+
+
+def test_all_tags_fall_silent_but_the_antennas_listen(make):
+    log = make(faults={"silence": {"time": 20.0, "duration": 15.0}, "false_reads": 0.2})
+    t, _ = reads_of(log)
+    assert not ((t >= 20.0) & (t < 35.0)).any()
+    assert ((t >= 35.0) & (t < 40.0)).any()
+    assert len(scans(log)) == 120
+
+
+def test_a_rigs_survey_tells_where_the_tags_are(make):
+    """A map that is shifted, and a rig that knows by how much, give the reads of the tags' true places."""
+    rig = preset("office").rig.model_dump(mode="json", exclude_none=True)
+    shifted = Rig.model_validate(rig | {"survey": {"x": 3.0}})
+    log = make(rig={"survey": {"x": 3.0}})
+    tags = tag_map(log.world, shifted.survey)
+    p = read_probabilities(shifted.rfid, tags.tags, log.reference.at(np.arange(1, 121) * 0.5))
+    likely = p.sum(axis=(0, 1))
+    _, epcs = reads_of(log)
+    counts = np.array([(epcs == name).sum() for name in tags.names])
+    assert np.abs(counts - likely).max() < 5.0 * np.sqrt(likely.max()) + 5.0
+
+
+def test_another_detection_model_and_other_rates_are_drawn_from(make):
+    model = {"kind": "logistic", "coefficients": [30.0] + [0.0] * 10}
+    log = make(rig={"rfid": {"models": {"default": model}}}, rounds_per_second=5.0)
+    assert len(scans(log)) == 300
+    reach, near = 8.0, 0
+    tags = tag_map(log.world, log.rig.survey)
+    scan = scans(log)[0]
+    pose = log.reference.at(np.array([scan.t]))[0]
+    for i, antenna in enumerate(log.rig.rfid.all_antennas().values()):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        x, y = pose[0] + c * antenna.x - s * antenna.y, pose[1] + s * antenna.x + c * antenna.y
+        inside = np.hypot(tags.tags.points[:, 0] - x, tags.tags.points[:, 1] - y) < reach
+        near += inside.sum()
+        assert (scan.antenna == i).sum() >= inside.sum() - 5  # 999 of 1000 are read
+    assert near > 50
+
+
+def test_a_log_of_ten_minutes_takes_little_time():
+    start = time.perf_counter()
+    simulate(preset("office"), 1)
+    assert time.perf_counter() - start < 2.0
