@@ -20,6 +20,7 @@ from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
 from factors.se2 import Array
 
+TAGS_SUFFIX = ".tags.csv"
 TAG_COLUMNS = ("epc", "x", "y", "z", "facing")
 TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
 
@@ -126,7 +127,7 @@ def write_world(world: World, path: Path) -> None:
     """Write ``NAME.world.toml``, and the tags beside it as ``NAME.tags.csv``; in the same file where one has a covariance."""
     content = world.model_dump(mode="json", exclude_none=True)
     if world.tags and all(tag.covariance is None for tag in world.tags.values()):
-        content["tags"] = f"{path.name.removesuffix('.toml').removesuffix('.world')}.tags.csv"
+        content["tags"] = path.name.removesuffix(".toml").removesuffix(".world") + TAGS_SUFFIX
         _write_tags(world.tags, path.parent / content["tags"])
     write_toml(path, content)
 

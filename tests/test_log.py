@@ -10,6 +10,7 @@ from factorgraph_loc.log import (
     BearingRangeStream,
     IncrementStream,
     Log,
+    RfidStream,
     StartPose,
     VelocityStream,
     YawRateStream,
@@ -155,6 +156,48 @@ def test_a_joined_log_survives_the_native_format(kind, tmp_path):
     for name, stream in log.streams.items():
         np.testing.assert_allclose(read.streams[name].t, stream.t, atol=1e-9)
     np.testing.assert_allclose(read.reference.poses, log.reference.poses, atol=1e-9)
+
+
+def reads(*rows):
+    """Rows of (t, round, antenna, EPC, age); RSSI and the like unknown."""
+    t, number, antenna, epc, age = zip(*rows, strict=True)
+    nothing = np.full(len(t), np.nan)
+    return RfidStream(column(*t), np.array(number), antenna, epc, column(*age), nothing, nothing, nothing)
+
+
+READS = reads(
+    (1.0, 0, "left", "E1", 0.2),
+    (1.0, 0, "left", "E2", 0.0),
+    (1.0, 1, "right", "", 0.0),
+    (1.0, 2, "left", "E1", 0.1),
+    (2.0, 0, "right", "E1", 0.0),
+    (3.0, 0, "left", "", 0.0),
+)
+
+
+def test_rounds_that_end_together_are_one_scan():
+    first, second, third = READS.measurements(0.5)
+    assert (first.t, first.antennas, first.tags) == (1.5, ("left", "right", "left"), ("E1", "E2", "E1"))
+    assert first.antenna.tolist() == [0, 0, 2]
+    np.testing.assert_array_equal(first.age, (0.2, 0.0, 0.1))
+    assert (second.antennas, second.tags) == (("right",), ("E1",))
+    assert (third.t, third.antennas, third.tags, third.rssi.shape) == (3.5, ("left",), (), (0,))
+
+
+def test_reads_are_cut_and_joined_by_scans():
+    log = make_log(odometry=ODOMETRY, rfid=READS)
+    first, second = cut(log, 0.0, 1.5), cut(log, 1.5, 9.0)
+    assert [len(list(part.measurements(("rfid",)))) for part in (first, second)] == [1, 2]
+    again = list(join(second, first, gap=0.5).measurements(("rfid",)))
+    # the second part ends at 3 s, the first begins with odometry at 0 s
+    assert [scan.t for scan in again] == [2.0, 3.0, 4.5]
+    assert [scan.tags for scan in again] == [("E1",), (), ("E1", "E2", "E1")]
+    assert again[2].antennas == ("left", "right", "left")
+
+
+def test_sensors_without_a_stream_are_passed_over():
+    log = make_log(odometry=ODOMETRY, rfid=READS)
+    assert len(list(log.measurements(("odometry", "rfid", "rssi", "phase")))) == 6
 
 
 def test_parts_that_are_none_and_logs_that_do_not_fit():

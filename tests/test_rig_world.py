@@ -5,7 +5,7 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.rig import BearingRangeSettings, ImuSettings, OdometrySettings, Rig, read_rig, write_rig
-from factorgraph_loc.world import Landmark, World, read_world, write_world
+from factorgraph_loc.world import Landmark, Tag, World, read_world, write_world
 
 GOOD = "[bearing_range]\nrange_sigma = 0.1\n"
 
@@ -78,6 +78,10 @@ BAD_WORLDS = {
     "no y": ("[landmarks.A]\nx = 1\n", "landmarks.A.y is missing"),
     "misspelt": ("[landmarks.A]\nx = 1\ny = 2\nsigm = 3\n", "unknown key landmarks.A.sigm: did you mean sigma?"),
     "infinite": ("[landmarks.A]\nx = inf\ny = 2\n", "landmarks.A.x is inf"),
+    "wall of three": ("walls = [[0, 1, 2]]\n", "walls.0"),
+    "tag in degrees": ("[tags.E1]\nx = 1\ny = 2\nfacing = 90\n", "tags.E1.facing is 90"),
+    "tag's covariance": ("[tags.E1]\nx = 1\ny = 2\ncovariance = [1, 2, 1]\n", "positive semi-definite"),
+    "table outside": ('tags = "../a.tags.csv"\n', "leaves its folder"),
     "negative deviation": ("[landmarks.A]\nx = 1\ny = 2\nsigma = -1\n", "landmarks.A.sigma is -1"),
 }
 
@@ -93,3 +97,49 @@ def test_bad_worlds(tmp_path, text, fragment):
 def test_missing_files(tmp_path):
     with pytest.raises(InputError, match=r"none.rig.toml: cannot be read: No such file"):
         read_rig(tmp_path / "none.rig.toml")
+
+
+def test_tags_and_walls_come_back(tmp_path):
+    tags = {"E1": Tag(x=1.0, y=1 / 3, z=0.5, facing=-1.5), 'a "comma", ü': Tag(x=0.1, y=0.2, sigma=0.05)}
+    world = World(name="hall", tags=tags, walls=((0.0, 1.0, 2.0, 3.0), (2.0, 3.0, -4.0, 5.5)))
+    write_world(world, tmp_path / "a.world.toml")
+    assert "E1" not in (tmp_path / "a.world.toml").read_text()
+    assert (tmp_path / "a.tags.csv").read_text().splitlines()[:2] == [
+        "epc,x,y,z,facing,sigma",
+        "E1,1.0,0.3333333333333333,0.5,-1.5,0.0",
+    ]
+    assert read_world(tmp_path / "a.world.toml") == world
+
+
+def test_tags_with_covariances_stay_in_the_map(tmp_path):
+    world = World(tags={"E1": Tag(x=1.0, y=2.0, covariance=(0.04, 0.01, 0.09))})
+    write_world(world, tmp_path / "a.world.toml")
+    assert [file.name for file in tmp_path.iterdir()] == ["a.world.toml"]
+    assert read_world(tmp_path / "a.world.toml") == world
+
+
+def test_a_table_of_tags_by_hand(tmp_path):
+    (tmp_path / "a.world.toml").write_text('tags = "a.tags.csv"\n')
+    (tmp_path / "a.tags.csv").write_text("y,x,epc,z,facing,label\n2,1,E1,,,shelf\n\n4,3,E2,0.5,3.14,\n")
+    world = read_world(tmp_path / "a.world.toml")
+    assert world.tags == {"E1": Tag(x=1, y=2), "E2": Tag(x=3, y=4, z=0.5, facing=3.14)}
+
+
+BAD_TAGS = {
+    "twice": ("E1,1,2,3,\nE2,1,2,3,\nE1,4,5,6,\n", ":4: epc is 'E1', expected another EPC than in row 2"),
+    "no EPC": (",1,2,3,\n", ":2: epc is ''"),
+    "no y": ("E1,1,,3,\n", ":2: y is missing"),
+    "degrees": ("E1,1,2,3,90\n", ":2: facing is 90.0"),
+    "word": ("E1,1,2,high,\n", ":2: z is 'high', expected a number"),
+    "short": ("E1,1,2\n", ":2: row is 'E1,1,2'"),
+}
+
+
+@pytest.mark.parametrize(("rows", "fragment"), BAD_TAGS.values(), ids=list(BAD_TAGS))
+def test_bad_tables_of_tags(tmp_path, rows, fragment):
+    (tmp_path / "a.world.toml").write_text('tags = "a.tags.csv"\n')
+    (tmp_path / "a.tags.csv").write_text("epc,x,y,z,facing\n" + rows)
+    with pytest.raises(InputError, match=r"a\.tags\.csv:") as caught:
+        read_world(tmp_path / "a.world.toml")
+    assert fragment in str(caught.value)
+    assert "\n" not in str(caught.value)

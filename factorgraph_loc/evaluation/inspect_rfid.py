@@ -18,14 +18,14 @@ SHOWN = 5  # names in a line
 @dataclass(frozen=True)
 class AntennaSummary:
     """One antenna: its reads and rounds, rounds per second from the first to the last, rounds without a read, and the last
-    stamps [s] of a round and of a read (-inf without)."""
+    stamps [s] of a round and of a read (None without)."""
 
     reads: int
     rounds: int
     rate: float
     silent: int
     last: float
-    last_read: float
+    last_read: float | None
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
             rate=(len(t) - 1) / span if span > 0.0 else 0.0,
             silent=int(np.count_nonzero(silent & mine)),
             last=float(t.max()),
-            last_read=float(reads.max(initial=-np.inf)),
+            last_read=float(reads.max()) if len(reads) else None,
         )
     counts = Counter(epc for epc in stream.epc if epc)
     t = stream.t[first]
@@ -104,7 +104,7 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
     for name, antenna in found.antennas.items():
         if antenna.last < last - STOPPED:
             out.append(f"antenna {name} stops at {antenna.last:.1f} s, {last - antenna.last:.1f} s before the others")
-        elif not antenna.reads:
+        elif antenna.last_read is None:
             out.append(f"antenna {name} reads nothing")
         elif antenna.last_read < last - STOPPED:
             out.append(f"antenna {name} reads nothing after {antenna.last_read:.1f} s")

@@ -32,7 +32,7 @@ from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rfid_settings import RfidSettings
 from factorgraph_loc.rig import Rig, placed, read_rig, write_rig
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows, write_tum
-from factorgraph_loc.world import World, parse_world, read_world, write_world
+from factorgraph_loc.world import TAGS_SUFFIX, World, parse_world, read_world, write_world
 from factors.se2 import Array
 
 RUN_FILE = "run.toml"
@@ -132,7 +132,11 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
                 tables[sensor] = table
             else:
                 warnings.append(f"{file}: holds no rows")
-    unread = sorted(file.name for file in folder.iterdir() if file.suffix in SUFFIXES and file.stem not in SHAPES)
+    unread = sorted(
+        file.name
+        for file in folder.iterdir()
+        if file.suffix in SUFFIXES and file.stem not in SHAPES and not file.name.endswith(TAGS_SUFFIX)
+    )
     if unread:
         warnings.append(f"{folder}: this version does not read {', '.join(unread)}")
     return tables

@@ -1,0 +1,114 @@
+"""What `inspect` says about reads of tags."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.inspect import inspect
+from factorgraph_loc.log import Log, RfidStream, VelocityStream
+from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import Tag, World
+
+ANTENNAS = ("left", "right")
+
+
+def make_log(**changes) -> Log:
+    """A minute with two rounds per second of two antennas that end together; left reads A and B, right nothing in every other."""
+    t, number, antenna, epc = [], [], [], []
+    for k in range(120):
+        for a, name in enumerate(ANTENNAS):
+            tags = ("A", "B") if name == "left" else (("A",) if k % 2 == 0 else ("",))
+            for tag in tags:
+                t.append(0.5 * k)
+                number.append(a)
+                antenna.append(name)
+                epc.append(tag)
+    nothing = np.full(len(t), np.nan)
+    stream = RfidStream(np.array(t), np.array(number), antenna, epc, np.zeros(len(t)), nothing, nothing, nothing)
+    wheels = np.arange(600) * 0.1
+    settings = RfidSettings(antennas={name: AntennaSettings() for name in ANTENNAS})
+    return Log(
+        name="minute",
+        rig=Rig(sensors=("odometry", "rfid"), rfid=settings),
+        world=World(tags={name: Tag(x=0.0, y=0.0) for name in "AB"}),
+        streams={
+            "odometry": VelocityStream(wheels, wheels, wheels),
+            "rfid": dataclasses.replace(stream, **changes),
+        },
+    )
+
+
+def stream_of(log: Log) -> RfidStream:
+    stream = log.streams["rfid"]
+    assert isinstance(stream, RfidStream)
+    return stream
+
+
+def only(keep: np.ndarray) -> dict[str, object]:
+    """The columns of the rows to keep."""
+    stream = stream_of(make_log())
+    columns = {field.name: np.asarray(getattr(stream, field.name))[keep] for field in dataclasses.fields(stream)}
+    return {name: column.tolist() if name in {"antenna", "epc"} else column for name, column in columns.items()}
+
+
+def test_counts() -> None:
+    found = inspect(make_log())
+    rfid = found.rfid
+    assert rfid is not None
+    assert (rfid.reads, rfid.rounds, rfid.scans, rfid.known, found.problems) == (300, 240, 120, 2, ())
+    right = rfid.antennas["right"]
+    assert (right.reads, right.rounds, right.silent, right.last, right.last_read) == (60, 120, 60, 59.5, 59.0)
+    assert right.rate == pytest.approx(2.0)
+    json.dumps(dataclasses.asdict(rfid), allow_nan=False)
+
+
+def test_a_log_without_reads() -> None:
+    log = make_log()
+    assert inspect(dataclasses.replace(log, streams={"odometry": log.streams["odometry"]})).rfid is None
+    none = inspect(make_log(**only(np.zeros(360, dtype=bool)[: len(stream_of(log).t)])))
+    assert none.rfid is not None
+    assert none.rfid.reads == none.rfid.rounds == 0
+    assert "antenna left of the rig never listens" in none.problems
+
+
+def test_tags_that_do_not_match_the_map() -> None:
+    world = World(tags={name: Tag(x=0.0, y=0.0) for name in ("A", "C", "D")})
+    found = inspect(dataclasses.replace(make_log(), world=world))
+    assert found.rfid is not None
+    assert (found.rfid.unread, found.rfid.unknown) == (("C", "D"), {"B": 120})
+    assert found.problems == (
+        "2 of 3 tags of the map are never read: C, D",
+        "120 reads are of 1 tags that the map lacks: B",
+    )
+
+
+def test_antennas_that_do_not_match_the_rig() -> None:
+    rig = Rig(rfid=RfidSettings(antennas={"left": AntennaSettings(), "rear": AntennaSettings()}), sensors=("odometry",))
+    assert inspect(dataclasses.replace(make_log(), rig=rig)).problems == (
+        "antenna right is not on the rig: 60 reads, 120 rounds",
+        "antenna rear of the rig never listens",
+    )
+
+
+def test_an_antenna_that_stops() -> None:
+    stream = stream_of(make_log())
+    right = np.array(stream.antenna) == "right"
+    (problem,) = inspect(make_log(**only(~right | (stream.t < 30.0)))).problems
+    assert problem == "antenna right stops at 29.5 s, 30.0 s before the others"
+    # its rounds go on, without a read
+    epc = ["" if r and t >= 30.0 else e for r, t, e in zip(right, stream.t, stream.epc, strict=True)]
+    (problem,) = inspect(make_log(epc=epc)).problems
+    assert problem == "antenna right reads nothing after 29.0 s"
+    epc = ["" if r else e for r, e in zip(right, stream.epc, strict=True)]
+    assert inspect(make_log(epc=epc)).problems == ("antenna right reads nothing",)
+
+
+def test_clocks_that_do_not_agree() -> None:
+    t = stream_of(make_log()).t
+    (problem,) = inspect(make_log(t=t + 3.0)).problems
+    assert problem == "the reads reach 2.6 s after the odometry: do their clocks agree?"
+    (problem,) = inspect(make_log(t=np.where(t >= 30.0, t - 10.0, t))).problems
+    assert problem == "38 rounds have stamps up to 9.5 s before an earlier one: did the clock of the reader jump?"

@@ -1,0 +1,84 @@
+"""What a run makes of reads of tags: their sensors, and tags that are never read."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.compare import compare
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import RfidStream
+from factorgraph_loc.world import Tag
+
+ALL = ("odometry", "rfid", "rssi", "phase")
+
+
+@pytest.fixture
+def reading(log):
+    """The short log with reads of tag a and of an unknown one; RSSI is known of the first read, phase of none."""
+    nothing = np.full(2, np.nan)
+    stream = RfidStream(
+        np.array((0.5, 1.0)),
+        np.arange(2),
+        ["1", "1"],
+        ["a", "x"],
+        np.zeros(2),
+        np.array((-60.0, np.nan)),
+        nothing,
+        nothing,
+    )
+    world = log.world.model_copy(update={"tags": {name: Tag(x=1.0, y=1.0) for name in ("a", "b", "c")}})
+    return replace(log, streams=dict(log.streams) | {"rfid": stream}, world=world)
+
+
+def test_rssi_and_phase_are_sensors_of_the_reads(reading, fake):
+    run(reading, RunConfig("fake", sensors=ALL[:3]))
+    assert fake.made.setup.sensors == ALL[:3]
+    assert sum(kind == "RfidScan" for kind, _ in fake.made.calls) == 2
+    with pytest.raises(InputError, match="has no sensor 'phase': none of its reads has a value of it"):
+        run(reading, RunConfig("fake", sensors=ALL))
+    stream = replace(reading.streams["rfid"], phase=np.array((np.nan, 0.5)))
+    run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL))
+    assert fake.made.setup.sensors == ALL
+
+
+def test_rssi_without_the_reads_is_an_error(reading, log):
+    with pytest.raises(InputError, match="rssi comes with reads of tags, expected rfid among the sensors too"):
+        run(reading, RunConfig("fake", sensors=("odometry", "rssi")))
+    with pytest.raises(InputError, match="has no sensor 'rssi'"):
+        run(log, RunConfig("fake", sensors=("odometry", "rssi", "rfid")))
+
+
+def test_what_the_rig_lists_and_the_reads_lack_is_left_out(reading, fake):
+    rig = reading.rig.model_copy(update={"sensors": ALL})
+    result = run(replace(reading, rig=rig), RunConfig("fake"))
+    assert fake.made.setup.sensors == ALL[:3]
+    assert sum("phase" in warning for warning in result.warnings) == 1
+    assert not any("rssi" in warning for warning in result.warnings)
+
+
+def test_tags_that_are_never_read_are_left_out(reading, fake):
+    result = run(reading, RunConfig("fake", sensors=ALL[:2]))
+    assert set(fake.made.setup.world.tags) == {"a"}
+    assert set(fake.made.setup.world.landmarks) == {"a", "b"}
+    (warning,) = (warning for warning in result.warnings if "never read" in warning)
+    assert warning == "straight: 2 of 3 tags of the map are never read and are left out: b, c"
+    assert set(reading.world.tags) == {"a", "b", "c"}
+    result = run(reading, RunConfig("fake", sensors=("odometry",)))
+    assert set(fake.made.setup.world.tags) == {"a", "b", "c"}
+    assert not any("never read" in warning for warning in result.warnings)
+
+
+def test_no_tag_of_the_map_is_ever_read(reading, fake):
+    stream = replace(reading.streams["rfid"], epc=["", "x"])
+    result = run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL[:2]))
+    assert fake.made.setup.world.tags == {}
+    assert any("3 of 3 tags of the map are never read" in warning for warning in result.warnings)
+
+
+def test_compare_takes_the_same_sensors(reading, tmp_path):
+    compare([reading], [RunConfig("dead_reckoning", sensors=ALL[:3])], tmp_path / "out", jobs=1)
+    assert not list((tmp_path / "out").rglob("error.txt"))
+    with pytest.raises(InputError, match="no log has a sensor 'phse': did you mean phase"):
+        compare([reading], [RunConfig("dead_reckoning", sensors=("odometry", "phse"))], tmp_path / "none")

@@ -1,0 +1,184 @@
+"""RFID reads in the native format: rounds from gaps and from inventories, and that what is written comes back."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from factorgraph_loc.log import Log, RfidStream, VelocityStream, cut
+from factorgraph_loc.readers import load, write_native
+from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import Tag, World
+
+READS = "t_ns,antenna,epc,rssi,phase,frequency\n"
+INVENTORIES = "t_ns,antenna,duration\n"
+
+
+def seconds(*values):
+    return np.array(values) * 1e-9
+
+
+@pytest.fixture
+def hall(native):
+    """The hall's log, from 1 s to 2 s, with reads: t = 0 at 1 s."""
+    (native / "bearing_range.csv").unlink()
+    (native / "rfid.csv").write_text(
+        READS
+        + "1100000000,left,E1,-60,0.5,915e6\n1130000000,left,E2,,,\n"
+        + "1130000000,right,E1,-61.5,,\n1200000000,right,E2,,6.25,\n"
+    )
+    return native
+
+
+def test_rounds_from_gaps(hall, one):
+    log = one(hall)
+    reads = log.streams["rfid"]
+    assert reads.antenna == ["left", "left", "right", "right"]
+    assert reads.round.tolist() == [0, 0, 1, 2]
+    np.testing.assert_array_equal(reads.t, (0.13, 0.13, 0.13, 0.2))
+    np.testing.assert_array_equal(reads.age, (0.03, 0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(reads.rssi, (-60.0, np.nan, -61.5, np.nan))
+    np.testing.assert_array_equal(reads.phase, (0.5, np.nan, np.nan, 6.25))
+    both, right = log.measurements(("rfid",))
+    assert (both.antennas, both.tags, both.antenna.tolist()) == (("left", "right"), ("E1", "E2", "E1"), [0, 0, 1])
+    assert right.antennas == ("right",)
+    assert log.warnings == ()
+
+
+def test_the_gap_is_the_rigs(hall, one):
+    rig = "[rig.rfid]\nround_gap = 0.1\nantennas.left = {}\nantennas.right = {}\n"
+    (hall / "run.toml").write_text(rig)
+    assert one(hall).streams["rfid"].round.tolist() == [0, 0, 1, 1]
+
+
+def test_rounds_from_inventories(hall, one):
+    (hall / "inventories.csv").write_text(
+        INVENTORIES
+        + "1150000000,left,0.05\n1150000000,right,0.02\n1150000000,back,0.05\n1180000000,right,0.01\n1240000000,left,0.05\n"
+    )
+    log = one(hall)
+    reads = log.streams["rfid"]
+    assert list(zip(reads.antenna, reads.epc, strict=True)) == [
+        ("left", "E1"),
+        ("left", "E2"),
+        ("right", "E1"),
+        ("back", ""),
+        ("right", ""),
+        ("left", ""),
+    ]
+    np.testing.assert_allclose(reads.age, (0.05, 0.02, 0.02, 0.0, 0.0, 0.0))
+    first, second, third = log.measurements(("rfid",))
+    assert (first.antennas, len(first.tags)) == (("left", "right", "back"), 3)
+    assert (second.antennas, second.tags, third.t) == (("right",), (), 0.24)
+    (warning,) = log.warnings
+    assert "rfid.csv: 1 of 4 reads lie outside every inventory and are left out" in warning
+
+
+def test_inventories_of_antennas_that_read_nothing(hall, one):
+    (hall / "rfid.csv").unlink()
+    (hall / "inventories.csv").write_text(INVENTORIES + "1500000000,left,0.5\n2000000000,left,0.5\n")
+    scans = list(one(hall).measurements(("rfid",)))
+    assert [(scan.t, scan.antennas, scan.tags) for scan in scans] == [(0.5, ("left",), ()), (1.0, ("left",), ())]
+
+
+def test_a_clock_that_jumps_is_kept_and_told(hall, one):
+    (hall / "inventories.csv").write_text(INVENTORIES + "9000000000,left,0.05\n1150000000,right,0.05\n")
+    log = one(hall)
+    assert log.streams["rfid"].t.tolist() == [8.0, 0.15]
+    assert any("1 rows are late, by at most 7.850 s" in warning for warning in log.warnings)
+
+
+BAD = {
+    "no tag": ("rfid.csv", READS + "1,left,,,,\n", "rfid.csv:2: epc is ''", "EPC of a tag"),
+    "no antenna": ("rfid.csv", READS + "1,,E1,,,\n", "rfid.csv:2: antenna is ''", "name of an antenna"),
+    "degrees": ("rfid.csv", READS + "1,left,E1,,90,\n", "rfid.csv:2: phase is 90.0", "radians"),
+    "megahertz": ("rfid.csv", READS + "1,left,E1,,,915\n", "rfid.csv:2: frequency is 915.0", "Hz"),
+    "text": ("rfid.csv", READS + "1,left,E1,loud,,\n", "rfid.csv:2: rssi is 'loud'", "a number"),
+    "column missing": ("rfid.csv", "t_ns,antenna,epc,rssi,phase\n", "column frequency is missing"),
+    "time going back": ("rfid.csv", READS + "9000000000,left,E1,,,\n1,left,E1,,,\n", "rfid.csv:3: time"),
+    "no duration": ("inventories.csv", INVENTORIES + "1,left,\n", "inventories.csv:2: duration is nan", "seconds"),
+    "negative duration": ("inventories.csv", INVENTORIES + "1,left,-0.5\n", "duration is -0.5", "seconds"),
+    "milliseconds": ("inventories.csv", INVENTORIES + "1,left,5000\n", "duration is 5000.0", "0 to 3600"),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "fragments"), [(n, t, f) for n, t, *f in BAD.values()], ids=list(BAD))
+def test_what_is_refused(hall, refused, name, text, fragments):
+    (hall / name).write_text(text)
+    refused(hall, *fragments)
+
+
+BAD_PLACES = {
+    "beyond": ("3", "inventory is 3.0", "1 to 2"),
+    "none": ("", "inventory is nan", "1 to 2"),
+    "half": ("1.5", "inventory is 1.5", "1 to 2"),
+    "of another antenna": ("2", "inventory is 2.0", "of the same antenna"),
+}
+
+
+@pytest.mark.parametrize(("place", "fragments"), [(p, f) for p, *f in BAD_PLACES.values()], ids=list(BAD_PLACES))
+def test_reads_that_name_a_wrong_inventory(hall, refused, place, fragments):
+    (hall / "rfid.csv").write_text(READS.strip() + f",inventory\n1000000000,left,E1,,,,{place}\n")
+    (hall / "inventories.csv").write_text(INVENTORIES + "1200000000,left,0.5\n1200000000,right,0.5\n")
+    refused(hall, "rfid.csv:2:", *fragments)
+
+
+def test_tags_of_the_map_beside_it(hall, one):
+    (hall / "hall.tags.csv").write_text("epc,x,y,z,facing\nE1,1,2,0.5,\n")
+    (hall / "run.toml").write_text('[world]\ntags = "hall.tags.csv"\n[rig.rfid]\npreset = "rackham"\n')
+    log = one(hall)
+    assert (log.world.tags, log.warnings) == ({"E1": Tag(x=1, y=2, z=0.5)}, ())
+
+
+names = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1, max_size=4)
+values = st.one_of(st.just(np.nan), st.floats(-100.0, 0.0))
+phases = st.one_of(st.just(np.nan), st.floats(0.0, 6.25))
+frequencies = st.one_of(st.just(np.nan), st.floats(8e8, 1e9))
+
+
+@st.composite
+def streams(draw):
+    """Rounds at any stamps, ages to the nanosecond, two rounds of one antenna at one stamp included."""
+    rows = []
+    ends = sorted(draw(st.lists(st.integers(10**9, 10**12), min_size=1, max_size=6)))
+    for number, end in enumerate(ends):
+        antenna = draw(st.sampled_from(("left", "right")))
+        reads = draw(st.lists(st.tuples(names, st.integers(0, 10**9), values, phases, frequencies), max_size=3))
+        for epc, age, rssi, phase, frequency in reads or [("", 0, np.nan, np.nan, np.nan)]:
+            rows.append((end / 1e9, number, antenna, epc, age / 1e9, rssi, phase, frequency))
+    t, number, antenna, epc, *rest = zip(*rows, strict=True)
+    return RfidStream(np.array(t), np.array(number), list(antenna), list(epc), *map(np.array, rest))
+
+
+@given(stream=streams(), format=st.sampled_from(["csv", "parquet"]), t0_ns=st.integers(-(10**18), 2 * 10**18))
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
+def test_what_is_written_comes_back(tmp_path_factory, stream, format, t0_ns):
+    odometry = VelocityStream(np.array((0.0, 1.0)), np.ones(2), np.zeros(2))
+    rig = Rig(sensors=("odometry", "rfid"), rfid=RfidSettings(antennas={"left": AntennaSettings(yaw=0.5)}))
+    world = World(tags={epc: Tag(x=0.1, y=1 / 3, facing=-1.5) for epc in stream.epc if epc})
+    log = Log("rounds", rig, world, {"odometry": odometry, "rfid": stream}, t0_ns=t0_ns)
+    folder = tmp_path_factory.mktemp("logs") / "out"
+    write_native(log, folder, format=format)
+    (back,) = load(str(folder))
+    assert (back.rig, back.world, back.t0_ns) == (rig, world, t0_ns)
+    for field in dataclasses.fields(stream):
+        np.testing.assert_array_equal(getattr(back.streams["rfid"], field.name), getattr(stream, field.name))
+
+
+def test_a_recorded_run_comes_back(data_root, tmp_path):
+    (log,) = load("rfid-aisle-run16", data_root=data_root)
+    log = cut(log, 0.0, 60.0)
+    write_native(log, tmp_path / "out")
+    (back,) = load(str(tmp_path / "out"))
+    assert back.world == log.world
+    for field in dataclasses.fields(RfidStream):
+        np.testing.assert_array_equal(
+            getattr(back.streams["rfid"], field.name), getattr(log.streams["rfid"], field.name)
+        )
+    # without the table of rounds the gaps tell the same ones
+    (tmp_path / "out" / "inventories.csv").unlink()
+    (again,) = load(str(tmp_path / "out"))
+    np.testing.assert_array_equal(again.streams["rfid"].round, log.streams["rfid"].round)
