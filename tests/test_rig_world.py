@@ -1,5 +1,8 @@
 """What people write in TOML: rigs and worlds, and the messages when something is wrong in them."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -32,6 +35,14 @@ def test_a_rig_needs_nothing_but_what_it_has(tmp_path):
     (tmp_path / "a.rig.toml").write_text("")
     assert read_rig(tmp_path / "a.rig.toml") == Rig()
     assert Rig().time_offset("bearing_range") == 0.0
+
+
+def test_the_example_of_the_documentation(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "rig.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "a.rig.toml").write_text(example)
+    model = read_rig(tmp_path / "a.rig.toml").rfid.model()
+    assert [antenna.model for antenna in model.antennas] == [0, 1]
 
 
 def test_positions():

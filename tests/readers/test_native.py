@@ -334,8 +334,9 @@ def test_the_example_of_the_documentation(tmp_path, one, monkeypatch):
     for name, text in blocks:
         (tmp_path / "hall" / name).write_text(text)
     log = one(tmp_path / "hall")
-    assert (len(blocks), log.warnings, len(log.reference)) == (4, (), 2)
-    assert {name: len(stream.t) for name, stream in log.streams.items()} == {"odometry": 3, "bearing_range": 3}
+    assert (len(blocks), log.warnings, len(log.reference)) == (7, (), 2)
+    rows = {name: len(stream.t) for name, stream in log.streams.items()}
+    assert rows == {"odometry": 3, "bearing_range": 3, "rfid": 3}
     # the run.toml with every key, and the lines of Python
     whole = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]
     parse_model(RunFile, tomllib.loads(whole), "run.toml")
