@@ -58,6 +58,15 @@ class DriveSettings(FileModel):
     clearance: Annotated[float, Field(ge=0.25, le=2.0, description="m")] = 0.3
 
 
+class PhaseSettings(FileModel):
+    """The phase that comes with a read: ``frequency`` of the carrier, noise ``sigma``, and a share of reads that are off by pi
+    (``flips``), as with most readers."""
+
+    frequency: Annotated[float, Field(ge=3e8, le=6e9, description="Hz")] = 920.625e6
+    sigma: Annotated[float, Field(ge=0.0, le=3.0, description="rad")] = 0.1
+    flips: Share = 0.2
+
+
 class SightingSettings(FileModel):
     """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
     axis, and not through walls."""
@@ -114,13 +123,14 @@ class FaultSettings(FileModel):
 
 
 class SimulationSettings(FileModel):
-    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: what estimators are told, and
-    what reads and sightings are drawn from."""
+    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``phase``: if given, reads have one.
+    ``rig``: what estimators are told, and what reads and sightings are drawn from."""
 
     name: str = "office"
     world: WorldSettings
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
+    phase: PhaseSettings | None = None
     sightings: SightingSettings = SightingSettings()
     faults: FaultSettings = FaultSettings()
     rig: Rig
@@ -160,8 +170,9 @@ RACKHAM_RIG: Mapping[str, Any] = {
     "bearing_range": {"range_sigma": 0.05, "range_sigma_relative": 0.02, "bearing_sigma": 0.02},
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
-# A fade of mean 2 s that takes a share of 0.2 makes the count of reads in many rounds vary 2.4 times as much as independent
-# rounds would, where 0.7 of the rounds outside fades read the tag (1.7 times at 0.5, 3.8 times at 0.9): hence the tempering.
+# Fades of a share f that last d in the mean make the count of reads in many rounds, dt apart, vary more than independent rounds
+# would: 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) times as much, with rho = exp(-dt / (d (1 - f))), where a share p of the rounds
+# outside fades read the tag. Here that is 1.9 at p = 0.5 and 2.7 at 0.7: the tempering is one over 2.5.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.4}},

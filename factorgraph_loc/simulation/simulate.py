@@ -12,7 +12,7 @@ from factorgraph_loc.readers.simulated_odometry import wheel_odometry
 from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.recorded import RecordedLooks
-from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
+from factorgraph_loc.simulation.rfid import draw_reads, phases, read_probabilities, rfid_stream
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
 from factorgraph_loc.simulation.sightings import sighting_stream
 from factorgraph_loc.simulation.trajectories import drive
@@ -36,7 +36,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     With ``recorded`` the robot carries the antennas of those recordings, and reads what they read (:mod:`.recorded`).
     InputError if the settings leave no room for tags or for the robot.
     """
-    rngs = np.random.default_rng(seed).spawn(7)
+    rngs = np.random.default_rng(seed).spawn(8)
     rig = settings.rig
     if recorded is not None:
         rig = rig.model_copy(update={"rfid": recorded.rfid, "survey": SurveySettings()})
@@ -44,7 +44,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     truth = drive(world, settings.drive, rngs[1])
     streams: dict[str, Stream] = {
         "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
-        "rfid": _reads(settings, rig, world, truth, recorded, rngs[3]),
+        "rfid": _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7])),
     }
     if world.landmarks and rig.bearing_range is not None:
         times = _ticks(settings.sightings.rate, truth)
@@ -80,7 +80,7 @@ def _reads(
     world: World,
     truth: Trajectory,
     recorded: RecordedLooks | None,
-    rng: np.random.Generator,
+    rngs: tuple[np.random.Generator, np.random.Generator],
 ) -> Stream:
     rfid = rig.rfid
     assert rfid is not None, "the settings have been checked"
@@ -88,9 +88,13 @@ def _reads(
     times = _ticks(settings.rounds_per_second, truth)
     poses = truth.at(times)
     # recorded outcomes are probabilities of zero and one
-    p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rng)
-    hits = draw_reads(rfid, p, times, settings.faults, rng)
-    return rfid_stream(list(rfid.all_antennas()), list(tags.names), times, hits, settings.faults)
+    p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rngs[0])
+    hits = draw_reads(rfid, p, times, settings.faults, rngs[0])
+    names, epcs = list(rfid.all_antennas()), list(tags.names)
+    if settings.phase is None:
+        return rfid_stream(names, epcs, times, hits, settings.faults)
+    phase = phases(rfid, tags.tags, poses, settings.phase, rngs[1])
+    return rfid_stream(names, epcs, times, hits, settings.faults, phase, settings.phase.frequency)
 
 
 def _ticks(rate: float, truth: Trajectory) -> Array:
