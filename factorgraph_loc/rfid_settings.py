@@ -17,6 +17,8 @@ from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.grids import read_grid
 from factors import se2
 from factors.rfid import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
+from factors.rfid_phase import PhaseModel
+from factors.rfid_rssi import RssiModel
 from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
@@ -82,6 +84,43 @@ class AntennaSettings(FileModel):
     model: str = "default"
 
 
+class RssiSettings(FileModel):
+    """See :class:`factors.rfid_rssi.RssiModel`; ``coefficients`` in the order of ``factors.rfid_rssi.FEATURES``."""
+
+    coefficients: tuple[float, float, float, float, float, float]
+    sigma: Annotated[float, Field(gt=0.0, le=30.0, description="dB")]
+    dof: Annotated[float, Field(gt=0.0, le=1000.0, description="degrees of freedom of Student's density")]
+    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.01
+
+    def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
+        """The model for antennas at these places."""
+        return RssiModel(antennas, self.coefficients, self.sigma, self.dof, self.tempering)
+
+
+class PhaseSettings(FileModel):
+    """See :class:`factors.rfid_phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]: a read counts in several of
+    them, in each by the share of ``step`` in ``window``."""
+
+    kappa: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
+    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
+    max_range: Annotated[float, Field(gt=0.0, le=50.0, description="m")] = 2.5
+    min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
+    window: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 2.0
+    step: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.0
+
+    @model_validator(mode="after")
+    def _has_no_gaps(self) -> PhaseSettings:
+        if self.step > self.window:
+            raise ValueError(f"step {self.step:g} s leaves gaps between windows, expected at most {self.window:g} s")
+        return self
+
+    def model(self, antennas: tuple[Antenna, ...]) -> PhaseModel:
+        """The model for antennas at these places, of one window."""
+        return PhaseModel(
+            antennas, self.kappa, self.tempering * self.step / self.window, self.max_range, self.min_reads
+        )
+
+
 RACKHAM_RADIUS = 0.25  # m
 
 
@@ -106,7 +145,7 @@ class RfidSettings(FileModel):
 
     ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
     below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where the
-    log does not tell the rounds.
+    log does not tell the rounds. ``rssi``, ``phase``: what is made of them, where an estimator is given these sensors.
     """
 
     time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
@@ -118,6 +157,8 @@ class RfidSettings(FileModel):
     miss: Share = 0.0
     tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
+    rssi: RssiSettings | None = None
+    phase: PhaseSettings | None = None
 
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:

@@ -2,8 +2,8 @@
 
 ``rssi = a0 - 10 a1 log10(d) + a2 w + a3 w^2 + a4 c + a5 c^2`` [dBm], with the distance d [m] from the antenna to the tag,
 w = 1 - cosine of the angle from the boresight, and c the cosine between the direction that the tag faces and that to the antenna
-(0 where that is not known): Rappaport, "Wireless Communications", 2002, eq. 4.69a, with an even series for the gains. Residuals have Student's
-density, as reflections make outliers (Lange, Little, Taylor, JASA 84, 1989); its Fisher information is
+(0 where that is not known): Rappaport, "Wireless Communications", 2002, eq. 4.69a, with a series for the gains. Residuals have
+Student's density, as reflections make outliers (Lange, Little, Taylor, JASA 84, 1989); Fisher's information of it is
 ``(dof + 1) / (dof + 3) / sigma^2``.
 """
 

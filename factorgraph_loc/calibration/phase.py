@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from factorgraph_loc.errors import InputError
@@ -23,6 +24,8 @@ from factors import se2
 from factors.rfid_likelihood import TagArray
 from factors.rfid_phase import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
+
+Rows = NDArray[np.int64]
 
 WINDOW = 2.0  # s
 MAX_GAP = 0.1  # s, of the reference around a read
@@ -139,10 +142,13 @@ class _Focus:
         return PhaseLikelihood(replace(self.model, antennas=antennas), self.tags)
 
 
-def _reads_of(log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], first_window: int) -> PhaseReads:
-    """The reads with a phase of known tags by known antennas, where the reference tells the pose."""
+def along_reference(
+    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
+) -> tuple[RfidStream, Rows, Array, Array, Rows, Rows]:
+    """The reads of known tags by known antennas where the reference tells the pose: the stream, R of its rows, times (R,) [s],
+    poses (R, 3) of the robot, and places (R,) of antennas and tags. InputError if the log has no reference or no reads."""
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference trajectory, expected one to calibrate the survey with")
+        raise InputError(f"{log.name}: has no reference trajectory, expected one to calibrate with")
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         raise InputError(f"{log.name}: has no RFID reads, expected a log of them")
@@ -150,7 +156,13 @@ def _reads_of(log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], fi
     tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
     antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)
     poses = log.reference.at(t, max_gap=MAX_GAP)
-    known = (tag >= 0) & (antenna >= 0) & np.isfinite(stream.phase) & np.isfinite(stream.frequency)
-    keep = np.flatnonzero(known & np.isfinite(poses[:, 0]))
-    windows = first_window + np.floor((t[keep] - t.min(initial=0.0)) / WINDOW).astype(np.int64)
-    return PhaseReads(poses[keep], antenna[keep], tag[keep], stream.phase[keep], stream.frequency[keep], windows)
+    rows = np.flatnonzero((tag >= 0) & (antenna >= 0) & np.isfinite(poses[:, 0]))
+    return stream, rows, t[rows], poses[rows], antenna[rows], tag[rows]
+
+
+def _reads_of(log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], first_window: int) -> PhaseReads:
+    """The reads with a phase, in windows numbered from ``first_window``."""
+    stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
+    windows = first_window + np.floor((t - t.min(initial=np.inf)) / WINDOW).astype(np.int64)
+    reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)
+    return reads.chosen(np.isfinite(reads.phase) & np.isfinite(reads.frequency))
