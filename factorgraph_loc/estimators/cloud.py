@@ -87,12 +87,11 @@ class Cloud:
         """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
         weights = self.weights
         found: list[Mode] = []
-        cells = np.floor(self.poses / CELL).astype(int)
+        _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
         free = np.ones(len(weights), dtype=bool)
         while len(found) < MODES and weights[free].sum() > 0.01:
-            _, which = np.unique(cells[free], axis=0, return_inverse=True)
-            heaviest = np.argmax(np.bincount(which.ravel(), weights[free]))
-            middle, _ = _normalised_moments(self.poses[free], weights[free] * (which.ravel() == heaviest))
+            heaviest = free & (which == np.argmax(np.bincount(which, weights * free)))
+            middle, _ = _normalised_moments(self.poses[heaviest], weights[heaviest])
             for _ in range(2):
                 difference = np.abs(self.poses - middle)
                 difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
@@ -109,6 +108,14 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
     return np.asarray(np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1))
+
+
+def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
+    """A number (N,) of the cell in which each pose (N, 3) lies, the cells having the size ``cell`` (3,) [m, m, rad]."""
+    places = np.floor(poses / cell).astype(np.int64)
+    places -= places.min(axis=0)
+    size = places.max(axis=0) + 1
+    return np.asarray((places[:, 0] * size[1] + places[:, 1]) * size[2] + places[:, 2])
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:

@@ -15,7 +15,7 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEst
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.measurements import BearingRange, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.odometry import ChainState, Increment
@@ -38,6 +38,7 @@ class Filter(ABC):
 
     deterministic = True
     supports_unknown_start = False
+    takes_scans = False  # whether scans of RFID tags update it; else they are counted as ignored
 
     def __init__(self, setup: Setup, settings: FilterSettings) -> None:
         self.diagnostics = Diagnostics()
@@ -49,7 +50,7 @@ class Filter(ABC):
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._ticks: list[float] = []
         self._records: list[Any] = []
-        self._events: deque[tuple[BearingRange | Tick, tuple[Any, ...]]] = deque()
+        self._events: deque[tuple[Exteroceptive | Tick, tuple[Any, ...]]] = deque()
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian."""
@@ -61,7 +62,7 @@ class Filter(ABC):
         """Take one measurement, in time or late by at most ``max_delay``."""
         if isinstance(measurement, Odometry):
             self._motion.add(measurement)
-        elif isinstance(measurement, RfidScan):
+        elif isinstance(measurement, RfidScan) and not self.takes_scans:
             self.diagnostics.ignore("rfid", len(measurement.antennas))
         elif self._state is None:
             self._begin(measurement)
@@ -100,7 +101,10 @@ class Filter(ABC):
 
     @abstractmethod
     def _update(self, m: BearingRange) -> None:
-        """Take a measurement at the state's time."""
+        """Take landmarks seen at the state's time."""
+
+    def _scan(self, m: RfidScan) -> None:  # noqa: B027
+        """Take a scan of tags at the state's time; only of those that take scans."""
 
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
@@ -110,11 +114,11 @@ class Filter(ABC):
     def _record(self) -> Any:
         """What :meth:`trajectory` needs of this time, with its time as ``t``."""
 
-    def _seek(self, m: BearingRange) -> Any:
+    def _seek(self, m: Exteroceptive) -> Any:
         """The state from a measurement alone, for an unknown start; None where it does not tell one."""
         return None
 
-    def _begin(self, m: BearingRange | Tick) -> None:
+    def _begin(self, m: Exteroceptive | Tick) -> None:
         """Start without a prior, at the first measurement that tells something of the pose."""
         if isinstance(m, Tick):
             return
@@ -125,7 +129,7 @@ class Filter(ABC):
         elif not self.supports_unknown_start:
             self.diagnostics.ignore("before the start")
 
-    def _take(self, m: BearingRange | Tick) -> None:
+    def _take(self, m: Exteroceptive | Tick) -> None:
         checkpoint = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         self._events.append((m, checkpoint))
         while self._events[0][0].t < m.t - self._max_delay:
@@ -134,14 +138,16 @@ class Filter(ABC):
             odometry = self._motion.state(m.t)
             self._predict(self._motion.relative(self._odometry, odometry))
             self._t, self._odometry = m.t, odometry
-        if isinstance(m, BearingRange):
-            self._update(m)
-        else:
+        if isinstance(m, Tick):
             self._ticks.append(m.t)
+        elif isinstance(m, RfidScan):
+            self._scan(m)
+        else:
+            self._update(m)
         self._records.append(self._record())
 
-    def _take_late(self, late: BearingRange | Tick) -> None:
-        again: list[BearingRange | Tick] = []
+    def _take_late(self, late: Exteroceptive | Tick) -> None:
+        again: list[Exteroceptive | Tick] = []
         while self._events and self._t > late.t:
             m, checkpoint = self._events.pop()
             again.append(m)
@@ -153,9 +159,11 @@ class Filter(ABC):
         for m in sorted(again, key=lambda m: m.t):
             self._take(m)
 
-    def _drop_late(self, m: BearingRange | Tick) -> None:
+    def _drop_late(self, m: Exteroceptive | Tick) -> None:
         if isinstance(m, BearingRange):
             self.diagnostics.drop_late("bearing_range", len(m.landmarks))
+        elif isinstance(m, RfidScan):
+            self.diagnostics.drop_late("rfid", len(m.antennas))
 
     def _go_back(self, checkpoint: tuple[Any, ...]) -> None:
         self._state, self._t, self._odometry, records, ticks = checkpoint

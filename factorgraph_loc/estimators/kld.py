@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.estimators.cloud import cell_numbers
 from factors.se2 import Array
 
 ERROR, QUANTILE = 0.05, 2.326  # the largest Kullback-Leibler divergence, kept to with a probability of 99 %
 CELL = np.array((0.3, 0.3, 0.2))  # m, m, rad
 
 
-def enough(cells: Array) -> Array:
+def enough(cells: Array | NDArray[np.int64]) -> Array:
     """The particles that a density over so many occupied cells needs (Fox, 2003, eq. 7, by Wilson and Hilferty)."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
@@ -22,10 +23,7 @@ def prefix(poses: Array, rng: np.random.Generator, least: int, cell: Array = CEL
     """Places among draws (N, 3) of as many as are enough, at least ``least``: in random order they are taken one by one until their
     number is enough for the cells that they have occupied."""
     order = rng.permutation(len(poses))
-    places = np.floor(poses[order] / cell).astype(np.int64)
-    places -= places.min(axis=0)
-    sizes = places.max(axis=0) + 1
-    _, first = np.unique((places[:, 0] * sizes[1] + places[:, 1]) * sizes[2] + places[:, 2], return_index=True)
+    _, first = np.unique(cell_numbers(poses[order], cell), return_index=True)
     occupied = np.searchsorted(np.sort(first), np.arange(1, len(poses) + 1), side="left")
     reached = np.arange(1, len(poses) + 1) >= np.maximum(enough(occupied), least)
     return np.asarray(order[: int(np.argmax(reached)) + 1] if reached.any() else order)

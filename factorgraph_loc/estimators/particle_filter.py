@@ -8,27 +8,33 @@ little too small where landmarks tell next to nothing of them: resampling moves 
 
 Where the place is not known, at an unknown start or once the landmarks refute it, a share of the particles is drawn anew at each
 stamp (augmented Monte Carlo localization: Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, table 8.3), not anywhere but from
-what the last sightings tell (:mod:`~factorgraph_loc.estimators.relocalization`).
+what the last sightings tell (:mod:`~factorgraph_loc.estimators.relocalization`). Where no landmarks are used, scans of RFID tags
+tell the place: the particles are drawn from a seeker (:mod:`~factorgraph_loc.estimators.seeker`) until it is sure.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior
+from factorgraph_loc.estimators import kld, tags
+from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import Relocalizer
+from factorgraph_loc.estimators.scan_finder import ScanFinder
+from factorgraph_loc.estimators.scan_monitor import ScanMonitor
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
+from factorgraph_loc.tag_map import extent
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
 from factors.bearing_range import TIME_OFFSET, log_likelihood
@@ -37,17 +43,21 @@ from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
 
 SLOW, FAST = 0.01, 0.1  # decay rates of the averages of the likelihood, per stamp
+KEPT = 90.0  # s of odometry, for a search among the last scans
 INJECTED = 0.05  # the least share that is drawn anew while the place is not known
 ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies within so many standard deviations of it
 
 
 class ParticleFilterSettings(FilterSettings):
-    """``particles``: their number. ``resample_below``: effective sample size, as a share, below which they are resampled.
-    ``smoothing_trajectories``: drawn backwards for the final result, through clouds ``smoothing_interval`` seconds apart.
-    ``self_calibration``: constants to which the rig gives an uncertainty travel with each particle, but not the sensor's time
-    offset, which is taken as the rig has it."""
+    """``particles``: their number; with ``kld`` the largest, of which no more are resampled than their spread needs, but at least
+    ``min_particles`` (KLD sampling: Fox, IJRR 22(12), 2003). ``resample_below``: effective sample size, as a share, below which
+    they are resampled. ``smoothing_trajectories``: drawn backwards for the final result, through clouds
+    ``smoothing_interval`` seconds apart. ``self_calibration``: constants to which the rig gives an uncertainty travel with
+    each particle, but not the sensor's time offset, which is taken as the rig has it."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
+    kld: bool = False
+    min_particles: Annotated[int, Field(ge=10, le=1_000_000)] = 500
     resample_below: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0)] = 1.0
@@ -59,6 +69,7 @@ class ParticleFilter(Filter):
 
     deterministic = False
     supports_unknown_start = True
+    takes_scans = True
     _state: Cloud
 
     def __init__(self, setup: Setup, settings: ParticleFilterSettings) -> None:
@@ -76,6 +87,13 @@ class ParticleFilter(Filter):
         self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, None)
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
         self._monitor = TrackMonitor()
+        self._tags = tags.KnownTags(setup, self.diagnostics)
+        self._finder: ScanFinder | None = None
+        self._scan_monitor = ScanMonitor()
+        if self._tags.likelihood is not None and not self._landmarks.known:
+            self._motion.keep(KEPT)
+            bounds = extent(setup.world, self._tags.map.tags)
+            self._finder = ScanFinder(self._tags.likelihood, self._motion, bounds, setup.rng)
         self._lost = False
 
     def belief(self) -> Belief:
@@ -112,15 +130,29 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in found]).reshape(-1, 3, 3))
 
     def _start(self, prior: PosePrior) -> Cloud:
+        if self._finder is not None:
+            self._finder.rest()
         return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
 
-    def _seek(self, m: BearingRange) -> Cloud | None:
+    def _seek(self, m: Exteroceptive) -> Cloud | None:
+        if isinstance(m, RfidScan):
+            looks = self._tags.looks(m)
+            if self._finder is None or looks is None:
+                return None
+            self._finder.add(self._odometry, looks)
+            return self._sought()
         seen = self._landmarks.factor(m)
         if seen is None:
             return None
         self._relocalizer.add(self._odometry, self._expected(seen, np.zeros(len(self._sensor_constants.names))))
         self._relocalizer.search()
         return replace(self._cloud(self._relocalizer.sample(self._rng, self._settings.particles)), localized=False)
+
+    def _sought(self) -> Cloud:
+        """Particles drawn from what scans alone tell."""
+        assert self._finder is not None
+        cloud = self._cloud(self._finder.sample(self._rng, self._settings.particles))
+        return replace(cloud, localized=self._finder.best is not None)
 
     def _cloud(self, poses: Array) -> Cloud:
         """Particles at poses (N, 3), whose constants are those of the prior."""
@@ -162,8 +194,9 @@ class ParticleFilter(Filter):
         self._relocalizer.add(self._odometry, expected)
         if self._state.localized:
             self._watch(m.t, expected)
-        self._weigh(seen)
-        if not self._state.localized:
+        self._average(float(self._state.weights @ np.exp(self._likelihood(seen) / len(seen.points))))
+        self._weigh(lambda: self._likelihood(seen))
+        if not self._state.localized and self._finder is None:
             self._relocalizer.search()
             self._inject()
             self._settle()
@@ -188,23 +221,65 @@ class ParticleFilter(Filter):
             self._state = replace(self._state, localized=False)
             self._event(f"lost: landmarks are not where they were expected since {since:.1f} s")
 
-    def _weigh(self, seen: BearingRangeFactor) -> None:
+    def _scan(self, m: RfidScan) -> None:
+        looks, likelihood = self._tags.looks(m), self._tags.likelihood
+        if looks is None or likelihood is None:
+            return
+        if not self._state.localized and self._finder is not None:
+            if self._finder.add(self._odometry, looks):
+                self._state = self._sought()
+                if self._state.localized:
+                    self._finder.start()
+                    self._event("localized")
+            return
+        mean, covariance = self._state.moments
+        update = tags.update(likelihood, looks, mean, se2.world_to_body(mean, covariance), iterations=1)
+        self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
+        evidence = self._weigh(lambda: likelihood.log_likelihood(self._state.poses, looks))
+        if self._finder is not None:
+            self._finder.add(self._odometry, looks, evidence)
+            self._scan_monitor.add(m.t, update.surprise, update.variance)
+            self._doubt(self._finder)
+
+    def _doubt(self, finder: ScanFinder) -> None:
+        """See whether another place explains the scans since they became unlikely, and go on there."""
+        since = self._scan_monitor.suspicious_since
+        if since is None:
+            finder.rest()
+            return
+        finder.seek(since)
+        mean, covariance = self._state.moments
+        if finder.refutes(mean, se2.world_to_body(mean, covariance)):
+            self._state = self._sought()
+            finder.start()
+            self._scan_monitor.clear()
+            self._event(f"lost: tags were not read as they were expected since {since:.1f} s")
+            self._event("recovered")
+
+    def _weigh(self, log_likelihood: Callable[[], Array]) -> float:
         """Weigh the particles by the likelihood, by a share of it at a time if it leaves too few effective ones: they are resampled
-        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4)."""
-        likelihood = self._likelihood(seen)
-        cloud = self._state
-        average = float(cloud.weights @ np.exp(likelihood / len(seen.points)))
-        slow = cloud.slow + SLOW * (average - cloud.slow) if cloud.slow else average
-        fast = cloud.fast + FAST * (average - cloud.fast) if cloud.fast else average
-        self._state = replace(cloud, slow=slow, fast=fast)
-        enough = self._settings.resample_below * len(cloud.poses)
-        left = 1.0
-        while (share := largest_share(self._state.log_weights, likelihood, left, enough)) < left:
-            self._state = replace(self._state, log_weights=normalised(self._state.log_weights + share * likelihood))
-            self._resample()
+        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of its mean."""
+        likelihood = log_likelihood()
+        mean, left = 0.0, 1.0
+        while True:
+            cloud = self._state
+            share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
+            weighed = cloud.log_weights + share * likelihood
+            log_weights = normalised(weighed)
+            mean += float(weighed[0] - log_weights[0])
+            self._state = replace(cloud, log_weights=log_weights)
             left -= share
-            likelihood = self._likelihood(seen)
-        self._state = replace(self._state, log_weights=normalised(self._state.log_weights + left * likelihood))
+            if left <= 0.0:
+                return mean
+            self._resample()
+            likelihood = log_likelihood()
+
+    def _average(self, likelihood: float) -> None:
+        """Keep the averages of the likelihood, over many and over few stamps."""
+        cloud = self._state
+        slow = cloud.slow + SLOW * (likelihood - cloud.slow) if cloud.slow else likelihood
+        fast = cloud.fast + FAST * (likelihood - cloud.fast) if cloud.fast else likelihood
+        self._state = replace(cloud, slow=slow, fast=fast)
 
     def _likelihood(self, seen: BearingRangeFactor) -> Array:
         """Log-likelihood (N,) of the particles, each with its own constants."""
@@ -213,7 +288,9 @@ class ParticleFilter(Filter):
         return log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings, changes)
 
     def _resample(self) -> None:
-        chosen = systematic(self._state.weights, self._rng)
+        chosen = systematic(self._state.weights, self._rng, self._settings.particles)
+        if self._settings.kld:
+            chosen = chosen[kld.prefix(self._state.poses[chosen], self._rng, self._settings.min_particles)]
         cloud, kernel = self._state.density()
         self._state = cloud.drawn(chosen, kernel, self._rng)
 
@@ -248,7 +325,8 @@ class ParticleFilter(Filter):
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            return PoseEstimate(self._t, *self._state.moments, "localized")
+            status: Status = "localized" if self._scan_monitor.suspicious_since is None else "ambiguous"
+            return PoseEstimate(self._t, *self._state.moments, status)
         mode = self._state.modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")
 

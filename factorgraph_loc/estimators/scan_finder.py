@@ -42,13 +42,19 @@ class ScanFinder:
         """The pose at the last scan if one hypothesis is clear, else None."""
         return self._seeker.best if self._seeker is not None else None
 
-    def add(self, odometry: ChainState, looks: Looks, evidence: float = 0.0) -> None:
-        """Take a scan; ``evidence``: log-probability of it under the track, where there is one."""
+    def add(self, odometry: ChainState, looks: Looks, evidence: float = 0.0) -> bool:
+        """Take a scan; ``evidence``: log-probability of it under the track, where there is one. Scans from its time on that were
+        taken before are forgotten. False if no seeker took it."""
+        while self._scans and self._scans[-1][0].t >= odometry.t:
+            self._scans.pop()
         self._scans.append((odometry, looks, evidence))
         while self._scans[0][0].t < odometry.t - DURATION:
             self._scans.popleft()
-        if self._seeker is not None:
-            self._seeker.add(odometry, looks)
+        return self._seeker is not None and self._seeker.add(odometry, looks)
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Poses (N, 3) at the last scan, drawn from all hypotheses; none where nothing is sought."""
+        return self._seeker.sample(rng, count) if self._seeker is not None else np.empty((0, 3))
 
     def seek(self, since: float) -> None:
         """Look for another place from the scans since then, if that has not begun."""
@@ -68,7 +74,7 @@ class ScanFinder:
         self._seeker = None
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """Whether there is another place than ``pose`` (3,), body-frame ``covariance`` (3, 3), that explains the scans much better."""
+        """Whether another place than ``pose`` (3,), body-frame ``covariance`` (3, 3), explains the scans much better."""
         if self._seeker is None or (best := self._seeker.best) is None:
             return False
         track = sum(evidence for odometry, _, evidence in self._scans if odometry.t >= self._since)

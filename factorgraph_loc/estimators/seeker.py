@@ -1,6 +1,6 @@
 """Where the robot is, from scans of RFID tags alone: for an unknown start, and after being carried elsewhere.
 
-A particle filter over pose that begins anywhere: uniform, stratified over the map's bounds. Each scan is weighed a share at a time, with
+A particle filter over pose that begins anywhere: evenly over the map's bounds. Each scan is weighed a share at a time, with
 resampling from a kernel density in between (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo
 Methods in Practice", 2001, section 12.4), so that few particles find narrow places. Their number follows the size of the
 places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each resampling some are drawn anywhere once more,
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Mode, PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
+from factorgraph_loc.estimators.cloud import Cloud, cell_numbers, effective_size, largest_share, normalised, systematic
 from factorgraph_loc.estimators.motion import Motion
 from factors import se2
 from factors.odometry import ChainState
@@ -25,18 +25,21 @@ from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
 
 DENSITY = 25.0  # particles per m^2 and rad at first
-FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 60_000, 1000
-KERNEL = 0.5  # of the distance between particles
+FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 2500
+GROWTH = 4  # times as many particles, at most, after a resampling
+KERNEL = 0.25  # of the distance between particles
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
 FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anywhere at a resampling, and their weight together
 # Variance of the odometry, times this: the constants of the odometry, which are not estimated here, err as well.
-NOISE = 3.0
+NOISE = 2.0
 
-CLEAR_WEIGHT = 0.99
-CLEAR_POSITION, CLEAR_HEADING = 0.4, 0.25  # m, rad: largest standard deviations of a clear place
+# the weight of a clear place, within so many standard deviations of it, and how large those may be at most: m, rad
+CLEAR_WEIGHT, REACH = 0.99, 5.0
+WIDEST_POSITION, WIDEST_HEADING = 0.45, 0.3
 CLEAR_SCANS, CLEAR_TAGS = 3, 2  # scans with reads, and different tags in them
 WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CLEAR_WEIGHT may be anywhere
-CLEAR_FOR = 1.0  # s that one place must have been clear
+# s that a place must have been clear, where its standard deviations are at most this share of the largest, and where not
+NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 1.0, 10.0
 
 
 class Seeker:
@@ -62,19 +65,23 @@ class Seeker:
     @property
     def best(self) -> PosePrior | None:
         """The pose at the last scan if one hypothesis has been clear for a while, else None."""
-        if self._odometry is None or self._odometry.t < self._clear_since + CLEAR_FOR:
+        if self._odometry is None or not math.isfinite(self._clear_since):
             return None
-        return PosePrior(self._odometry.t, self.hypotheses[0].pose, self.hypotheses[0].covariance)
+        mode = self.hypotheses[0]
+        needed = CLEAR_FOR if self._width(mode) <= NARROW else CLEAR_FOR_WIDE
+        if self._odometry.t < self._clear_since + needed:
+            return None
+        return PosePrior(self._odometry.t, mode.pose, mode.covariance)
 
     @property
     def log_evidence(self) -> float:
         """Log-probability of all scans so far for a robot that began anywhere."""
         return self._log_evidence
 
-    def add(self, odometry: ChainState, looks: Looks) -> None:
-        """Take a scan made when the odometry was at ``odometry``; one that is older than the last is left out."""
-        if self._odometry is not None and odometry.t < self._odometry.t:
-            return
+    def add(self, odometry: ChainState, looks: Looks) -> bool:
+        """Take a scan made when the odometry was at ``odometry``; False if it is left out, as it is not newer than the last."""
+        if self._odometry is not None and odometry.t <= self._odometry.t:
+            return False
         if self._cloud is None or self._odometry is None:
             area = float(np.prod(self._bounds[1] - self._bounds[0]))
             count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
@@ -88,6 +95,7 @@ class Seeker:
         self._scans_with_reads += len(read) > 0
         self._tags.update(read.tolist())
         self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
+        return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Poses (N, 3) at the last scan, drawn from all hypotheses; none before the first scan."""
@@ -103,11 +111,16 @@ class Seeker:
         if np.linalg.eigvalsh(self._cloud.moments[1][:2, :2])[-1] > WIDE**2:
             return False
         mode = self.hypotheses[0]
-        return bool(
-            mode.weight >= CLEAR_WEIGHT
-            and np.linalg.eigvalsh(mode.covariance[:2, :2])[-1] <= CLEAR_POSITION**2
-            and mode.covariance[2, 2] <= CLEAR_HEADING**2
-        )
+        error = self._cloud.poses - mode.pose
+        error[:, 2] = se2.wrap(error[:, 2])
+        near = np.sum(error * np.linalg.solve(mode.covariance, error.T).T, axis=1) < REACH**2
+        return bool(self._cloud.weights[near].sum() >= CLEAR_WEIGHT and self._width(mode) <= 1.0)
+
+    @staticmethod
+    def _width(mode: Mode) -> float:
+        """The standard deviations of a place, as a share of the largest that it may have."""
+        position = math.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1])
+        return float(max(position / WIDEST_POSITION, math.sqrt(mode.covariance[2, 2]) / WIDEST_HEADING))
 
     def _predict(self, cloud: Cloud, start: ChainState, end: ChainState) -> None:
         increment = self._motion.relative(start, end)
@@ -131,7 +144,7 @@ class Seeker:
                 self._resample(self._cloud)
 
     def _resample(self, cloud: Cloud) -> None:
-        rows = systematic(cloud.weights, self._rng, MOST)
+        rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
         poses = np.concatenate((self._jittered(cloud, rows, self._rng), self._anywhere(FRESH)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
@@ -141,7 +154,7 @@ class Seeker:
     def _jittered(self, cloud: Cloud, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
         """Particles (N, 3) drawn from kernels as wide as befits how densely the particles ``rows`` (N,) lie in the cells."""
         poses = cloud.poses[rows]
-        cells = len(np.unique(np.floor(poses / kld.CELL).astype(np.int64), axis=0))
+        cells = len(np.unique(cell_numbers(poses, kld.CELL)))
         width = KERNEL * kld.CELL * (cells / len(rows)) ** (1.0 / 3.0)
         return se2.compose(poses, se2.exp(rng.standard_normal(poses.shape) * width))
 
