@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.log import RfidStream
 from factorgraph_loc.rfid_settings import RfidSettings
-from factorgraph_loc.simulation.settings import ClockJump, Fading, FaultSettings, PhaseSettings
-from factors import se2
+from factorgraph_loc.simulation.settings import ClockJump, Fading, FaultSettings
 from factors.rfid_likelihood import RfidLikelihood, TagArray
-from factors.rfid_phase import SPEED_OF_LIGHT
 from factors.se2 import Array
 
 Hits = NDArray[np.bool_]
@@ -51,36 +51,11 @@ def draw_reads(
     return hits
 
 
-def phases(
-    rfid: RfidSettings, tags: TagArray, poses: Array, settings: PhaseSettings, rng: np.random.Generator
-) -> Array:
-    """The phase (N, A, T) in [0, 2 pi) that a read of each tag by each antenna at poses (N, 3) comes with.
-
-    ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4) with an offset drawn for each antenna and tag, noise, and
-    pi more for a share of the reads.
-    """
-    at = np.array([(antenna.x, antenna.y, antenna.z) for antenna in rfid.all_antennas().values()])
-    planar = se2.transform_from(poses[:, None], at[None, :, :2])[:, :, None] - tags.points[:, :2]
-    height = at[:, None, 2] - tags.points[:, 2]
-    distance = np.sqrt((planar**2).sum(axis=-1) + height**2)
-    offset = rng.uniform(0.0, 2.0 * np.pi, distance.shape[1:])
-    phase = offset - 4.0 * np.pi * settings.frequency / SPEED_OF_LIGHT * distance
-    phase += settings.sigma * rng.standard_normal(phase.shape)
-    phase += np.pi * (rng.random(phase.shape) < settings.flips)
-    return np.asarray(np.mod(phase, 2.0 * np.pi))
-
-
 def rfid_stream(
-    names: list[str],
-    epcs: list[str],
-    times: Array,
-    hits: Hits,
-    faults: FaultSettings,
-    phase: Array | None = None,
-    frequency: float = np.nan,
+    names: list[str], epcs: list[str], times: Array, hits: Hits, faults: FaultSettings, signals: Mapping[str, Array]
 ) -> RfidStream:
-    """Reads (N, A, T) of antennas ``names`` (A) and tags ``epcs`` (T) as rows, with their ``phase`` (N, A, T) if there is one. All
-    antennas end a round at the same ``times`` (N,), and the tags count as read just then."""
+    """Reads (N, A, T) of antennas ``names`` (A) and tags ``epcs`` (T) as rows. All antennas end a round at the same ``times`` (N,),
+    and the tags count as read just then. ``signals``: the columns rssi, phase and frequency (N, A, T), those that there are."""
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
     if stop is not None and not stop.rounds_go_on:
@@ -90,19 +65,17 @@ def rfid_stream(
     n, a, tag = np.nonzero(np.concatenate((hits & listened[:, :, None], empty[:, :, None]), axis=2))
     t = _jumped(times, faults.clock_jump)[n]
     labels = [*epcs, ""]
-    nothing, read = np.full(len(n), np.nan), tag < len(epcs)
-    phases = nothing.copy()
-    if phase is not None:
-        phases[read] = phase[n[read], a[read], tag[read]]
+    read = tag < len(epcs)
+    columns = {name: np.full(len(n), np.nan) for name in ("rssi", "phase", "frequency")}
+    for name, values in signals.items():
+        columns[name][read] = values[n[read], a[read], tag[read]]
     return RfidStream(
         t=t,
         round=a.astype(np.int64),
         antenna=[names[i] for i in a.tolist()],
         epc=[labels[i] for i in tag.tolist()],
         age=np.zeros(len(n)),
-        rssi=nothing,
-        phase=phases,
-        frequency=np.where(read, frequency, np.nan),
+        **columns,
     )
 
 

@@ -67,6 +67,15 @@ class PhaseSettings(FileModel):
     flips: Share = 0.2
 
 
+class RssiSettings(FileModel):
+    """How strong a read is: ``coefficients`` of :data:`factors.rfid_rssi.FEATURES`, and Student's noise of scale ``sigma`` with
+    ``dof`` degrees of freedom."""
+
+    coefficients: tuple[float, float, float, float, float, float] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
+    sigma: Annotated[float, Field(ge=0.0, le=30.0, description="dB")] = 2.0
+    dof: Annotated[float, Field(gt=0.0, le=100.0)] = 4.0
+
+
 class SightingSettings(FileModel):
     """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
     axis, and not through walls."""
@@ -123,13 +132,14 @@ class FaultSettings(FileModel):
 
 
 class SimulationSettings(FileModel):
-    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``phase``: if given, reads have one.
-    ``rig``: what estimators are told, and what reads and sightings are drawn from."""
+    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rssi``, ``phase``: if given, reads have
+    one. ``rig``: what estimators are told, and what reads and sightings are drawn from."""
 
     name: str = "office"
     world: WorldSettings
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
+    rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None
     sightings: SightingSettings = SightingSettings()
     faults: FaultSettings = FaultSettings()

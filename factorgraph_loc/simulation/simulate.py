@@ -12,9 +12,10 @@ from factorgraph_loc.readers.simulated_odometry import wheel_odometry
 from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.recorded import RecordedLooks
-from factorgraph_loc.simulation.rfid import draw_reads, phases, read_probabilities, rfid_stream
+from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
 from factorgraph_loc.simulation.sightings import sighting_stream
+from factorgraph_loc.simulation.signals import phases, strengths
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.tag_map import tag_map
@@ -36,7 +37,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     With ``recorded`` the robot carries the antennas of those recordings, and reads what they read (:mod:`.recorded`).
     InputError if the settings leave no room for tags or for the robot.
     """
-    rngs = np.random.default_rng(seed).spawn(8)
+    rngs = np.random.default_rng(seed).spawn(9)
     rig = settings.rig
     if recorded is not None:
         rig = rig.model_copy(update={"rfid": recorded.rfid, "survey": SurveySettings()})
@@ -44,7 +45,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     truth = drive(world, settings.drive, rngs[1])
     streams: dict[str, Stream] = {
         "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
-        "rfid": _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7])),
+        "rfid": _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7], rngs[8])),
     }
     if world.landmarks and rig.bearing_range is not None:
         times = _ticks(settings.sightings.rate, truth)
@@ -80,7 +81,7 @@ def _reads(
     world: World,
     truth: Trajectory,
     recorded: RecordedLooks | None,
-    rngs: tuple[np.random.Generator, np.random.Generator],
+    rngs: tuple[np.random.Generator, ...],
 ) -> Stream:
     rfid = rig.rfid
     assert rfid is not None, "the settings have been checked"
@@ -91,10 +92,13 @@ def _reads(
     p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rngs[0])
     hits = draw_reads(rfid, p, times, settings.faults, rngs[0])
     names, epcs = list(rfid.all_antennas()), list(tags.names)
-    if settings.phase is None:
-        return rfid_stream(names, epcs, times, hits, settings.faults)
-    phase = phases(rfid, tags.tags, poses, settings.phase, rngs[1])
-    return rfid_stream(names, epcs, times, hits, settings.faults, phase, settings.phase.frequency)
+    signals: dict[str, Array] = {}
+    if settings.rssi is not None:
+        signals["rssi"] = strengths(rfid, tags.tags, poses, hits, settings.rssi, rngs[1])
+    if settings.phase is not None:
+        signals["phase"] = phases(rfid, tags.tags, poses, settings.phase, rngs[2])
+        signals["frequency"] = np.full(hits.shape, settings.phase.frequency)
+    return rfid_stream(names, epcs, times, hits, settings.faults, signals)
 
 
 def _ticks(rate: float, truth: Trajectory) -> Array:

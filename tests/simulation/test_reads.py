@@ -192,38 +192,3 @@ def test_a_log_of_ten_minutes_takes_little_time():
     start = time.perf_counter()
     simulate(preset("office"), 1)
     assert time.perf_counter() - start < 2.0
-
-
-def test_phases_tell_the_distance_but_for_an_offset_of_each_antenna_and_tag(make):
-    """Twice the phase is free of flips; less 8 pi f d / c it is constant for an antenna and tag, to twice the noise."""
-    log = make(phase={"sigma": 0.05, "flips": 0.3}, drive={"duration": 120.0})
-    stream, tags = log.streams["rfid"], log.world.tags
-    antennas = log.rig.rfid.all_antennas()
-    groups: dict[tuple[str, str], list[complex]] = {}
-    plain: dict[tuple[str, str], list[complex]] = {}
-    for t, pose, name, epc, phase, frequency in zip(
-        stream.t, log.reference.at(stream.t), stream.antenna, stream.epc, stream.phase, stream.frequency, strict=True
-    ):
-        if not epc:
-            assert np.isnan(phase), t
-            assert np.isnan(frequency), t
-            continue
-        assert 0.0 <= phase < 2.0 * np.pi
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        a, tag = antennas[name], tags[epc]
-        offset = (pose[0] + c * a.x - s * a.y - tag.x, pose[1] + s * a.x + c * a.y - tag.y, a.z - tag.z)
-        travelled = 4.0 * np.pi * frequency * np.linalg.norm(offset) / 299_792_458.0
-        groups.setdefault((name, epc), []).append(np.exp(2j * (phase + travelled)))
-        plain.setdefault((name, epc), []).append(np.exp(1j * (phase + travelled)))
-    large = {key for key, values in groups.items() if len(values) >= 20}
-    assert len(large) > 20
-    # exp(-(2 sigma)^2 / 2) = 0.995 is the mean length expected
-    assert min(abs(np.mean(groups[key])) for key in large) > 0.98
-    # flips pull the single phase's mean length to about 1 - 2 * 0.3
-    assert abs(np.mean([abs(np.mean(plain[key])) for key in large]) - 0.4) < 0.05
-
-
-def test_a_phase_changes_no_read(make):
-    with_phase, without = make(phase={}), make()
-    assert with_phase.streams["rfid"].epc == without.streams["rfid"].epc
-    assert np.isnan(without.streams["rfid"].phase).all()
