@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from factorgraph_loc.calibration.consistency import Consistency, Evaluate, inflated, make_consistent
-from factorgraph_loc.calibration.learn import Knowledge, has_heading, learn
+from factorgraph_loc.calibration.learn import EXTEROCEPTIVE, Knowledge, has_heading, learn, sensing
+from factorgraph_loc.calibration.rfid_rounds import distinct
+from factorgraph_loc.calibration.rfid_tempering import tempered
 from factorgraph_loc.calibration.windows import REFERENCE_GAP
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, RfidStream, VelocityStream
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
 
@@ -24,7 +27,8 @@ Scores = Mapping[str, Any]
 class Calibration:
     """What came out.
 
-    ``before`` and ``after``: scores of the EKF on each log with the input rig and with the new one; ``held_out``: with a rig learnt
+    ``consistency``: of the landmark sensor with the EKF; ``rfid_consistency``: of the tempering with the smoother; None without
+    such a sensor. ``before`` and ``after``: scores on each log with the input rig and the new one; ``held_out``: with a rig learnt
     from the other logs, but for the factor on the noise; empty where there are none. ``doubts``: one line each.
     """
 
@@ -32,7 +36,8 @@ class Calibration:
     input_rig: Rig
     rig: Rig
     knowledge: Knowledge
-    consistency: Consistency
+    consistency: Consistency | None
+    rfid_consistency: Consistency | None
     before: tuple[Scores, ...]
     after: tuple[Scores, ...]
     held_out: tuple[Scores, ...]
@@ -44,41 +49,93 @@ def calibrate(
     evaluate: Evaluate,
     rig: Rig | None = None,
     progress: Callable[[float, float], None] | None = None,
+    *,
+    grids: Path | None = None,
 ) -> Calibration:
     """The rig that ``logs`` tell; what they do not tell is taken from ``rig``, else from the rig of the first log.
 
-    ``evaluate`` runs the EKF on a log and scores it. ``progress`` is given the steps done and all steps.
-    Raises InputError if a log lacks a reference, odometry, or sightings, is too short, or is of another type than the rest.
+    ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and scores it. ``progress`` is given the steps done
+    and all steps. ``grids``: path and beginning of the names of learnt grids, in a folder that lasts; for logs with reads of tags.
+    Raises InputError if a log lacks a reference, odometry, or sightings and reads, is too short, or is of another type than the
+    rest.
     """
     check(logs)
     report = progress or (lambda _done, _total: None)
-    steps = 2 + (len(logs) if len(logs) > 1 else 0)
-    start = rig or logs[0].rig
+    parts = _parts(logs)
+    steps = 2 + (len(logs) if len(parts) > 1 else 0)
+    start = sensing(rig or logs[0].rig, logs[0])
     logs = [_scorable(log) for log in logs]
-    before = tuple(evaluate(replace(log, rig=start)) for log in logs)
+    before = _scores(logs, start, evaluate) if _is_complete(start) else ()
     report(1, steps)
-    knowledge = learn(logs, start)
-    consistency = make_consistent(logs, knowledge.rig, evaluate)
-    after = consistency.trial.scores if consistency.trial else _scores(logs, consistency.rig, evaluate)
+    knowledge = learn(logs, start, grids)
+    rig, consistency, of_rfid = _consistent(logs, knowledge, evaluate)
+    searches = [one for one in (consistency, of_rfid) if one is not None]
+    last = searches[-1]
+    after = last.trial.scores if last.trial and len(searches) == 1 else _scores(logs, rig, evaluate)
     report(2, steps)
     held_out = []
-    # one number is shared: a search in each fold would take longer than all the rest
-    factor = consistency.trial.factor if consistency.trial else 1.0
-    for i, log in enumerate(logs if len(logs) > 1 else ()):
-        others = learn([*logs[:i], *logs[i + 1 :]], start).rig
-        held_out.append(evaluate(replace(log, rig=inflated(others, factor))))
+    # numbers that are searched with an estimator are shared: a search in each fold would take longer than all the rest
+    for i, log in enumerate(logs if len(parts) > 1 else ()):
+        others = [one for one, part in zip(logs, parts, strict=True) if part != parts[i]]
+        changed = _without(others, start, knowledge, grids, i)
+        if consistency is not None and consistency.trial:
+            changed = inflated(changed, consistency.trial.factor)
+        if of_rfid is not None and changed.rfid is not None and rig.rfid is not None:
+            changed = tempered(changed, rig.rfid.tempering**-0.5)
+        held_out.append(evaluate(replace(log, rig=changed)))
         report(3 + i, steps)
     return Calibration(
         logs=tuple(log.name for log in logs),
         input_rig=start,
-        rig=consistency.rig,
+        rig=rig,
         knowledge=knowledge,
         consistency=consistency,
+        rfid_consistency=of_rfid,
         before=before,
         after=after,
         held_out=tuple(held_out),
-        doubts=_doubts(knowledge, consistency),
+        doubts=_doubts(knowledge, searches),
     )
+
+
+def _consistent(
+    logs: Sequence[Log], knowledge: Knowledge, evaluate: Evaluate
+) -> tuple[Rig, Consistency | None, Consistency | None]:
+    """Each sensor with honest noise, by runs without the other one."""
+    rig, sensors = knowledge.rig, knowledge.rig.sensors
+
+    def alone(sensor: str) -> Rig:
+        kept = tuple(name for name in sensors if name == sensor or name not in EXTEROCEPTIVE)
+        return rig.model_copy(update={"sensors": kept})
+
+    of_landmarks = of_rfid = None
+    if "bearing_range" in sensors:
+        of_landmarks = make_consistent(logs, alone("bearing_range"), evaluate)
+        rig = rig.model_copy(update={"bearing_range": of_landmarks.rig.bearing_range})
+    if knowledge.rfid is not None:
+        guess = knowledge.rfid.share**-0.5
+        of_rfid = make_consistent(logs, alone("rfid"), evaluate, guess, tempered, least=1.0)
+        rig = rig.model_copy(update={"rfid": of_rfid.rig.rfid})
+    return rig, of_landmarks, of_rfid
+
+
+def _without(others: Sequence[Log], start: Rig, knowledge: Knowledge, grids: Path | None, fold: int) -> Rig:
+    """The rig that other logs tell; RFID's models are fitted in the way that was chosen with all."""
+    if knowledge.rfid is None or grids is None:
+        return learn(others, start).rig
+    folder = grids.parent / f"{grids.name}.fold{fold}"
+    folder.mkdir()
+    return learn(others, start, folder / grids.name, knowledge.rfid.choice.kind).rig
+
+
+def _parts(logs: Sequence[Log]) -> list[int]:
+    """The number of what each log recorded: of logs that hold the same reads one is no test of the other."""
+    return distinct(logs) if "rfid" in logs[0].streams else list(range(len(logs)))
+
+
+def _is_complete(rig: Rig) -> bool:
+    """Whether a rig can be run with the sensors that it names."""
+    return all(getattr(rig, name) is not None for name in EXTEROCEPTIVE if name in rig.sensors)
 
 
 def check(logs: Sequence[Log]) -> None:
@@ -88,26 +145,38 @@ def check(logs: Sequence[Log]) -> None:
     for log in logs:
         if log.reference is None or len(log.reference) < 2:
             raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
-        for sensor in ("odometry", "bearing_range"):
-            if sensor not in log.streams or not len(log.streams[sensor].t):
-                raise InputError(f"{log.name}: has no {sensor}, expected one in every log to calibrate from")
-        if not isinstance(log.streams["bearing_range"], BearingRangeStream):
-            raise InputError(f"{log.name}: its bearing_range holds no sightings of landmarks")
+        if not _has(log, "odometry"):
+            raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
+        if not any(_has(log, sensor) for sensor in EXTEROCEPTIVE):
+            raise InputError(f"{log.name}: has no bearing_range and no rfid, expected one of them to calibrate from")
+        for sensor, kind in (("bearing_range", BearingRangeStream), ("rfid", RfidStream)):
+            if sensor in log.streams and not isinstance(log.streams[sensor], kind):
+                raise InputError(f"{log.name}: its {sensor} is of another kind than that sensor's")
     first = logs[0]
     for log in logs[1:]:
-        if type(log.streams["odometry"]) is not type(first.streams["odometry"]):
-            kinds = {VelocityStream: "velocities", IncrementStream: "increments"}
-            ours, theirs = (kinds.get(type(one.streams["odometry"]), "another kind") for one in (log, first))
-            raise InputError(
-                f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
-            )
-        if has_heading(log) != has_heading(first):
-            raise InputError(
-                f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart"
-            )
+        _check_alike(first, log)
     names = [log.name for log in logs]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{twice}: is given twice, or two logs have this name")
+
+
+def _check_alike(first: Log, log: Log) -> None:
+    for sensor in EXTEROCEPTIVE:
+        for one, other in ((first, log), (log, first)):
+            if _has(one, sensor) and not _has(other, sensor):
+                raise InputError(f"{other.name}: has no {sensor}, expected one in every log to calibrate from")
+    if type(log.streams["odometry"]) is not type(first.streams["odometry"]):
+        kinds = {VelocityStream: "velocities", IncrementStream: "increments"}
+        ours, theirs = (kinds.get(type(one.streams["odometry"]), "another kind") for one in (log, first))
+        raise InputError(
+            f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
+        )
+    if has_heading(log) != has_heading(first):
+        raise InputError(f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart")
+
+
+def _has(log: Log, sensor: str) -> bool:
+    return sensor in log.streams and len(log.streams[sensor].t) > 0
 
 
 def _scores(logs: Sequence[Log], rig: Rig, evaluate: Evaluate) -> tuple[Scores, ...]:
@@ -126,7 +195,7 @@ def _scorable(log: Log) -> Log:
     return replace(log, reference=Trajectory(t[good], poses[good], has_heading=reference.has_heading))
 
 
-def _doubts(knowledge: Knowledge, consistency: Consistency) -> tuple[str, ...]:
+def _doubts(knowledge: Knowledge, searches: Sequence[Consistency]) -> tuple[str, ...]:
     """What the reader of the report should look at."""
     doubts = list(knowledge.notes)
     noise = knowledge.noise
@@ -139,11 +208,17 @@ def _doubts(knowledge: Knowledge, consistency: Consistency) -> tuple[str, ...]:
             f"The fitted noise of the odometry ({', '.join(noise.floored)}) is below what wheels can do and was raised: the "
             "reference is probably not independent of the odometry."
         )
-    if consistency.trial is None:
-        doubts.append("No log has a reference dense enough for scoring: the noise in the rig is the mere scatter.")
-    elif not consistency.reached:
-        doubts.append(
-            f"No factor on the noise makes the EKF consistent: ANEES over its ideal value is {consistency.trial.causal:.2f} "
-            f"causal, {consistency.trial.final:.2f} final."
-        )
+    for one in searches:
+        if one.trial is None:
+            doubts.append("No log has a reference dense enough for scoring: the noise in the rig is the mere scatter.")
+        elif not one.reached:
+            doubts.append(
+                "No factor on the noise makes the estimator consistent: ANEES over its ideal value is "
+                f"{one.trial.causal:.2f} causal, {one.trial.final:.2f} final."
+            )
+    if knowledge.rfid is not None:
+        for tag in knowledge.rfid.doubts:
+            doubts.append(f"Tag {tag.name} seems to be {tag.distance:.1f} m from where the map has it.")
+        if silent := knowledge.rfid.silent:
+            doubts.append(f"{len(silent)} tags of the map are never read, the first is {silent[0]}.")
     return tuple(doubts)

@@ -17,7 +17,7 @@ from factorgraph_loc.log import Log
 from factorgraph_loc.rig import Rig
 
 Evaluate = Callable[[Log], Mapping[str, Any]]
-"""Runs the EKF on a log, with the log's rig, and gives the scores of :func:`factorgraph_loc.evaluation.metrics.score`."""
+"""Runs an estimator on a log, with the log's rig, and gives the scores of :func:`factorgraph_loc.evaluation.metrics.score`."""
 
 FACTORS = (0.5, 30.0)  # between these the factor is sought
 TOLERANCE = 0.08  # of the logarithm of ANEES
@@ -66,36 +66,47 @@ def inflated(rig: Rig, factor: float) -> Rig:
     )
 
 
-def make_consistent(logs: Sequence[Log], rig: Rig, evaluate: Evaluate, guess: float = 3.0) -> Consistency:
-    """The factor for which the EKF's ANEES is ideal on ``logs``; ``guess``: where the search begins.
+Change = Callable[[Rig, float], Rig]
 
-    First for the causal estimates. Where the final ones are then too sure, for the geometric mean of both.
+
+def make_consistent(
+    logs: Sequence[Log],
+    rig: Rig,
+    evaluate: Evaluate,
+    guess: float = 3.0,
+    change: Change = inflated,
+    least: float = FACTORS[0],
+) -> Consistency:
+    """The factor for which the estimator's ANEES is ideal on ``logs``; ``guess``: where the search begins, ``least``: its end.
+
+    ``change``: the rig with the standard deviations of a sensor multiplied by a factor. First the factor is made right for the
+    causal estimates. Where the final ones are then too sure, for the geometric mean of both.
     """
     trials: list[Trial] = []
 
     def at(factor: float) -> Trial:
-        changed = inflated(rig, factor)
+        changed = change(rig, factor)
         trials.append(_trial(factor, [evaluate(replace(log, rig=changed)) for log in logs], logs))
         return trials[-1]
 
     if not math.isfinite(at(guess).causal):
         return Consistency(rig, None, False)
-    trial = _solve(at, trials, lambda t: math.log(t.causal))
+    trial = _solve(at, trials, lambda t: math.log(t.causal), least)
     if trial.final > MAX_FINAL:
-        trial = _solve(at, trials, _both)
+        trial = _solve(at, trials, _both, least)
         reached = abs(_both(trial)) < 2.0 * TOLERANCE
     else:
         reached = abs(math.log(trial.causal)) < 2.0 * TOLERANCE
-    return Consistency(inflated(rig, trial.factor), trial, reached)
+    return Consistency(change(rig, trial.factor), trial, reached)
 
 
 def _both(trial: Trial) -> float:
     return 0.5 * (math.log(trial.causal) + math.log(trial.final))
 
 
-def _solve(at: Callable[[float], Trial], trials: list[Trial], excess: Callable[[Trial], float]) -> Trial:
+def _solve(at: Callable[[float], Trial], trials: list[Trial], excess: Callable[[Trial], float], least: float) -> Trial:
     """The trial whose ``excess``, which falls with the factor, is nearest to zero: by secants of logarithms."""
-    low, high = (math.log(f) for f in FACTORS)
+    low, high = math.log(least), math.log(FACTORS[1])
     for _ in range(TRIALS):
         nearest = sorted(trials, key=lambda t: abs(excess(t)))[:2]
         best = nearest[0]

@@ -30,7 +30,7 @@ def sightings_figure(knowledge: Knowledge) -> bytes:
     errors = [one.errors(settings) for one in knowledge.seen]
     rows = [(0, "range", "m"), (1, "bearing", "rad")]
     rows = [row for row in rows if any(np.isfinite(e[:, row[0]]).any() for e in errors)]
-    figure, axes = _figure(len(rows), 3)
+    figure, axes = axes_of(len(rows), 3)
     for panels, (column, what, unit) in zip(axes, rows, strict=True):
         typical = np.concatenate(
             [bearing_range.sigmas(settings.model(), one.ranges)[:, column] for one in knowledge.seen]
@@ -51,18 +51,18 @@ def sightings_figure(knowledge: Knowledge) -> bytes:
         scatter = bearing_range.sigmas(settings.model(), distance)[:, column]
         for sign in (-2.0, 2.0):
             panels[1].plot(distance, sign * scatter, color="0.3", linestyle="--", label="2 sigma of the scatter")
-        _name(panels[0], f"{what} residual [{unit}]", f"density [1/{unit}]")
-        _name(panels[1], "measured range [m]", f"{what} residual [{unit}]")
-        _name(panels[2], "time [s]", f"{what} residual [{unit}]")
-    _legend(figure, axes.flat)
-    return _png(figure)
+        name_axes(panels[0], f"{what} residual [{unit}]", f"density [1/{unit}]")
+        name_axes(panels[1], "measured range [m]", f"{what} residual [{unit}]")
+        name_axes(panels[2], "time [s]", f"{what} residual [{unit}]")
+    legend(figure, axes.flat)
+    return png(figure)
 
 
 def correlation_figure(knowledge: Knowledge) -> bytes:
     """Autocorrelation of the residuals of one landmark, of each log."""
     columns = [(0, "range"), (1, "bearing")]
     columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in knowledge.correlations)]
-    figure, axes = _figure(1, max(1, len(columns)))
+    figure, axes = axes_of(1, max(1, len(columns)))
     for axis, (column, what) in zip(axes[0], columns, strict=False):
         for i, (one, seen) in enumerate(zip(knowledge.correlations, knowledge.seen, strict=True)):
             known = np.isfinite(one.function[:, column])
@@ -71,15 +71,15 @@ def correlation_figure(knowledge: Knowledge) -> bytes:
         axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.set_xscale("log")
-        _name(axis, "time between two sightings of a landmark [s]", f"correlation of {what} residuals")
-    _legend(figure, axes.flat)
-    return _png(figure)
+        name_axes(axis, "time between two sightings of a landmark [s]", f"correlation of {what} residuals")
+    legend(figure, axes.flat)
+    return png(figure)
 
 
 def odometry_figure(knowledge: Knowledge) -> bytes:
     """Residuals of the odometry over windows: in time, over distance, and how they grow with the length of the window."""
     model = knowledge.rig.odometry_model()
-    figure, axes = _figure(3, 3)
+    figure, axes = axes_of(3, 3)
     residuals = [one.residuals(model) for one in knowledge.windows]
     lengths = (*LENGTHS, BLACKOUT)
     growth = [_growth([cut(one.log, length) for one in knowledge.windows], model) for length in lengths]
@@ -99,11 +99,11 @@ def odometry_figure(knowledge: Knowledge) -> bytes:
         panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
         panels[2].set_xscale("log")
         panels[2].set_yscale("log")
-        _name(panels[0], "time [s]", f"{what} [{unit}] in 2 s")
-        _name(panels[1], "distance [m] in 2 s", f"{what} [{unit}] in 2 s")
-        _name(panels[2], "length of the window [s]", f"{what} [{unit}]")
-    _legend(figure, axes.flat)
-    return _png(figure)
+        name_axes(panels[0], "time [s]", f"{what} [{unit}] in 2 s")
+        name_axes(panels[1], "distance [m] in 2 s", f"{what} [{unit}] in 2 s")
+        name_axes(panels[2], "length of the window [s]", f"{what} [{unit}]")
+    legend(figure, axes.flat)
+    return png(figure)
 
 
 def _growth(windows: Sequence[Any], model: Any) -> tuple[Array, Array]:
@@ -115,11 +115,12 @@ def _growth(windows: Sequence[Any], model: Any) -> tuple[Array, Array]:
     return np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(stated, axis=0))
 
 
-def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
+def axes_of(rows: int, columns: int, height: float = 3.2) -> tuple[Figure, Any]:
+    """A figure and its axes (rows, columns), rows ``height`` inches high."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(13.0, 3.2 * rows + 0.6), layout="constrained")
+    figure = Figure(figsize=(13.0, height * rows + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
@@ -128,12 +129,14 @@ def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _name(axis: Axes, x: str, y: str) -> None:
+def name_axes(axis: Axes, x: str, y: str) -> None:
+    """What an axis shows, with units."""
     axis.set_xlabel(x)
     axis.set_ylabel(y)
 
 
-def _legend(figure: Figure, axes: Any) -> None:
+def legend(figure: Figure, axes: Any) -> None:
+    """One legend below the axes, of all that is drawn in any of them."""
     entries: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -143,7 +146,8 @@ def _legend(figure: Figure, axes: Any) -> None:
     )
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG image."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=80)
     return out.getvalue()

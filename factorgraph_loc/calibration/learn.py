@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from factorgraph_loc.calibration import odometry, sightings
 from factorgraph_loc.calibration.noise import NoiseFit, fit_noise
+from factorgraph_loc.calibration.rfid_choice import Kind
+from factorgraph_loc.calibration.rfid_learn import RfidKnowledge, learn_rfid
 from factorgraph_loc.calibration.robust import Constant, Fit, folds, gains, is_worth
 from factorgraph_loc.calibration.sightings import Correlation, Sightings
 from factorgraph_loc.calibration.windows import Windows, cut
@@ -27,10 +30,11 @@ BETTER_KIND = (
 ROUNDS = 2  # of constants and scatter in turn
 # the constants that an estimator can learn on each run, with the most that the rig takes
 UNCERTAIN: dict[str, dict[str, float]] = {
-    "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias"), 1.0),
+    "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0),
     "bearing_range": {"x": 10.0, "y": 10.0}
     | dict.fromkeys(("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0),
 }
+EXTEROCEPTIVE = ("bearing_range", "rfid")  # what a robot knows its place by
 _FIRST_SIGMA = 0.1  # m, of a sensor of which nothing is known
 
 
@@ -63,7 +67,8 @@ class Learnt:
 class Knowledge:
     """What the logs say. ``rig`` has the scatter as noise; ``noise`` is None where the reference has no heading.
 
-    ``windows``: of 2 s, by log; ``seen``: by log; ``notes``: what could not be learnt, one line each.
+    ``windows``: of 2 s, by log; ``seen``: by log, none without landmarks; ``rfid``: None without reads of tags; ``notes``: what
+    could not be learnt, one line each.
     """
 
     rig: Rig
@@ -73,11 +78,13 @@ class Knowledge:
     seen: tuple[Sightings, ...]
     correlations: tuple[Correlation, ...]
     notes: tuple[str, ...]
+    rfid: RfidKnowledge | None = None
 
 
-def learn(logs: Sequence[Log], rig: Rig) -> Knowledge:
+def learn(logs: Sequence[Log], rig: Rig, grids: Path | None = None, rfid_kind: Kind | None = None) -> Knowledge:
     """The rig that ``logs`` tell, starting from ``rig``, whose values stay where a log cannot tell them better.
 
+    ``grids`` and ``rfid_kind``: see :func:`~factorgraph_loc.calibration.rfid_learn.learn_rfid`; for logs with reads of tags.
     Raises InputError if a log is too short.
     """
     logs = [replace(log, rig=rig) for log in logs]
@@ -100,20 +107,36 @@ def learn(logs: Sequence[Log], rig: Rig) -> Knowledge:
         notes.append(
             "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
         )
-    seen = tuple(sightings_with(log) for log in logs)
-    found, sensor = _learn_sensor(seen, rig)
-    learnt += found
-    if rig.bearing_range is not None and sensor.range_kind != rig.bearing_range.range_kind:
-        notes.append(f"The ranges fit better as the {sensor.range_kind} than as the {rig.bearing_range.range_kind}.")
-    sensors = rig.sensors if "bearing_range" in rig.sensors else (*rig.sensors, "bearing_range")
-    rig = rig.model_copy(update={"bearing_range": sensor, "sensors": sensors})
-    rig = _uncertainties(rig, learnt)
-    correlations = tuple(sightings.correlation(one, sensor) for one in seen)
+    seen: tuple[Sightings, ...] = ()
+    correlations: tuple[Correlation, ...] = ()
+    if "bearing_range" in logs[0].streams:
+        seen = tuple(sightings_with(log) for log in logs)
+        found, sensor = _learn_sensor(seen, rig)
+        learnt += found
+        if rig.bearing_range is not None and sensor.range_kind != rig.bearing_range.range_kind:
+            notes.append(
+                f"The ranges fit better as the {sensor.range_kind} than as the {rig.bearing_range.range_kind}."
+            )
+        rig = rig.model_copy(update={"bearing_range": sensor})
+        correlations = tuple(sightings.correlation(one, sensor) for one in seen)
+    rfid: RfidKnowledge | None = None
+    if "rfid" in logs[0].streams:
+        if grids is None:
+            raise ValueError("logs with reads of tags need a place for grids")
+        rig, rfid = learn_rfid(logs, rig, grids, rfid_kind)
+    rig = sensing(_uncertainties(rig, learnt), logs[0])
     if len(logs) == 1:
         notes.append(
             "One log cannot tell what differs between runs: the uncertainties of constants are those of the input rig."
         )
-    return Knowledge(rig, tuple(learnt), noise, windows, seen, correlations, tuple(notes))
+    return Knowledge(rig, tuple(learnt), noise, windows, seen, correlations, tuple(notes), rfid)
+
+
+def sensing(rig: Rig, log: Log) -> Rig:
+    """The rig with all exteroceptive sensors of the log, and none that the log lacks, among those that are used."""
+    kept = [name for name in rig.sensors if name not in EXTEROCEPTIVE or name in log.streams]
+    added = [name for name in EXTEROCEPTIVE if name in log.streams and name not in kept]
+    return rig.model_copy(update={"sensors": (*kept, *added)})
 
 
 def sightings_with(log: Log) -> Sightings:
@@ -269,6 +292,8 @@ def _uncertainties(rig: Rig, learnt: Sequence[Learnt]) -> Rig:
     sections: dict[str, object] = {}
     for sensor, most in UNCERTAIN.items():
         settings = getattr(rig, sensor)
+        if settings is None:
+            continue
         found = {
             one.name: min(one.uncertainty, most[one.name])
             for one in learnt

@@ -44,6 +44,7 @@ def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant
         Constant("scale_rotation", settings.scale_rotation, 0.05, 0.2, 5.0),
         Constant("speed_bias", settings.speed_bias, 0.01, -1.0, 1.0),
         Constant("heading_rate_bias", settings.heading_rate_bias, 0.005, -1.0, 1.0),
+        Constant("heading_drift", settings.heading_drift, 0.02, -1.0, 1.0),
         Constant("direction", settings.direction, 0.05, -np.pi, np.pi),
     ]
     if isinstance(odometry_of(windows.log), VelocityStream):

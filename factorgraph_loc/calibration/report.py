@@ -8,13 +8,14 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from factorgraph_loc.calibration import figures
+from factorgraph_loc.calibration import figures, rfid_figures, rfid_report
 from factorgraph_loc.calibration.calibrate import Calibration, Scores
 from factorgraph_loc.calibration.learn import Learnt
 
 UNITS = {
     "speed_bias": "m/s",
     "heading_rate_bias": "rad/s",
+    "heading_drift": "rad/m",
     "direction": "rad",
     "delay": "s",
     "lag": "s",
@@ -60,14 +61,26 @@ def accuracy_table(calibration: Calibration) -> Rows:
     rows = []
     for i, log in enumerate(calibration.logs):
         for name, scores in rigs:
+            if not scores:
+                continue
             found = [number(scores[i][f"{k}.{figure}"], n) for k in KINDS for figure, n in FIGURES.values()]
             rows.append((log, name, *found))
     return header, rows
 
 
+def rfid_tables(calibration: Calibration) -> list[Rows]:
+    """Survey and mounting, models of detection, and doubtful tags if there are any."""
+    found = calibration.knowledge.rfid
+    if found is None:
+        return []
+    tables = [rfid_report.offsets_table(found), rfid_report.models_table(found)]
+    return [*tables, rfid_report.tags_table(found)] if found.doubts else tables
+
+
 def document(calibration: Calibration) -> dict[str, Any]:
     """Everything of the report as plain values."""
-    noise, trial = calibration.knowledge.noise, calibration.consistency.trial
+    noise, rfid = calibration.knowledge.noise, calibration.knowledge.rfid
+    trial = calibration.consistency.trial if calibration.consistency else None
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
 
     def scores(found: Sequence[Scores]) -> dict[str, Any]:
@@ -94,8 +107,9 @@ def document(calibration: Calibration) -> dict[str, Any]:
         "noise_factor": None if trial is None else trial.factor,
         "correlation": {
             log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
-            for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=True)
+            for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=False)
         },
+        "rfid": None if rfid is None else rfid_report.rfid_document(rfid),
         "before": scores(calibration.before),
         "after": scores(calibration.after),
         "held_out": scores(calibration.held_out),
@@ -120,12 +134,9 @@ def page(calibration: Calibration) -> str:
         _table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
         *_noise(calibration),
-        "<h2>How alike neighbouring errors are</h2>",
-        "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
-        "one, and the noise in the rig must be larger than the scatter.</p>",
-        _table(*_correlations(calibration)),
-        "<h2>Accuracy of the EKF</h2>",
-        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the filter is too sure. "
+        *_rfid(calibration),
+        f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
+        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is too sure. "
         + (
             "The rows <i>from the other logs</i> are the honest ones: of that rig, only the factor on the noise has seen the log."
             if calibration.held_out
@@ -133,10 +144,17 @@ def page(calibration: Calibration) -> str:
         )
         + "</p>",
         _table(*accuracy_table(calibration)),
-        "<h2>Residuals of the sightings</h2>",
-        _image(figures.sightings_figure(knowledge)),
-        _image(figures.correlation_figure(knowledge)),
     ]
+    if knowledge.seen:
+        parts += [
+            "<h2>How alike neighbouring errors are</h2>",
+            "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
+            "one, and the noise in the rig must be larger than the scatter.</p>",
+            _table(*_correlations(calibration)),
+            "<h2>Residuals of the sightings</h2>",
+            _image(figures.sightings_figure(knowledge)),
+            _image(figures.correlation_figure(knowledge)),
+        ]
     if knowledge.windows:
         parts += ["<h2>Residuals of the odometry</h2>", _image(figures.odometry_figure(knowledge))]
     title = f"Calibration of {_text(calibration.rig.name)}"
@@ -147,14 +165,14 @@ def page(calibration: Calibration) -> str:
 def _verdict(calibration: Calibration) -> str:
     change = [
         after["causal.position_rmse"] / before["causal.position_rmse"]
-        for before, after in zip(calibration.before, calibration.after, strict=True)
+        for before, after in zip(calibration.before, calibration.after, strict=False)
         if before["causal.position_rmse"] and after["causal.position_rmse"]
     ]
     kept = sum(c.kept for c in calibration.knowledge.constants)
     text = f"{kept} of {len(calibration.knowledge.constants)} constants were worth changing."
     if change:
         mean = math.exp(sum(map(math.log, change)) / len(change))
-        text += f" The EKF's position error is {mean:.2f} times that with the input rig."
+        text += f" The {_estimator(calibration)}'s position error is {mean:.2f} times that with the input rig."
     return text
 
 
@@ -169,7 +187,8 @@ def _long_constants(calibration: Calibration) -> Rows:
 
 
 def _noise(calibration: Calibration) -> list[str]:
-    noise, trial = calibration.knowledge.noise, calibration.consistency.trial
+    noise = calibration.knowledge.noise
+    trial = calibration.consistency.trial if calibration.consistency else None
     out = []
     if noise is not None:
         rows = [
@@ -183,8 +202,8 @@ def _noise(calibration: Calibration) -> list[str]:
             "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
         )
     scatter, rig = calibration.knowledge.rig.bearing_range, calibration.rig.bearing_range
-    assert scatter is not None
-    assert rig is not None
+    if not calibration.knowledge.seen or scatter is None or rig is None:
+        return out
     names = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
     rows = [(f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(rig, n))) for n, unit in names.items()]
     out.append(_table(("noise of the sightings", "scatter", "in the rig"), rows))
@@ -194,6 +213,26 @@ def _noise(calibration: Calibration) -> list[str]:
             f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
         )
     return out
+
+
+def _rfid(calibration: Calibration) -> list[str]:
+    found = calibration.knowledge.rfid
+    if found is None:
+        return []
+    tables = [_table(*table) for table in rfid_tables(calibration)]
+    return [
+        "<h2>RFID</h2>",
+        f"<p>{_text(rfid_report.tempering_text(found, calibration.rig))}</p>",
+        *tables,
+        "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or stretches.</p>",
+        _image(rfid_figures.reliability_figure(found)),
+        "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the model.</p>",
+        _image(rfid_figures.field_figure(found)),
+    ]
+
+
+def _estimator(calibration: Calibration) -> str:
+    return "EKF" if calibration.knowledge.rfid is None else "smoother"
 
 
 def _correlations(calibration: Calibration) -> Rows:

@@ -17,6 +17,9 @@ WORTH = 1e-3  # nats a pair; what helps less does not pay for itself
 BEAM_PAIRS = 20000  # are enough for its four parameters
 
 
+PLANE = Axes()
+
+
 @dataclass(frozen=True)
 class Kind:
     """A way to fit: ``name`` beam, logistic or grid; ``facing``: with the features that need it; ``own``: each antenna its own
@@ -25,7 +28,7 @@ class Kind:
     name: str
     facing: bool = False
     own: bool = False
-    axes: Axes = Axes()
+    axes: Axes = PLANE
     smoothness: float = 0.0
 
     def label(self) -> str:
@@ -42,20 +45,25 @@ class Kind:
 
 @dataclass(frozen=True)
 class Trial:
-    """Held-out negative log-likelihood [nats a pair] of a way to fit: of each fold, and over all."""
+    """Held-out negative log-likelihood [nats a pair] of a way to fit: of each fold, and over all; ``predicted`` (M,): probabilities
+    of the pairs, floor included, each by a fit to the other folds."""
 
     kind: Kind
     by_fold: tuple[float, ...]
     nll: float
+    predicted: Array
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The ``kind`` that is used, all ``trials``, and the held-out probabilities (M,) of the pairs, floor included."""
+    """The trial that was ``best``, and all ``trials``."""
 
-    kind: Kind
+    best: Trial
     trials: tuple[Trial, ...]
-    predicted: Array
+
+    @property
+    def kind(self) -> Kind:
+        return self.best.kind
 
 
 def fit(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
@@ -100,7 +108,7 @@ def choose(pairs: Pairs, floor: Floor, antennas: int, *, facing: bool) -> Choice
         field = better(field, Kind("grid", uses_facing, axes=Axes(by_height=True), smoothness=smoothness))
     if field.nll < best.nll - WORTH:
         best = field
-    return Choice(best.kind, tuple(trials), held_out(pairs, best.kind, floor, antennas))
+    return Choice(best, tuple(trials))
 
 
 def held_out(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Array:
@@ -126,4 +134,4 @@ def _trial(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Trial:
     nll = -(pairs.hits * np.log(q) + (pairs.count - pairs.hits) * np.log1p(-q))
     folds = [pairs.fold == fold for fold in np.unique(pairs.fold)]
     each = tuple(float(np.sum(nll[one]) / np.sum(pairs.count[one])) for one in folds)
-    return Trial(kind, each, float(np.sum(nll) / np.sum(pairs.count)))
+    return Trial(kind, each, float(np.sum(nll) / np.sum(pairs.count)), q)

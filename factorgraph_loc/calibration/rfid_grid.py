@@ -38,8 +38,8 @@ class Axes:
 def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: Axes, floor: Floor) -> GridModel:
     """The grid of pairs, near to the ``parametric`` model; ``smoothness``: weight of squared second differences of logits.
 
-    The grid has a height axis where the heights of ``pairs`` differ, and a facing axis where the model has: what ``axes`` leaves out
-    is as the parametric model says.
+    The grid has a height axis where the heights of ``pairs`` differ, and a facing axis where the model has. What ``axes`` leaves
+    out is as the parametric model says.
     """
     heights = _heights(pairs)
     base = bake(parametric, EXTENT, CELL, heights, FACINGS if parametric.uses_facing or axes.by_facing else 1)
@@ -130,7 +130,7 @@ def _together(pairs: Pairs) -> Pairs:
     )
 
     def total(values: Array) -> Array:
-        return np.bincount(inverse, weights=values, minlength=len(first))
+        return np.asarray(np.bincount(inverse, weights=values, minlength=len(first)), dtype=float)
 
     count = total(pairs.count)
     return replace(

@@ -22,8 +22,8 @@ BLOCKS = 4  # stretches of time of a single log, each predicted by the others
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """M pairs. ``points`` (M, 3) [m] in the antenna's frame; ``facing`` (M,): cosine between the direction that the tag faces and
-    that to the antenna, 0 where not known; ``hits`` of ``count`` (M,) rounds; ``antenna`` and ``tag`` (M,): places in the rig and among
-    the tags of all logs; ``fold`` (M,): what is held out together; ``block`` (M,): of :data:`BLOCK` seconds."""
+    that to the antenna, 0 where not known; ``hits`` of ``count`` (M,) rounds; ``antenna`` (M,): place in the rig; ``tag``
+    (M,): among those of all logs; ``fold`` (M,): what is held out together; ``block`` (M,): of :data:`BLOCK` seconds."""
 
     points: Array
     facing: Array
@@ -34,7 +34,7 @@ class Pairs:
     fold: Integers
     block: Integers
 
-    def part(self, keep: NDArray[np.bool_]) -> Pairs:
+    def part(self, keep: NDArray[np.bool_] | Integers) -> Pairs:
         """Some of the pairs."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
@@ -57,7 +57,7 @@ def pairs_of(
     parts = []
     blocks = 0
     for i, log in enumerate(logs):
-        points, facing, distance = local(log, settings, survey)
+        points, facing, _ = local(log, settings, survey)
         chosen = nearby(log, settings, survey) if within is None else within[i]
         row, column = np.divmod(chosen, len(log.names))
         block = ((log.t - log.t.min()) // BLOCK).astype(np.int64) + blocks
@@ -92,7 +92,7 @@ def tag_names(logs: Sequence[Rounds]) -> dict[str, int]:
 def stretches(t: Array) -> Integers:
     """The stretch (N,) of a single log that each time belongs to, of :data:`BLOCKS`."""
     share = (t - t.min()) / max(float(np.ptp(t)), 1e-9)
-    return np.minimum((BLOCKS * share).astype(np.int64), BLOCKS - 1)
+    return np.asarray(np.minimum(BLOCKS * share, BLOCKS - 1).astype(np.int64))
 
 
 def local(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> tuple[Array, Array, Array]:

@@ -85,8 +85,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     order = order[np.isfinite(poses[:, 0]) & (antenna[order] >= 0)]
     if len(order) < MIN_ROUNDS or len(names) < 2:
         raise InputError(
-            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas while there is a reference, and {len(names)} tags "
-            f"of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
+            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas while there is a reference, in which "
+            f"{len(names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
         )
     tags = [log.world.tags[name] for name in names]
     found = Rounds(
@@ -128,9 +128,11 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
-    middle = 0.5 * (oldest + youngest)
-    known = np.isfinite(middle)
-    return np.where(known, middle, np.median(middle[known]) if np.any(known) else 0.0)
+    known = np.isfinite(oldest)
+    middle = np.zeros(count)
+    middle[known] = 0.5 * (oldest[known] + youngest[known])
+    middle[~known] = np.median(middle[known]) if np.any(known) else 0.0
+    return middle
 
 
 def _together(rounds: Rounds) -> Rounds:

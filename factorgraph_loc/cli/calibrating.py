@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,13 +50,16 @@ def calibrate(
     from factorgraph_loc.rig import write_rig
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
-    with show.progress("calibrating", counted=True) as progress:
-        found = learn(loaded, _score_ekf, progress=progress)
-    try:
-        write_text(page, report.page(found))
-        write_rig(found.rig, out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    # learnt grids lie here until the rig is written: nothing is left of a calibration that fails
+    with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
+        with show.progress("calibrating", counted=True) as progress:
+            grids = Path(folder) / out.name.removesuffix(SUFFIX)
+            found = learn(loaded, _score, progress=progress, grids=grids)
+        try:
+            write_text(page, report.page(found))
+            write_rig(found.rig, out)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     for doubt in found.doubts:
         show.note(f"warning: {doubt}")
     if json:
@@ -63,6 +67,10 @@ def calibrate(
         return
     show.table(*report.constants_table(found.knowledge.constants))
     typer.echo()
+    if found.knowledge.rfid is not None:
+        for table in report.rfid_tables(found):
+            show.table(*table)
+            typer.echo()
     show.table(*report.accuracy_table(found))
     typer.echo(f"\nthe rig is in {out}, the report in {page}")
 
@@ -81,9 +89,9 @@ def _report_beside(out: Path, *, overwrite: bool) -> Path:
     return page
 
 
-def _score_ekf(log: Log) -> dict[str, Any]:
-    """The scores of the EKF on a log, with the log's rig."""
+def _score(log: Log) -> dict[str, Any]:
+    """The scores of the EKF on a log, with the log's rig and its sensors; of the smoother where tags are read."""
     from factorgraph_loc.evaluation.metrics import score
     from factorgraph_loc.experiments.run import RunConfig, run
 
-    return score(run(log, RunConfig("ekf")), log)
+    return score(run(log, RunConfig("smoother" if "rfid" in log.rig.sensors else "ekf")), log)

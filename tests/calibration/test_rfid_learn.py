@@ -1,0 +1,133 @@
+"""Survey, mounting, misplaced tags and tempering, from logs of which they are known."""
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.calibration.rfid_choice import Kind
+from factorgraph_loc.calibration.rfid_fit import Floor, fit_logistic
+from factorgraph_loc.calibration.rfid_learn import learn_rfid
+from factorgraph_loc.calibration.rfid_mounting import SURVEY_PLACES, Place, alternated, moved, with_offsets
+from factorgraph_loc.calibration.rfid_pairs import pairs_of
+from factorgraph_loc.calibration.rfid_rounds import rounds_of
+from factorgraph_loc.calibration.rfid_tags import misplaced
+from factorgraph_loc.calibration.rfid_tempering import independent_share, tempered
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.rfid_settings import GridSettings, SurveySettings
+from factorgraph_loc.rig import read_rig, write_rig
+
+FLOOR = Floor()
+KIND = Kind("logistic", facing=True)
+SHIFTED = SurveySettings(x=0.3, y=-0.2, heading=0.08, about_x=0.0, about_y=2.0)
+
+
+def model_of(rounds, settings, survey):
+    return (fit_logistic(pairs_of(rounds, settings, survey), FLOOR, with_facing=True),), (0, 0)
+
+
+def test_a_shifted_survey_is_found(read_tags):
+    """Within four standard errors each: less than one false alarm in 5,000 for the three; and they are known to decimetres."""
+    log = read_tags(seconds=400.0, survey=SHIFTED)
+    rounds = [rounds_of(log, log.rig.rfid)]
+    start = SurveySettings(about_x=0.0, about_y=2.0)
+    found = alternated(rounds, log.rig.rfid, start, SURVEY_PLACES, KIND, FLOOR)
+    assert np.all(found.errors < (0.1, 0.1, 0.05))
+    np.testing.assert_array_less(np.abs(found.changes - (0.3, -0.2, 0.08)), 4.0 * found.errors)
+
+
+def test_what_is_right_is_not_changed(read_tags):
+    log = read_tags(seconds=200.0)
+    rounds = [rounds_of(log, log.rig.rfid)]
+    settings, survey, offsets = with_offsets(rounds, log.rig.rfid, SurveySettings(), KIND, FLOOR, focused=False)
+    assert settings.all_antennas() == log.rig.rfid.all_antennas()
+    assert survey == SurveySettings()
+    assert not any(one.kept for one in offsets)
+
+
+def test_constants_of_one_antenna_and_of_all(read_tags):
+    settings = read_tags(seconds=60.0).rig.rfid
+    changed, survey = moved(
+        settings, SurveySettings(), (Place("x"), Place("y", -1), Place("yaw", 1)), np.array((0.1, 0.2, 0.3))
+    )
+    left, right = changed.all_antennas().values()
+    assert (survey.x, left.y, right.y) == pytest.approx((0.1, 0.4, 0.0))
+    assert (left.yaw, right.yaw) == pytest.approx((np.pi / 2, 0.3 - np.pi / 2))
+
+
+def test_misplaced_tags_are_named(read_tags):
+    """Three tags, 1 m off, in a map of 30: at least two are named, and 0.01 of the maps name one that is in its place."""
+    log = read_tags(seconds=300.0, misplaced=3)
+    rounds = [rounds_of(log, log.rig.rfid)]
+    found = misplaced(rounds, log.rig.rfid, SurveySettings(), *model_of(rounds, log.rig.rfid, SurveySettings()), FLOOR)
+    named = {doubt.name: doubt.distance for doubt in found}
+    assert set(named) <= {"tag0", "tag1", "tag2"}
+    assert len(named) >= 2
+    assert all(distance == pytest.approx(1.0, abs=0.4) for distance in named.values())
+
+
+def test_in_a_right_map_no_tag_is_named(read_tags):
+    """One map in 100 would have one."""
+    log = read_tags(seconds=200.0)
+    rounds = [rounds_of(log, log.rig.rfid)]
+    assert not misplaced(
+        rounds, log.rig.rfid, SurveySettings(), *model_of(rounds, log.rig.rfid, SurveySettings()), FLOOR
+    )
+
+
+def test_independent_reads_need_no_tempering(read_tags):
+    """Of 40 windows with three scores the mean square has a standard deviation of 0.13: 0.6 is beyond five of them."""
+    log = read_tags(seconds=400.0)
+    rounds = [rounds_of(log, log.rig.rfid, merged=False)]
+    models, which = model_of(rounds, log.rig.rfid, SurveySettings())
+    assert independent_share(rounds, log.rig.rfid, SurveySettings(), models, which, FLOOR) > 0.6
+
+
+def test_reads_in_bursts_need_it(read_tags):
+    """Each round five times over: the share is a fifth."""
+    from dataclasses import replace  # noqa: PLC0415
+
+    log = read_tags(seconds=400.0)
+    once = rounds_of(log, log.rig.rfid, merged=False)
+    models, which = model_of([once], log.rig.rfid, SurveySettings())
+    five = replace(once, count=5.0 * once.count, hits=5.0 * once.hits)
+    alone, together = (
+        independent_share([one], log.rig.rfid, SurveySettings(), models, which, FLOOR) for one in (once, five)
+    )
+    assert together == pytest.approx(min(alone / 5.0, 0.2), rel=0.2)
+
+
+def test_tempering_is_the_square_of_a_factor(read_tags):
+    rig = read_tags(seconds=60.0).rig
+    assert tempered(rig, 5.0).rfid.tempering == pytest.approx(0.04)
+    assert tempered(rig, 0.5).rfid.tempering == 1.0
+
+
+def test_a_learnt_rig_is_complete(read_tags, tmp_path):
+    """With any model, a grid included, it is read back from where it was written."""
+    log = read_tags(seconds=100.0)
+    (tmp_path / "work").mkdir()
+    rig, knowledge = learn_rfid(
+        [log], log.rig, tmp_path / "work" / "cart", Kind("grid", True, own=True, smoothness=5.0)
+    )
+    assert knowledge is None
+    write_rig(rig, tmp_path / "cart.rig.toml")
+    back = read_rig(tmp_path / "cart.rig.toml")
+    assert all(isinstance(model, GridSettings) for model in back.rfid.models.values())
+    assert {antenna.model for antenna in back.rfid.all_antennas().values()} == {"left", "right"}
+    for mine, theirs in zip(rig.rfid.model().models, back.rfid.model().models, strict=True):
+        np.testing.assert_array_equal(mine.logits, theirs.logits)
+    assert (back.rfid.false_read, back.rfid.miss) == (0.02, 0.02)
+
+
+def test_a_floor_that_the_rig_gives_is_kept(read_tags, tmp_path):
+    log = read_tags(seconds=60.0)
+    given = log.rig.model_copy(update={"rfid": type(log.rig.rfid)(antennas=log.rig.rfid.antennas, false_read=0.001)})
+    rig, _ = learn_rfid([log], given, tmp_path / "cart", Kind("logistic", True))
+    assert (rig.rfid.false_read, rig.rfid.miss) == (0.001, 0.0)
+
+
+def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
+    log = read_tags(seconds=20.0)
+    with pytest.raises(InputError, match=r"reads-1: has 79 inventory rounds .* expected 100 rounds and 2 tags or more"):
+        learn_rfid([log], log.rig, tmp_path / "cart")
+    with pytest.raises(InputError, match=r"its rig says nothing of RFID"):
+        learn_rfid([log], log.rig.model_copy(update={"rfid": None}), tmp_path / "cart")
