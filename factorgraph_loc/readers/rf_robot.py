@@ -141,11 +141,7 @@ def read_reads(path: Path, warnings: list[str]) -> _Reads:
         if len(bad):
             raise bad_field(path, field, float(column[bad[0]]), f"{low:g} to {high:g}", row=rows[bad[0]])
     t_ns = np.array(stamps, dtype=np.int64)
-    back = np.flatnonzero(np.diff(t_ns) < 0) + 1
-    if len(back):
-        i = int(back[0])
-        expected = f"a stamp not before that of the row before, {stamps[i - 1] // 1000}"
-        raise bad_field(path, READ_FIELDS[7], stamps[i] // 1000, expected, row=rows[i])
+    checks.arrivals(path, np.array(rows, dtype=np.int64), t_ns, warnings)
     return _Reads(t_ns, epc, table[:, 2], np.radians(table[:, 1]), table[:, 0] * 1e6)
 
 
