@@ -182,7 +182,7 @@ RACKHAM_RIG: Mapping[str, Any] = {
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
 # Fades of a share f that last d in the mean make the count of reads in many rounds, dt apart, vary more than independent rounds
 # would: 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) times as much, with rho = exp(-dt / (d (1 - f))), where a share p of the rounds
-# outside fades read the tag: 1.9 times at p = 0.5. One over that is too cautious, as the robot passes a tag in less than a few fades.
+# outside fades read the tag: 1.9 times at p = 0.5. One over that is too cautious, since the robot moves on.
 # The tempering is that at which the smoother's causal ANEES is 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
