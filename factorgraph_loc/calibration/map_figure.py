@@ -1,4 +1,4 @@
-"""The picture of a map: what was given, what was learnt, and where the robot was."""
+"""The picture of a map, of landmarks or tags: what was given, what was learnt, and where the robot was."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factorgraph_loc.calibration.mapping import LandmarkMap
+from factorgraph_loc.calibration.tag_mapping import MadeTags
 from factorgraph_loc.evaluation.figures import COLOURS, grid, legend
 from factors.se2 import Array
 
@@ -14,9 +15,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORNERS = 60  # of an ellipse that is drawn as a polygon
+LABEL = 4  # last characters of a tag's EPC, that the picture has room for
 
 
-def figure(log: str, made: LandmarkMap, poses: Array) -> Figure:
+def tag_figure(log: str, made: MadeTags) -> Figure:
+    """Given and learnt tags as of :func:`figure`, labelled by the end of the EPC; where ambiguous ones may be, and those
+    of the given map that were not located."""
+    out = figure(log, made.made, made.poses, LABEL)
+    axis = out.axes[0]
+    for name, modes in made.modes.items():
+        places = np.array([mode.position for mode in modes])
+        axis.plot(*places.T, ":o", color=COLOURS[4], markersize=6, label="ambiguous: one of these", zorder=3)
+        axis.annotate(name[-LABEL:], tuple(places[0]), (7, 7), textcoords="offset points", fontsize=10, zorder=5)
+    lost = [e.given for e in made.made.entries if e.given is not None and e.landmark in made.open]
+    if lost and made.made.judged:
+        axis.plot(*np.array(lost).T, "s", color=COLOURS[3], markersize=12, markerfacecolor="none", label="not located")
+    for text in list(out.legends):
+        text.remove()
+    legend(out, [axis])
+    return out
+
+
+def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
     """Given and learnt landmarks, these with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
@@ -35,7 +55,7 @@ def figure(log: str, made: LandmarkMap, poses: Array) -> Figure:
         x, y = entry.learnt.position
         axis.plot(x, y, "x" if entry.flagged else "+", color=colour, markersize=9, label=kind, zorder=4)
         axis.plot(*_ellipse(entry.learnt.position, entry.learnt.covariance), color=colour, label="2 sigma", zorder=4)
-        axis.annotate(entry.landmark, (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
+        axis.annotate(entry.landmark[-label:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
         if entry.flagged and entry.given is not None:
             axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
     axis.set_aspect("equal", adjustable="datalim")

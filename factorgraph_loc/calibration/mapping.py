@@ -89,10 +89,10 @@ class LandmarkMap:
         """Names of the landmarks whose given position is wrong."""
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
-    def summary(self) -> str:
+    def summary(self, what: str = "landmarks") -> str:
         """One sentence on what was found."""
         counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
-        text = f"{len(self.world.landmarks)} landmarks are in the new map"
+        text = f"{len(self.world.landmarks)} {what} are in the new map"
         parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
         if self.flagged:
             parts.append(f"{len(self.flagged)} wrong in the given map ({', '.join(self.flagged)})")
@@ -110,6 +110,9 @@ class Alignment:
     factor: float
 
 
+IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
+
+
 def check(log: Log) -> None:
     """InputError if no landmark can be located from what the log's sightings hold."""
     stream = log.streams.get("bearing_range")
@@ -124,11 +127,14 @@ def check(log: Log) -> None:
         )
 
 
-def make_map(log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False) -> LandmarkMap:
+def make_map(
+    log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
+) -> LandmarkMap:
     """The map of the ``learnt`` landmarks of a run on ``log``.
 
     ``extend``: the run used the log's map and learnt what it lacks; its landmarks stay as they are. Otherwise the run has used no
-    map: where the log has one, the learnt landmarks are brought into its frame and its landmarks are judged. A landmark is wrong
+    map: where the log has one, the learnt landmarks are brought into its frame (unless they are ``in_frame`` already) and its
+    landmarks are judged. A landmark is wrong
     where it lies more than ``TOLERANCE`` from the learnt one, and the square of that distance, in units of its covariance, is
     beyond ``GATE``. The covariance is the sum of the learnt landmark's, the alignment's and the survey's.
 
@@ -144,14 +150,14 @@ def make_map(log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = Fals
         return _assemble(log, learnt, np.zeros(3), dict.fromkeys(given, "given"), keep=tuple(given))
     if not given:
         return _assemble(log, learnt, np.zeros(3), {})
-    if len(common) < MIN_COMMON:
+    if len(common) < MIN_COMMON and not in_frame:
         note = f"only {len(common)} of the given map's landmarks were mapped, expected {MIN_COMMON} or more to compare"
         return _unjudged(log, learnt, note)
     points = [learnt[name] for name in common]
     targets = np.array([log.world.position(name) for name in common])
     surveys = np.array([_survey(given[name]) for name in common])
-    alignment = align_robustly(points, targets, surveys)
-    if alignment.inliers < max(MIN_COMMON, len(common) / 2):
+    alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
+    if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
         note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map at a time"
         return _unjudged(log, learnt, note)
     moved = {name: _moved(point, alignment) for name, point in learnt.items()}

@@ -1,8 +1,8 @@
 """Where a tag may be, from looks along a known way: all places that explain the reads, not only the best one.
 
-A lattice of places is searched with the likelihood of all looks, and its best ones are refined by Fisher scoring. A robot that passed
-in a straight line leaves a tag on the left of it as likely as one on the right, unless its antennas or the way tell them apart: then
-there are two modes, and their weights say so. Weights are those of Laplace's method under a uniform prior.
+A lattice of places is searched with the likelihood of all looks, and its best ones are refined by Fisher scoring. After a straight
+pass a tag on the left of the robot may be as likely as one on the right, where the antennas do not tell them apart: then there are
+two modes, and their weights say so. Weights are those of Laplace's method under a uniform prior.
 
 A facing that matters to the model and is not known is tried in :data:`DIRECTIONS`, then between the best of them.
 """
@@ -95,8 +95,8 @@ class _Candidates:
 
 
 def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> list[Found]:
-    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown, by looks from known poses: the ``looks``, as seen
-    from the world's origin."""
+    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: from known poses, as
+    seen from the world's origin."""
     looks = merged(looks, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
     nothing = math.log1p(-model.false_read) * looks.rounds.sum()
@@ -105,7 +105,9 @@ def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> lis
     nowhere = -model.tempering * (nothing + reads * odds)
     # a tag with fewer reads cannot be located, wherever it is
     searched = -model.tempering * reads * odds > GAIN
-    coarse = _lattice_search(model, merged(looks, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan))
+    coarse = _lattice_search(
+        model, merged(looks, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
+    )
     if uses_facing and np.isnan(facing[coarse.tag]).any():
         between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
         sides = [_Candidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
@@ -136,7 +138,7 @@ def reach(model: RfidModel) -> float:
 
 
 def merged(looks: Looks, distance: float, angle: float) -> Looks:
-    """The looks with those of one antenna counted together as long as the robot stays within ``distance`` [m] and ``angle`` [rad]."""
+    """The looks, those of one antenna counted together while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
     group = np.empty(len(looks.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -231,9 +233,7 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
     return out
 
 
-def refine(
-    model: RfidModel, looks: Looks, heights: Array, candidates: _Candidates
-) -> tuple[_Candidates, Array, Array]:
+def refine(model: RfidModel, looks: Looks, heights: Array, candidates: _Candidates) -> tuple[_Candidates, Array, Array]:
     """Candidates at the optimum nearest to each, its negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
@@ -323,7 +323,11 @@ def _modes(found: _Candidates, nll: Array, covariances: Array) -> tuple[Mode, ..
     out = []
     for group in groups:
         members = [kept[k] for k in group]
-        share = weights[group] / weights[group].sum() if weights[group].sum() > 0.0 else np.full(len(group), 1.0 / len(group))
+        share = (
+            weights[group] / weights[group].sum()
+            if weights[group].sum() > 0.0
+            else np.full(len(group), 1.0 / len(group))
+        )
         mean = share @ found.places[members]
         off = found.places[members] - mean
         spread = np.einsum("k,kij->ij", share, covariances[members] + off[:, :, None] * off[:, None, :])

@@ -1,15 +1,16 @@
 """Tags and the robot's way at once, from odometry and reads alone.
 
-The way is built a stretch at a time, so that odometry drifts little beyond what is known of the tags: the poses of a stretch and all
-before are optimised with the tags that are in the map (:class:`factors.rfid_tag_factor.RfidTagFactor`), then those that are not are
-searched along the way (:mod:`factorgraph_loc.calibration.tag_search`), and come in as soon as one place alone explains their reads. At
-the end all tags are searched once more along the whole way, and the problem is solved again where one turns out to lie elsewhere.
+The way is built a stretch at a time, so that odometry drifts little beyond what is known of the tags: the poses of a stretch and
+all before are optimised with the tags that are in the map (:class:`factors.rfid_tag_factor.RfidTagFactor`), then those that are not
+are searched along the way (:mod:`factorgraph_loc.calibration.tag_search`), and come in as soon as one place alone explains their
+reads. At the end all tags are searched once more along the whole way, and the problem is solved again where one lies elsewhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +45,8 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 
 @dataclass(frozen=True)
 class TagSlam:
-    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: by number, those that were located; ``facing`` (T,); ``found``: what
-    the last search said of each of T tags."""
+    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: by number, those that were located; ``facing`` (T,);
+    ``found``: what the last search said of each of T tags."""
 
     t: Array
     poses: Array
@@ -57,7 +58,7 @@ class TagSlam:
 def tag_slam(
     log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
 ) -> TagSlam:
-    """Map the tags that are not ``known`` (T,); those that are stay where ``looks.positions`` has them. The frame is the prior's."""
+    """Map the tags that are not ``known`` (T,); those stay where ``looks.positions`` has them. The frame is the prior's."""
     way = _Way(log, looks, prior, known)
     count = len(way.t)
     for end in (*range(STRETCH, count, STRETCH), count):
@@ -86,9 +87,9 @@ class _Way:
             if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
                 motion.add(m)
         last = max(float(looks.t[-1]), prior.t)
-        self.t = prior.t + INTERVAL * np.arange(int((last - prior.t) / INTERVAL) + 1)
+        self.t: Array = np.asarray(prior.t + INTERVAL * np.arange(int((last - prior.t) / INTERVAL) + 1))
         states = [motion.state(float(t)) for t in self.t]
-        self._steps = [motion.relative(a, b) for a, b in zip(states[:-1], states[1:], strict=True)]
+        self._steps = [motion.relative(a, b) for a, b in pairwise(states)]
         self._used = looks.t >= prior.t
         self._keyframe = np.searchsorted(self.t, looks.t, side="right") - 1
         self._offsets = np.zeros((len(looks.t), 3))

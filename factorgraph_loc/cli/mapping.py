@@ -1,4 +1,4 @@
-"""``fgloc map``: a map of identified landmarks from a log, and what it says about the map that the log has."""
+"""``fgloc map``: a map of landmarks or of RFID tags from a log, and what it says about the map that the log has."""
 
 from __future__ import annotations
 
@@ -45,6 +45,21 @@ def map_(
         str, typer.Option("--estimator", "-e", metavar="NAME", help=f"One of {', '.join(MAPPERS)}.")
     ] = MAPPERS[0],
     extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
+    of: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="landmarks or tags; else landmarks where the log has sightings of them."),
+    ] = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="For tags: reference or odometry, which estimates the poses too; else the reference if there is one.",
+        ),
+    ] = None,
+    tag_height: Annotated[
+        float | None,
+        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; else that of the antennas."),
+    ] = None,
     prior: Prior = None,
     set_: Settings = None,
     reader: Reader = None,
@@ -55,8 +70,17 @@ def map_(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Make a map of the landmarks in a log; where the log has a map, check that."""
+    """Make a map of the landmarks or RFID tags in a log; where the log has a map, check that."""
     picture = _picture_beside(out, overwrite=overwrite)
+    options = LogOptions(reader, reader_option, data_root, rig, world)
+    if of not in (None, "landmarks", "tags"):
+        raise InputError(f"--of is {of!r}, expected landmarks or tags")
+    loaded = options.load_one(log)
+    if of == "tags" or (of is None and "bearing_range" not in loaded.streams and "rfid" in loaded.streams):
+        from factorgraph_loc.cli.mapping_tags import TagOptions, map_log
+
+        map_log(loaded, TagOptions(poses, prior, tag_height, extend=extend, json=json), out, picture)
+        return
     if estimator not in MAPPERS:
         raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
     settings = parse_settings(set_ or (), [estimator])[estimator]
@@ -69,7 +93,6 @@ def map_(
     from factorgraph_loc.world import write_world
     from factors import se2
 
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     mapping.check(loaded)
     if extend and not loaded.world.landmarks:
         raise InputError(f"{loaded.name}: has no map that could be extended; leave --extend out")
