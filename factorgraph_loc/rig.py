@@ -29,6 +29,9 @@ Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
 Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
 Noise = Annotated[float, Field(ge=0.0, le=5.0)]
 
+# m, rad, s: how long the error of a constant acts before what is seen corrects it
+WAY, TURN, TIME = 4.0, 4.0, 8.0
+
 
 class GrowthSettings(FileModel):
     """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) passed."""
@@ -39,6 +42,14 @@ class GrowthSettings(FileModel):
 
     def model(self) -> Growth:
         return Growth(self.per_distance, self.per_rotation, self.per_time)
+
+    def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> GrowthSettings:
+        """The same with independent errors of these standard deviations added."""
+        return GrowthSettings(
+            per_distance=math.hypot(self.per_distance, per_distance),
+            per_rotation=math.hypot(self.per_rotation, per_rotation),
+            per_time=math.hypot(self.per_time, per_time),
+        )
 
 
 class OdometryNoise(FileModel):
@@ -170,9 +181,25 @@ class Rig(FileModel):
     rfid: RfidSettings | None = None
     survey: SurveySettings = SurveySettings()
 
-    def odometry_model(self, *, use_gyro: bool = False) -> OdometryModel:
-        """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro."""
+    def odometry_model(self, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
+        """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
+
+        ``constants_as_noise``: for an estimator that does not estimate the uncertain constants, whose error then is in its noise: as
+        of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
+        """
         s = self.odometry
+        noise = s.noise
+        if constants_as_noise:
+            u = s.uncertainty
+            noise = OdometryNoise(
+                along=noise.along.widened(per_distance=u.scale_distance * math.sqrt(WAY)),
+                lateral=noise.lateral,
+                heading=noise.heading.widened(
+                    per_distance=u.heading_drift * math.sqrt(WAY),
+                    per_rotation=u.scale_rotation * math.sqrt(TURN),
+                    per_time=u.heading_rate_bias * math.sqrt(TIME),
+                ),
+            )
         imu = self.imu or ImuSettings()
         return OdometryModel(
             scale_distance=s.scale_distance,
@@ -188,9 +215,9 @@ class Rig(FileModel):
             max_hold=s.max_hold,
             unknown_distance=s.unknown_distance,
             unknown_rotation=s.unknown_rotation,
-            along=s.noise.along.model(),
-            lateral=s.noise.lateral.model(),
-            heading=imu.heading.model() if use_gyro else s.noise.heading.model(),
+            along=noise.along.model(),
+            lateral=noise.lateral.model(),
+            heading=imu.heading.model() if use_gyro else noise.heading.model(),
         )
 
     def estimated_odometry(self) -> Estimated:

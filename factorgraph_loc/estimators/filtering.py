@@ -44,7 +44,8 @@ class Filter(ABC):
         self.diagnostics = Diagnostics()
         self._max_delay = settings.max_delay
         self._smooth = settings.smooth
-        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
+        calibrates = getattr(settings, "self_calibration", False)
+        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
         self._state: Any = None
         self._t = -math.inf
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -61,7 +61,8 @@ class GraphEstimator(ABC):
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
         self.diagnostics = Diagnostics()
         self._graph_settings = settings
-        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
+        self_calibration = settings.self_calibration
+        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=self_calibration)
         self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)

@@ -20,10 +20,14 @@ class Motion:
     """Odometry rows in, relative motion between any two recent times out.
 
     A gyro replaces the rotation of wheels that report velocities; increments hold their own, and then it is ignored.
+    ``self_calibration``: the uncertain constants of the odometry are estimated; else their error is part of the noise.
     """
 
-    def __init__(self, rig: Rig, sensors: tuple[str, ...], diagnostics: Diagnostics) -> None:
+    def __init__(
+        self, rig: Rig, sensors: tuple[str, ...], diagnostics: Diagnostics, *, self_calibration: bool = False
+    ) -> None:
         self._rig = rig
+        self._constants_as_noise = not self_calibration
         self._use_gyro = "imu" in sensors and rig.imu is not None
         self._use_wheels = "odometry" in sensors
         self._horizon = HORIZON
@@ -36,7 +40,7 @@ class Motion:
         self._chain = self._new_chain()
 
     def _new_chain(self) -> OdometryChain:
-        model = self._rig.odometry_model(use_gyro=self._use_gyro)
+        model = self._rig.odometry_model(use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self._horizon)
 
     def add(self, m: Odometry) -> None:
