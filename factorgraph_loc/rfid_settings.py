@@ -90,7 +90,7 @@ class RssiSettings(FileModel):
     coefficients: tuple[float, float, float, float, float, float]
     sigma: Annotated[float, Field(gt=0.0, le=30.0, description="dB")]
     dof: Annotated[float, Field(gt=0.0, le=1000.0, description="degrees of freedom of Student's density")]
-    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.01
+    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
         """The model for antennas at these places."""
@@ -103,7 +103,7 @@ class PhaseSettings(FileModel):
 
     kappa: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
     tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
-    max_range: Annotated[float, Field(gt=0.0, le=50.0, description="m")] = 2.5
+    max_range: Annotated[float, Field(gt=0.0, le=50.0, description="m")] = 1.5
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
     window: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 2.0
     step: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.0

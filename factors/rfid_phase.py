@@ -94,13 +94,13 @@ class _Ordered(NamedTuple):
 @dataclass(frozen=True)
 class PhaseModel:
     """``antennas``: where they are on the robot; ``kappa``: concentration of twice the phase; ``tempering``: exponent of the
-    likelihood, for reads and windows that go together; ``max_range`` [m]: beyond it reflections spoil the phase; ``min_reads``: of
-    a group, fewer of which say nothing."""
+    likelihood, for reads and windows that go together; ``max_range`` [m]: beyond it reflections spoil the phase, which then turns
+    too slowly with the distance; ``min_reads``: of a group, fewer of which say nothing."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
     tempering: float = 0.05
-    max_range: float = 2.5
+    max_range: float = 1.5
     min_reads: int = 3
 
 

@@ -90,9 +90,10 @@ class _Focus:
         tags = tag_map(logs[0].world, SurveySettings())
         names = {name: i for i, name in enumerate(rfid.all_antennas())}
         parts: list[PhaseReads] = []
+        first_window = 0
         for log in logs:
-            first = 1 + int(parts[-1].windows.max(initial=0)) if parts else 0
-            parts.append(_reads_of(log, tags.index, names, first))
+            parts.append(_reads_of(log, tags.index, names, first_window))
+            first_window = 1 + int(parts[-1].windows.max(initial=first_window))
         reads = PhaseReads(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PhaseReads)))
         model = PhaseModel(rfid.model().antennas, kappa=1.0, tempering=1.0)
         return cls(reads, model, tags.tags, tags.tags.points[:, :2].mean(axis=0))

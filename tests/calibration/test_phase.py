@@ -12,7 +12,7 @@ from factorgraph_loc.calibration.phase import fit_phase
 from factorgraph_loc.calibration.rssi import fit_rssi, rssi_nll
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings, RssiSettings, SurveySettings
+from factorgraph_loc.rfid_settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings, SurveySettings
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
@@ -45,7 +45,7 @@ def simulated(seed: int) -> Log:
     rng = np.random.default_rng(seed)
     tags = {
         f"{row}{i}": Tag(x=-2.5 + 0.25 * i, y=y, z=z, facing=-math.copysign(math.pi / 2.0, y))
-        for row, (y, z) in enumerate(((1.5, 0.4), (-1.5, 0.8), (1.5, 1.4), (-1.5, 1.0)))
+        for row, (y, z) in enumerate(((1.2, 0.4), (-1.2, 0.8), (1.2, 1.4), (-1.2, 1.0)))
         for i in range(21)
     }
     world = World(tags=tags)
@@ -56,8 +56,8 @@ def simulated(seed: int) -> Log:
     mounting = np.array([(a.x + LEVER_ARM[0], a.y + LEVER_ARM[1], a.z) for a in SETTINGS.antennas.values()])
     places = np.column_stack((se2.transform_from(poses, mounting[antenna, :2]), mounting[antenna, 2]))
     distances = np.linalg.norm(places[:, None] - true.tags.points, axis=2)
-    # any of the tags within 2 m
-    tag = np.argmax(np.where(distances < 2.0, rng.random(distances.shape), -1.0), axis=1)
+    # any of the tags within 1.5 m
+    tag = np.argmax(np.where(distances < 1.5, rng.random(distances.shape), -1.0), axis=1)
     distance = distances[np.arange(READS), tag]
     offsets = rng.uniform(0.0, 2.0 * np.pi, (2, len(tags)))[antenna, tag]
     phase = offsets - 4.0 * np.pi * FREQUENCY / SPEED_OF_LIGHT * distance + np.pi * (rng.random(READS) < 0.2)
@@ -76,6 +76,14 @@ def simulated(seed: int) -> Log:
         frequency=np.full(READS, FREQUENCY),
     )
     return Log("simulated", Rig(rfid=SETTINGS), world, {"rfid": stream}, Trajectory(stamps, path(stamps)))
+
+
+def without_signals(log: Log) -> Log:
+    """The same reads, without phase and RSSI."""
+    stream = log.streams["rfid"]
+    assert isinstance(stream, RfidStream)
+    unknown = np.full(READS, np.nan)
+    return replace(log, streams={"rfid": replace(stream, phase=unknown, rssi=unknown)})
 
 
 @pytest.fixture(scope="module")
@@ -116,13 +124,28 @@ def test_without_reference_or_reads_it_says_what_is_missing(log: Log) -> None:
         fit_phase([replace(log, reference=None)], SETTINGS)
     with pytest.raises(InputError, match="no RFID reads"):
         fit_phase([replace(log, streams={})], SETTINGS)
-    stream = log.streams["rfid"]
-    assert isinstance(stream, RfidStream)
-    silent = replace(log, streams={"rfid": replace(stream, phase=np.full(READS, np.nan), rssi=np.full(READS, np.nan))})
     with pytest.raises(InputError, match="hold 0 reads with a phase"):
-        fit_phase([silent], SETTINGS)
+        fit_phase([without_signals(log)], SETTINGS)
     with pytest.raises(InputError, match="hold 0 reads with an RSSI"):
-        fit_rssi([silent], SETTINGS, SURVEY)
+        fit_rssi([without_signals(log)], SETTINGS, SURVEY)
+
+
+def test_settings_make_models_of_one_window() -> None:
+    antennas = SETTINGS.model().antennas
+    model = PhaseSettings(tempering=0.06, window=3.0, step=1.0).model(antennas)
+    assert model.tempering == pytest.approx(0.02)
+    assert model.antennas == antennas
+    with pytest.raises(ValueError, match="leaves gaps"):
+        PhaseSettings(window=1.0, step=2.0)
+    assert RSSI.model(antennas).coefficients == RSSI.coefficients
+
+
+def test_logs_are_focused_together(log: Log) -> None:
+    """The same log twice says the same, to the accuracy of the search: windows of different logs are never mixed."""
+    once = fit_phase([log], SETTINGS)
+    twice = fit_phase([log, without_signals(log), log], SETTINGS)
+    assert twice.reads == 2 * once.reads
+    assert twice.after == pytest.approx(once.after, abs=1e-5)
 
 
 def test_rssi_is_found() -> None:
