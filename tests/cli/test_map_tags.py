@@ -1,0 +1,99 @@
+"""`fgloc map` of RFID tags, from the arguments to the files, on a small simulated log."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from factorgraph_loc.readers import write_native
+from factorgraph_loc.simulation.settings import preset
+from factorgraph_loc.simulation.simulate import simulate
+from factorgraph_loc.world import Tag, World, read_world
+
+SETTINGS = {"world": {"width": 7.0, "depth": 6.5, "tags": 8}, "drive": {"duration": 40.0}}
+
+
+@pytest.fixture(scope="session")
+def room():
+    return simulate(preset("office", SETTINGS), 1)
+
+
+@pytest.fixture
+def on_disk(room, tmp_path):
+    """``on_disk(**changes)``: the path of the log with other fields."""
+
+    def write(**changes):
+        write_native(replace(room, **changes), tmp_path / "log")
+        return tmp_path / "log"
+
+    return write
+
+
+def rms(made, truth):
+    both = [(made[n], truth[n]) for n in made if n in truth]
+    return np.sqrt(np.mean([(a.x - b.x) ** 2 + (a.y - b.y) ** 2 for a, b in both]))
+
+
+def test_a_map_along_the_reference_can_be_used(fgloc, on_disk, room, tmp_path):
+    silent = room.world.model_copy(update={"tags": {**room.world.tags, "silent": Tag(x=60.0, y=0.0)}})
+    folder, out = on_disk(world=silent), tmp_path / "new.world.toml"
+    result = fgloc("map", folder, "-o", out)
+    assert result.exit_code == 0, result.output
+    assert "never read: silent" in result.stdout
+    assert "root mean square distance from the given places: 0." in result.stdout
+    assert "the frame of the new map is that of the reference" in result.stdout
+    made = read_world(out)
+    assert rms(made.tags, room.world.tags) < 0.6
+    assert sum(tag.covariance is not None for tag in made.tags.values()) >= 5
+    with Image.open(tmp_path / "new.map.png") as picture:
+        assert picture.width == 1600
+    errors = []
+    for world in ((), ("--world", out)):
+        run = fgloc("run", folder, "-e", "smoother", *world, "-o", tmp_path / f"run{len(errors)}", "--json")
+        assert run.exit_code == 0, run.output
+        errors.append(json.loads(run.stdout)["final.position_rmse"])
+    assert errors[1] < max(2.0 * errors[0], 0.2)
+
+
+def test_from_odometry_the_map_is_brought_onto_the_given_one(fgloc, on_disk, room, tmp_path):
+    result = fgloc("map", on_disk(), "--poses", "odometry", "-o", tmp_path / "a.world.toml", "--json")
+    assert result.exit_code == 0, result.output
+    content = json.loads(result.stdout)
+    assert content["frame"] == "that of the given map"
+    assert content["rms"] < 0.5
+    assert {entry["tag"] for entry in content["tags"]} == set(room.world.tags)
+
+
+def test_without_reference_and_map_the_frame_is_the_start(fgloc, on_disk, tmp_path):
+    folder = on_disk(world=World(), reference=None)
+    result = fgloc("map", folder, "--prior", "1,2,0.5", "--tag-height", "1.2", "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 0, result.output
+    assert "the robot starts at (1.000 m, 2.000 m, 0.500 rad), from --prior" in result.stdout
+    tags = read_world(tmp_path / "a.world.toml").tags
+    assert tags
+    assert {tag.z for tag in tags.values()} == {1.2}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--of", "walls"], "--of is 'walls', expected landmarks or tags"),
+        (["--poses", "gps"], "--poses is 'gps', expected reference or odometry"),
+        (["--tag-height", "1200"], "--tag-height is 1200, expected metres"),
+        (["--of", "landmarks"], "has no sightings of landmarks"),
+    ],
+)
+def test_bad_options_are_one_line(fgloc, on_disk, tmp_path, options, message):
+    result = fgloc("map", on_disk(), "-o", tmp_path / "a.world.toml", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_there_must_be_tags_to_extend(fgloc, on_disk, tmp_path):
+    result = fgloc("map", on_disk(world=World()), "--extend", "-o", tmp_path / "a.world.toml")
+    assert result.exit_code == 2
+    assert "has no map of tags that could be extended" in result.stderr
