@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid import RfidModel, probability
+from factorgraph_loc.calibration.tag_refinement import Candidates, reach, refine
+from factors.rfid import RfidModel
 from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
 from factors.se2 import Array, wrap, wrap_scalar
 
 CELL = 0.4  # m, of the lattice
 LEVEL = 0.2  # m: tags of about the same height share a lattice
-LEAST = 0.05  # probability of a read below which an antenna does not reach
 DIRECTIONS = 8
 CANDIDATES = 6  # of a tag, that are refined
 CUT = 40.0  # above the best of the lattice: a place is not a candidate, however far its optimum may be from the lattice
@@ -33,13 +33,7 @@ COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad that looks may be apart to
 GAIN = 8.0  # of the log-likelihood: less, the best of a few thousand places also gives to false reads
 SURE = 0.95  # weight of a mode that is the only one
 LARGEST_SIGMA = 1.0  # m
-ITERATIONS = 30
-CONVERGED = 1e-3  # m
-MAX_DAMPING = 1e6
-LARGEST_STEP = 0.5  # m
-STEP = 0.02  # m, for the curvature
-CHUNK = 256  # candidates that are refined at once, and
-LOOKS = 2000  # looks that are taken to the lattice at once, to bound the memory
+LOOKS = 2000  # that are taken to the lattice at once, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -82,18 +76,6 @@ def sigma(covariance: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """C places (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
-
-    tag: NDArray[np.int64]
-    places: Array
-    facing: Array
-
-    def __getitem__(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> _Candidates:
-        return _Candidates(self.tag[which], self.places[which], self.facing[which])
-
-
 def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> list[Found]:
     """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: from known poses, as
     seen from the world's origin."""
@@ -110,8 +92,8 @@ def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> lis
     )
     if uses_facing and np.isnan(facing[coarse.tag]).any():
         between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
-        sides = [_Candidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
-        coarse = _Candidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
+        sides = [Candidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
+        coarse = Candidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
     fine, nll, covariances = refine(model, looks, heights, coarse)
     out = []
     for t in range(len(heights)):
@@ -119,21 +101,6 @@ def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> lis
         mine = mine[np.argsort(nll[mine], kind="stable")]
         gain = float(nowhere[t] - nll[mine[0]]) if len(mine) else 0.0
         out.append(Found(_modes(fine[mine], nll[mine], covariances[mine]), int(reads[t]), gain))
-    return out
-
-
-def reach(model: RfidModel) -> float:
-    """The distance [m], seen from the robot, at which its antennas begin to read."""
-    out = 0.0
-    bearings = np.linspace(-math.pi, math.pi, 24, endpoint=False)
-    for antenna in model.antennas:
-        detection = model.models[antenna.model]
-        distances = np.arange(0.1, detection.reach, 0.1)
-        r, b = np.meshgrid(distances, bearings, indexing="ij")
-        points = np.stack((r * np.cos(b), r * np.sin(b), np.zeros_like(r)), axis=-1).reshape(-1, 3)
-        p = np.maximum(*(probability(detection, points, c) for c in (0.0, 1.0))).reshape(r.shape).max(axis=1)
-        read = np.flatnonzero(p > LEAST)
-        out = max(out, math.hypot(antenna.x, antenna.y) + (float(distances[read[-1]]) if len(read) else 0.0))
     return out
 
 
@@ -161,7 +128,7 @@ def merged(looks: Looks, distance: float, angle: float) -> Looks:
 
 def _lattice_search(
     model: RfidModel, looks: Looks, read: NDArray[np.bool_], heights: Array, facing: Array
-) -> _Candidates:
+) -> Candidates:
     """The best places of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
     cells = _cells(looks.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
@@ -180,7 +147,7 @@ def _lattice_search(
                 tables[t].append((nll[:, column], float(direction)))
     rows = [(t, *c) for t, table in enumerate(tables) if table for c in _best(cells, table)]
     out = np.array(rows).reshape(-1, 4)
-    return _Candidates(out[:, 0].astype(np.int64), out[:, 1:3], out[:, 3])
+    return Candidates(out[:, 0].astype(np.int64), out[:, 1:3], out[:, 3])
 
 
 def _cells(places: Array, distance: float) -> Array:
@@ -233,72 +200,7 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
     return out
 
 
-def refine(model: RfidModel, looks: Looks, heights: Array, candidates: _Candidates) -> tuple[_Candidates, Array, Array]:
-    """Candidates at the optimum nearest to each, its negative log-likelihood (C,) and covariance (C, 2, 2)."""
-    places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
-    covariances = np.empty((len(nll), 2, 2))
-    prior = np.eye(2) / reach(model) ** 2
-    for first in range(0, len(nll), CHUNK):
-        part = slice(first, first + CHUNK)
-        tag, facing = candidates.tag[part], candidates.facing[part]
-        mine = Looks(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tag]))
-        problem = _Refinement(model, mine, heights[tag], facing)
-        places[part], nll[part], information = problem.solve(places[part])
-        covariances[part] = np.linalg.inv(information + prior)
-    return _Candidates(candidates.tag, places, candidates.facing), nll, covariances
-
-
-@dataclass(frozen=True, eq=False)
-class _Refinement:
-    """C places at once, each by looks of its own column of hits."""
-
-    model: RfidModel
-    looks: Looks
-    heights: Array
-    facing: Array
-
-    def at(self, places: Array) -> tuple[Array, Array, Array]:
-        tags = TagArray(np.column_stack((places, self.heights)), self.facing)
-        return RfidLikelihood(self.model, tags).by_tag(np.zeros(3), self.looks)
-
-    def solve(self, places: Array) -> tuple[Array, Array, Array]:
-        """Places (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2): the curvature where that is
-        positive definite, else Fisher's."""
-        nll, gradient, information = self.at(places)
-        places, damping = places.copy(), np.full(len(places), 1e-3)
-        moving = np.arange(len(places))
-        for _ in range(ITERATIONS):
-            scale = damping * (np.trace(information[moving], axis1=1, axis2=2) + 1e-6)
-            damped = information[moving] + scale[:, None, None] * np.eye(2)
-            step = -np.linalg.solve(damped, gradient[moving, :, None])[..., 0]
-            step *= np.minimum(1.0, LARGEST_STEP / np.maximum(np.hypot(*step.T), 1e-12))[:, None]
-            tried = self._only(moving).at(places[moving] + step)
-            better = tried[0] <= nll[moving]
-            taken = moving[better]
-            places[taken] += step[better]
-            nll[taken], gradient[taken], information[taken] = (part[better] for part in tried)
-            damping = np.where(better, damping / 10.0, damping * 10.0)
-            on = (np.hypot(*step.T) > CONVERGED) & (damping < MAX_DAMPING)
-            moving, damping = moving[on], damping[on]
-            if not len(moving):
-                break
-        return places, nll, self._curvature(places, information)
-
-    def _only(self, which: NDArray[np.int64]) -> _Refinement:
-        looks = self.looks
-        hits = np.ascontiguousarray(looks.hits[:, which])
-        mine = Looks(looks.offsets, looks.antennas, looks.rounds, hits)
-        return _Refinement(self.model, mine, self.heights[which], self.facing[which])
-
-    def _curvature(self, places: Array, information: Array) -> Array:
-        columns = [(self.at(places + STEP * e)[1] - self.at(places - STEP * e)[1]) / (2.0 * STEP) for e in np.eye(2)]
-        curvature = np.stack(columns, axis=2)
-        curvature = (curvature + curvature.transpose(0, 2, 1)) / 2.0
-        good = np.linalg.eigvalsh(curvature)[:, 0] > 0.1 * np.linalg.eigvalsh(information)[:, 0]
-        return np.where(good[:, None, None], curvature, information)
-
-
-def _modes(found: _Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...]:
+def _modes(found: Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...]:
     """Optima of one tag, the best first, as modes: those that are near each other, which differ in facing, are one."""
     kept: list[int] = []
     for i in range(len(nll)):

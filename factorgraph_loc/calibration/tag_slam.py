@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.calibration.tag_looks import TagLooks
-from factorgraph_loc.calibration.tag_search import Found, reach, search
+from factorgraph_loc.calibration.tag_refinement import reach
+from factorgraph_loc.calibration.tag_search import Found, search
 from factorgraph_loc.estimators.base import Diagnostics, LearntPoint, PosePrior
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.problem import Problem
