@@ -250,6 +250,8 @@ class ParticleFilter(Filter):
         finder.seek(since)
         mean, covariance = self._state.moments
         if finder.refutes(mean, se2.world_to_body(mean, covariance)):
+            # for the final trajectory: since then the track was elsewhere
+            self._records = [r.lost() if r.t >= since else r for r in self._records]
             self._state = self._sought()
             finder.start()
             self._scan_monitor.clear()

@@ -36,6 +36,10 @@ class Record:
     covariance: Array
     cloud: Cloud | None
 
+    def lost(self) -> Record:
+        """The same, its cloud known to have been elsewhere."""
+        return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
+
 
 class BackwardSimulation:
     """``count`` trajectories through the clouds at the records ``kept``.

@@ -1,0 +1,154 @@
+"""Finding the robot from scans of tags alone."""
+
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators import kld
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.seeker import Seeker
+from factorgraph_loc.measurements import VelocityOdometry
+from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
+from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factors import se2
+from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+
+NOISE = OdometryNoise(
+    along=GrowthSettings(per_distance=0.01),
+    lateral=GrowthSettings(per_distance=0.005),
+    heading=GrowthSettings(per_distance=0.026),
+)
+RIG = Rig(odometry=OdometrySettings(noise=NOISE), rfid=RfidSettings(preset="rackham", preset_z=1.2))
+BOUNDS = np.array(((-1.0, -1.0), (13.0, 9.0)))
+SPEED, STEP = 0.5, 0.5  # m/s, s
+START = np.array((1.0, 1.5, 0.1))
+
+
+class World:
+    """A drive along a gentle arc past tags, or straight, and what is read on the way."""
+
+    def __init__(self, points, seed, turn=0.1, rfid=RIG.rfid):
+        self.turn = turn
+        self.antennas = len(rfid.all_antennas())
+        self.rng = np.random.default_rng(seed)
+        points = np.column_stack((points, np.full(len(points), 1.2)))
+        self.likelihood = RfidLikelihood(rfid.model(), TagArray(points, np.full(len(points), np.nan)))
+        self.motion = Motion(RIG, ("odometry", "rfid"), Diagnostics())
+        self.motion.add(VelocityOdometry(0.0, SPEED, turn))
+        self.truth = START
+        self.t = 0.0
+        self.silent = False
+
+    def seeker(self):
+        return Seeker(self.likelihood, self.motion, BOUNDS, np.random.default_rng(self.rng.integers(2**32)))
+
+    def scan(self, seeker):
+        if self.t > 0.0:
+            self.motion.add(VelocityOdometry(self.t, SPEED, self.turn))
+        n = self.antennas
+        looks = Looks(np.zeros((n, 3)), np.arange(n), np.ones(n, dtype=np.int64), self.hits())
+        seeker.add(self.motion.state(self.t), looks)
+        at, self.t = self.truth, self.t + STEP
+        self.truth = se2.compose(at, se2.exp(np.array((SPEED, 0.0, self.turn)) * STEP))
+        return at
+
+    def hits(self):
+        chance = np.stack([self.likelihood.probabilities(self.truth[None], k)[0] for k in range(self.antennas)])
+        return (self.rng.random(chance.shape) < (0.0 if self.silent else chance)).astype(np.int64)
+
+
+def scattered(seed, count=25):
+    return np.random.default_rng(seed).uniform(BOUNDS[0] + 1.0, BOUNDS[1] - 1.0, (count, 2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_place_is_found_and_claimed(seed):
+    world = World(scattered(seed), seed)
+    seeker = world.seeker()
+    for _ in range(12):
+        at = world.scan(seeker)
+    assert seeker.best is not None
+    assert seeker.best.t == pytest.approx(5.5)
+    error = seeker.best.pose - at
+    assert math.hypot(*error[:2]) < 0.5
+    assert abs(se2.wrap_scalar(error[2])) < math.radians(15.0)
+    assert sum(m.weight for m in seeker.hypotheses) == pytest.approx(1.0, abs=0.02)
+    drawn = seeker.sample(np.random.default_rng(0), 500)
+    assert np.linalg.norm(drawn[:, :2].mean(axis=0) - seeker.best.pose[:2]) < 0.1
+
+
+def test_evidence_favours_a_world_that_fits():
+    found = []
+    for points in (scattered(1), scattered(2)):
+        world = World(scattered(1), 5)
+        other = RfidLikelihood(
+            RIG.rfid.model(), TagArray(np.column_stack((points, np.full(25, 1.2))), np.full(25, np.nan))
+        )
+        seeker = Seeker(other, world.motion, BOUNDS, np.random.default_rng(3))
+        for _ in range(6):
+            world.scan(seeker)
+        found.append(seeker.log_evidence)
+    assert found[0] > found[1] + 20.0
+
+
+def test_symmetric_places_stay_ambiguous():
+    # tags on one line, antennas ahead and behind, and a straight drive: the mirror image beyond the line fits as well
+    both = RfidSettings(
+        antennas={"ahead": AntennaSettings(x=0.2, z=1.2), "behind": AntennaSettings(x=-0.2, z=1.2, yaw=math.pi)}
+    )
+    line = np.column_stack((np.arange(0.0, 13.0, 1.5), np.full(9, 4.0)))
+    world = World(line, 1, turn=0.0, rfid=both)
+    seeker = world.seeker()
+    for _ in range(24):
+        at = world.scan(seeker)
+        assert seeker.best is None
+    modes = [m for m in seeker.hypotheses if m.weight > 0.1]
+    assert len(modes) == 2
+    for expected in (at, np.array((at[0], 8.0 - at[1], -at[2]))):
+        assert min(np.linalg.norm(m.pose - expected) for m in modes) < 0.6
+
+
+def test_no_reads_claim_nothing():
+    world = World(scattered(0), 0)
+    world.silent = True
+    seeker = world.seeker()
+    for _ in range(30):
+        world.scan(seeker)
+        assert seeker.best is None
+        assert all(np.isfinite(m.pose).all() for m in seeker.hypotheses)
+
+
+def test_found_after_silence():
+    world = World(scattered(4), 2)
+    world.silent = True
+    seeker = world.seeker()
+    for _ in range(6):
+        world.scan(seeker)
+    world.silent = False
+    for _ in range(12):
+        at = world.scan(seeker)
+    assert seeker.best is not None
+    assert np.linalg.norm(seeker.best.pose[:2] - at[:2]) < 0.5
+
+
+def test_a_scan_that_comes_again_is_left_out():
+    world = World(scattered(0), 0)
+    seeker = world.seeker()
+    world.scan(seeker)
+    before = seeker.log_evidence
+    assert not seeker.add(
+        world.motion.state(0.0), Looks(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, 25), int))
+    )
+    assert seeker.log_evidence == before
+
+
+def test_number_of_particles_follows_the_places_left():
+    rng = np.random.default_rng(0)
+    wide, narrow = rng.normal(0.0, 3.0, (20_000, 3)), rng.normal(0.0, 0.1, (20_000, 3))
+    assert len(kld.prefix(narrow, rng, 300)) < 1000
+    assert len(kld.prefix(wide, rng, 300)) > 10_000
+    assert len(kld.prefix(narrow, rng, 5000)) == 5000
+    # Fox (2003), eq. 7 at k = 101, epsilon 0.05: chi-square quantile 135.8 of 100 degrees of freedom over 0.1
+    assert kld.enough(np.array(101)) == pytest.approx(1358.0, rel=2e-3)
