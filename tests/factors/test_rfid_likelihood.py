@@ -1,0 +1,138 @@
+"""The likelihood of reads and silences: value, gradient, information, tables."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factors import se2
+from factors.rfid import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
+from factors.rfid_factor import RfidFactor
+from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray, together
+
+COEFFICIENTS = (3.0, -1.2, 0.02, -1.5, 0.2, -0.06, -0.6, 0.4, 0.9, 0.1, -0.16)
+MODELS: dict[str, DetectionModel] = {
+    "beam": BeamModel(),
+    "logistic": LogisticModel(COEFFICIENTS),
+    "grid": bake(LogisticModel(COEFFICIENTS), 6.0, 0.2, heights=(-0.4, 0.0, 0.4), facings=7),
+}
+POSE = np.array((4.0, 3.0, 0.5))
+
+
+def scene(model: DetectionModel, seed: int = 0, tempering: float = 1.0, pitch: float = 0.1) -> tuple[RfidLikelihood, Looks]:
+    """Four antennas with different places, 15 tags, of which some have no facing, and looks at different offsets."""
+    rng = np.random.default_rng(seed)
+    antennas = tuple(Antenna(0.3 * math.cos(a), 0.3 * math.sin(a), 1.0, a, pitch) for a in np.arange(4) * math.pi / 2.0)
+    facing = rng.uniform(-math.pi, math.pi, 15)
+    facing[:3] = np.nan
+    tags = TagArray(np.column_stack((rng.uniform(1.0, 7.0, (15, 2)), rng.uniform(0.8, 1.4, 15))), facing)
+    hits = rng.integers(0, 3, (4, 15))
+    looks = Looks(rng.normal(size=(4, 3)) * 0.1, np.arange(4), np.full(4, 2), hits)
+    return RfidLikelihood(RfidModel(antennas, (model,), 0.01, 0.02, tempering), tags), looks
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(seed=st.integers(0, 1000))
+def test_gradient(name: str, seed: int) -> None:
+    likelihood, looks = scene(MODELS[name], seed)
+    step = 1e-6
+    numeric = [
+        (
+            likelihood.score(se2.compose(POSE, se2.exp(step * e)), looks).nll[0]
+            - likelihood.score(se2.compose(POSE, se2.exp(-step * e)), looks).nll[0]
+        )
+        / (2.0 * step)
+        for e in np.eye(3)
+    ]
+    assert likelihood.score(POSE, looks).gradient[0] == pytest.approx(numeric, abs=1e-3, rel=1e-3)
+
+
+def test_information_and_expectation_are_those_of_drawn_reads() -> None:
+    """Over reads drawn from the model: the gradient has mean zero and the information as covariance. 4,000 draws: each of the checks
+    is at 5 standard errors, so that all together fail by chance once in 100,000 runs."""
+    likelihood, looks = scene(BeamModel(), pitch=0.0)
+    looks = Looks(np.zeros((4, 3)), looks.antennas, np.ones(4, dtype=np.int64), looks.hits)
+    rng = np.random.default_rng(5)
+    q = np.array([likelihood.probabilities(POSE[None], a)[0] for a in range(4)])
+    scores = [
+        likelihood.score(POSE, Looks(looks.offsets, looks.antennas, looks.rounds, (rng.random(q.shape) < q).astype(np.int64)))
+        for _ in range(4000)
+    ]
+    gradients = np.array([s.gradient[0] for s in scores])
+    nlls = np.array([s.nll[0] for s in scores])
+    information = scores[0].information[0]
+    root = np.sqrt(len(scores))
+    assert np.all(np.abs(gradients.mean(axis=0)) < 5.0 * gradients.std(axis=0) / root)
+    products = gradients[:, :, None] * gradients[:, None, :]
+    assert np.all(np.abs(products.mean(axis=0) - information) < 5.0 * products.std(axis=0) / root)
+    assert abs(nlls.mean() - scores[0].expected[0]) < 5.0 * nlls.std() / root
+    squares = (nlls - nlls.mean()) ** 2
+    assert abs(squares.mean() - scores[0].variance[0]) < 5.0 * squares.std() / root
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_tables_are_near_the_likelihood(name: str) -> None:
+    likelihood, looks = scene(MODELS[name])
+    poses = POSE + np.random.default_rng(2).normal(size=(300, 3)) * (0.5, 0.5, 0.5)
+    exact = -likelihood.score(poses, looks).nll
+    found = likelihood.log_likelihood(poses, looks)
+    # the cells are 5 cm wide: an error of what the likelihood changes within half of one
+    assert np.std(found - exact) < 0.1 * np.std(exact)
+    assert np.abs(found - exact).mean() < 0.05 * np.abs(exact).mean()
+
+
+def test_one_read_and_one_silence_by_hand() -> None:
+    tags = TagArray(np.array(((2.0, 0.5, 1.0), (3.0, -1.0, 1.0))), np.full(2, np.nan))
+    likelihood = RfidLikelihood(RfidModel((Antenna(z=1.0),), (BeamModel(),), 0.01, 0.02, 0.5), tags)
+    looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((1, 0),)))
+    p = probability(BeamModel(), np.array(((2.0, 0.5, 0.0), (3.0, -1.0, 0.0))))
+    q = 0.01 + 0.97 * p
+    expected = -0.5 * (math.log(q[0]) + math.log(1.0 - q[1]))
+    assert likelihood.score(np.zeros(3), looks).nll[0] == pytest.approx(expected, rel=1e-9)
+    assert likelihood.probabilities(np.zeros((1, 3)), 0)[0] == pytest.approx(q, rel=1e-9)
+
+
+def test_looks_around_one_pose_add_up() -> None:
+    likelihood, looks = scene(BeamModel())
+    moved = looks.moved(np.array((0.2, 0.0, 0.1)))
+    both = likelihood.score(POSE, together([looks, moved])).nll[0]
+    apart = likelihood.score(POSE, looks).nll[0] + likelihood.score(se2.compose(POSE, (0.2, 0.0, 0.1)), looks).nll[0]
+    assert both == pytest.approx(apart, rel=1e-12)
+
+
+def test_tags_say_together_what_each_says() -> None:
+    likelihood, looks = scene(MODELS["grid"], tempering=0.3)
+    nll, gradient, information = likelihood.by_tag(POSE, looks)
+    assert nll.sum() == pytest.approx(likelihood.score(POSE, looks).nll[0])
+    step = 1e-6
+    for t in (0, 7):
+        for axis in range(2):
+            ends = []
+            for s in (step, -step):
+                points = likelihood.tags.points.copy()
+                points[t, axis] += s
+                other = RfidLikelihood(likelihood.model, TagArray(points, likelihood.tags.facing))
+                ends.append(other.score(POSE, looks).nll[0])
+            assert gradient[t, axis] == pytest.approx((ends[0] - ends[1]) / (2.0 * step), abs=1e-3)
+    assert np.all(np.linalg.eigvalsh(information) > -1e-12)
+
+
+def test_a_model_without_a_floor_stays_finite() -> None:
+    tags = TagArray(np.array(((0.5, 0.0, 0.0), (50.0, 0.0, 0.0))), np.full(2, np.nan))
+    likelihood = RfidLikelihood(RfidModel((Antenna(),), (BeamModel(p0=1.0 - 1e-16),), 0.0, 0.0), tags)
+    looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((0, 1),)))
+    assert all(np.all(np.isfinite(part)) for part in likelihood.score(np.zeros(3), looks))
+    assert not np.any(np.isnan(likelihood.log_likelihood(np.zeros((2, 3)), looks)))
+
+
+def test_factor_has_the_cost_gradient_and_curvature_of_the_likelihood() -> None:
+    likelihood, looks = scene(MODELS["logistic"], tempering=0.2)
+    factor, score = RfidFactor(likelihood, looks), likelihood.score(POSE, looks)
+    residual, (jacobian,) = factor.linearize([POSE])
+    assert residual.shape == (4,)
+    assert 0.5 * residual @ residual == pytest.approx(score.nll[0], rel=1e-6)
+    assert jacobian.T @ residual == pytest.approx(score.gradient[0], rel=1e-5, abs=1e-7)
+    assert jacobian.T @ jacobian == pytest.approx(score.information[0], rel=1e-4, abs=1e-6)
+    assert factor.cost([POSE]) == pytest.approx(score.nll[0])
