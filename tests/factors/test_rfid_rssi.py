@@ -60,6 +60,12 @@ def test_gradient_is_that_of_the_value(likelihood: RssiLikelihood) -> None:
     assert np.allclose(likelihood.score(poses, reads).gradient, numeric, rtol=1e-5, atol=1e-5)
 
 
+def test_particles_get_the_same_value(likelihood: RssiLikelihood) -> None:
+    reads = simulated(np.random.default_rng(7), likelihood.model, likelihood.tags, 50)
+    poses = POSE + np.random.default_rng(8).normal(0.0, 1.0, (20, 3))
+    assert likelihood.log_likelihood(poses, reads) == pytest.approx(-likelihood.score(poses, reads).nll)
+
+
 def test_information_is_the_expected_square_of_the_gradient(likelihood: RssiLikelihood) -> None:
     """Of independent reads: the mean over 4,000 draws lies within 10 % (its own spread is 2 %)."""
     rng = np.random.default_rng(4)
