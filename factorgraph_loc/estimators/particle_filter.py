@@ -30,7 +30,7 @@ from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Re
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import Relocalizer
 from factorgraph_loc.estimators.scan_finder import ScanFinder
-from factorgraph_loc.estimators.scan_monitor import ScanMonitor
+from factorgraph_loc.estimators.scan_monitor import ScanMonitor, Silence
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
@@ -90,6 +90,7 @@ class ParticleFilter(Filter):
         self._tags = tags.KnownTags(setup, self.diagnostics)
         self._finder: ScanFinder | None = None
         self._scan_monitor = ScanMonitor()
+        self._silence = Silence()
         if self._tags.likelihood is not None and not self._landmarks.known:
             self._motion.keep(KEPT)
             bounds = extent(setup.world, self._tags.map.tags)
@@ -235,6 +236,12 @@ class ParticleFilter(Filter):
         mean, covariance = self._state.moments
         update = tags.update(likelihood, looks, mean, se2.world_to_body(mean, covariance), iterations=1)
         self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
+        lasted = self._silence.lasts
+        if self._silence.add(int(looks.hits.sum()), update.evidence):
+            self.diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
+            if not lasted:
+                self._event("no tag is read where some should be")
+            return
         evidence = self._weigh(lambda: likelihood.log_likelihood(self._state.poses, looks))
         if self._finder is not None:
             self._finder.add(self._odometry, looks, evidence)
@@ -327,7 +334,8 @@ class ParticleFilter(Filter):
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            status: Status = "localized" if self._scan_monitor.suspicious_since is None else "ambiguous"
+            doubted = self._scan_monitor.suspicious_since is not None or self._silence.lasts
+            status: Status = "ambiguous" if doubted else "localized"
             return PoseEstimate(self._t, *self._state.moments, status)
         mode = self._state.modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")

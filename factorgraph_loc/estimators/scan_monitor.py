@@ -10,6 +10,27 @@ SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations: a suspicion arises above the
 SCANS = 4  # at least
 
 
+SILENT = 6.0  # log of the odds against a silence at which it is no longer taken for one of the place
+
+
+class Silence:
+    """Whether no tag is read where tags should be: then the reader or the tags have failed, and not to read them tells nothing
+    of the place, while it would drive an estimate to wherever no tags are."""
+
+    def __init__(self) -> None:
+        self._evidence = 0.0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the last scan was one of such a silence."""
+        return self._evidence < -SILENT
+
+    def add(self, reads: int, evidence: float) -> bool:
+        """Take a scan with so many reads, and the log-probability of it at the predicted pose; True in a silence."""
+        self._evidence = 0.0 if reads else self._evidence + evidence
+        return self.lasts
+
+
 class ScanMonitor:
     """Whether scans are much less likely than they would be if the track were right.
 

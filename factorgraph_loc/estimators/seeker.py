@@ -152,8 +152,8 @@ class Seeker:
         self._cloud = _cloud(poses, log_weights)
 
     def _jittered(self, cloud: Cloud, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
-        """Particles (N, 3) drawn from kernels on the particles ``rows`` (N,), as wide as befits how densely those, each of them once,
-        lie in the cells."""
+        """Particles (N, 3) drawn from kernels on the particles ``rows`` (N,), as wide as befits how densely those, each of them
+        once, lie in the cells."""
         poses = cloud.poses[rows]
         cells = len(np.unique(cell_numbers(poses, kld.CELL)))
         width = KERNEL * kld.CELL * (cells / len(np.unique(rows))) ** (1.0 / 3.0)
