@@ -134,8 +134,9 @@ def _parts(logs: Sequence[Log]) -> list[int]:
 
 
 def _is_complete(rig: Rig) -> bool:
-    """Whether a rig can be run with the sensors that it names."""
-    return all(getattr(rig, name) is not None for name in EXTEROCEPTIVE if name in rig.sensors)
+    """Whether a rig has what its sensors need, learnt or stated: with the default model of detection a run tells nothing."""
+    given = rig.rfid is None or "models" in rig.rfid.model_fields_set
+    return given and all(getattr(rig, name) is not None for name in EXTEROCEPTIVE if name in rig.sensors)
 
 
 def check(logs: Sequence[Log]) -> None:
