@@ -75,6 +75,8 @@ def map_tags(
         learnt = {tag: point for tag, point in learnt.items() if not known[tag]}
     else:
         if prior is None:
+            if extend:
+                raise InputError(f"{log.name}: to extend its map from odometry the start has to be known in it")
             prior = PosePrior(log.span()[0], np.zeros(3), START_SIGMA**2 * np.eye(3))
             looks = replace(looks, facing=np.full(len(given), np.nan))
         slam = tag_slam(log, looks, prior, known, progress)
@@ -169,6 +171,9 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
         x, y = se2.transform_to(transform, np.array((landmark.x, landmark.y))).tolist()
         covariance = _turned(landmark.spread(), -float(transform[2]))
         direction = facing[name] - float(transform[2])
+        given = log.world.tags.get(name)
+        if np.isnan(direction) and given is not None and given.facing is not None and is_in_given_frame(made):
+            direction = given.facing
         tags[name] = Tag(
             x=x,
             y=y,

@@ -188,3 +188,13 @@ def test_what_cannot_be_mapped_is_said(room):
         tag_looks(replace(room, rig=room.rig.model_copy(update={"rfid": None})))
     with pytest.raises(InputError, match="has no reference"):
         map_tags(replace(room, reference=None), "reference", None)
+
+
+def test_from_an_unknown_start_the_map_is_brought_onto_the_given_one_with_its_facings(room):
+    made = map_tags(replace(room, reference=None), "odometry", None)
+    assert made.made.judged
+    assert made.rms < 0.6
+    for name, tag in made.world.tags.items():
+        assert se2.wrap_scalar(tag.facing - room.world.tags[name].facing) == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(InputError, match="to extend its map from odometry the start has to be known"):
+        map_tags(room, "odometry", None, extend=True)
