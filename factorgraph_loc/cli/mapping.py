@@ -77,10 +77,14 @@ def map_(
         raise InputError(f"--of is {of!r}, expected landmarks or tags")
     loaded = options.load_one(log)
     if of == "tags" or (of is None and "bearing_range" not in loaded.streams and "rfid" in loaded.streams):
+        if set_ or estimator != MAPPERS[0]:
+            raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
         from factorgraph_loc.cli.mapping_tags import TagOptions, map_log
 
         map_log(loaded, TagOptions(poses, prior, tag_height, extend=extend, json=json), out, picture)
         return
+    if poses is not None or tag_height is not None:
+        raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
     if estimator not in MAPPERS:
         raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
     settings = parse_settings(set_ or (), [estimator])[estimator]

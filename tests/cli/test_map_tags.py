@@ -83,6 +83,8 @@ def test_without_reference_and_map_the_frame_is_the_start(fgloc, on_disk, tmp_pa
         (["--poses", "gps"], "--poses is 'gps', expected reference or odometry"),
         (["--tag-height", "1200"], "--tag-height is 1200, expected metres"),
         (["--of", "landmarks"], "has no sightings of landmarks"),
+        (["--of", "landmarks", "--poses", "reference"], "--poses and --tag-height are for maps of tags"),
+        (["--set", "batch.widest_loss=1"], "--estimator and --set are for maps of landmarks"),
     ],
 )
 def test_bad_options_are_one_line(fgloc, on_disk, tmp_path, options, message):
