@@ -89,7 +89,8 @@ def map_tags(
     by_name = {names[tag]: point for tag, point in learnt.items()}
     made = mapping.make_map(stand_in, by_name, extend=extend, in_frame=poses == "reference")
     turned = facing + made.frame[2]
-    world = _world(log, looks, made, {names[tag]: float(turned[tag]) for tag in learnt})
+    same = poses == "reference" or made.judged or extend
+    world = _world(log, looks, made, {names[tag]: float(turned[tag]) for tag in learnt}, in_given_frame=same)
     why = {
         name: _why(one, int(looks.hits[:, i].sum()))
         for i, (name, one) in enumerate(zip(names, found, strict=True))
@@ -156,7 +157,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
     return xx, xy, yy
 
 
-def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float]) -> World:
+def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool) -> World:
     """The map as it is written: learnt tags in the frame of the rig's survey, those that were kept as they were given."""
     survey: SurveySettings = log.rig.survey
     transform = survey.transform()
@@ -172,7 +173,7 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
         covariance = _turned(landmark.spread(), -float(transform[2]))
         direction = facing[name] - float(transform[2])
         given = log.world.tags.get(name)
-        if np.isnan(direction) and given is not None and given.facing is not None and is_in_given_frame(made):
+        if np.isnan(direction) and given is not None and given.facing is not None and in_given_frame:
             direction = given.facing
         tags[name] = Tag(
             x=x,
@@ -181,10 +182,6 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
             facing=None if np.isnan(direction) else se2.wrap_scalar(direction),
             covariance=covariance,
         )
-    walls = log.world.walls if is_in_given_frame(made) else ()
-    return World(name=f"{log.name}-map", landmarks=log.world.landmarks, tags=tags, walls=walls)
-
-
-def is_in_given_frame(made: LandmarkMap) -> bool:
-    """Whether the new map is in the frame of the given one, so that its walls stay right."""
-    return made.judged or any(entry.verdict == "given" for entry in made.entries)
+    # what else the log's map holds is right only in its frame
+    rest = log.world if in_given_frame else World()
+    return World(name=f"{log.name}-map", landmarks=rest.landmarks, tags=tags, walls=rest.walls)

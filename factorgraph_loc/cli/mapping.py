@@ -73,18 +73,13 @@ def map_(
     """Make a map of the landmarks or RFID tags in a log; where the log has a map, check that."""
     picture = _picture_beside(out, overwrite=overwrite)
     options = LogOptions(reader, reader_option, data_root, rig, world)
-    if of not in (None, "landmarks", "tags"):
-        raise InputError(f"--of is {of!r}, expected landmarks or tags")
     loaded = options.load_one(log)
-    if of == "tags" or (of is None and "bearing_range" not in loaded.streams and "rfid" in loaded.streams):
-        if set_ or estimator != MAPPERS[0]:
-            raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
+    of_landmarks, of_tags = set_ or estimator != MAPPERS[0], poses is not None or tag_height is not None
+    if _maps_tags(loaded, of, of_landmarks=bool(of_landmarks), of_tags=of_tags):
         from factorgraph_loc.cli.mapping_tags import TagOptions, map_log
 
         map_log(loaded, TagOptions(poses, prior, tag_height, extend=extend, json=json), out, picture)
         return
-    if poses is not None or tag_height is not None:
-        raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
     if estimator not in MAPPERS:
         raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
     settings = parse_settings(set_ or (), [estimator])[estimator]
@@ -127,6 +122,18 @@ def map_(
     for line in (made.summary(), *made.notes, f"the frame of the new map is {frame}"):
         typer.echo(line)
     typer.echo(f"\nthe map is in {out}, a picture of it in {picture}")
+
+
+def _maps_tags(log: Log, of: str | None, *, of_landmarks: bool, of_tags: bool) -> bool:
+    """Whether tags are mapped rather than landmarks; InputError for options of the other kind."""
+    if of not in (None, "landmarks", "tags"):
+        raise InputError(f"--of is {of!r}, expected landmarks or tags")
+    tags = of == "tags" or (of is None and "bearing_range" not in log.streams and "rfid" in log.streams)
+    if tags and of_landmarks:
+        raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
+    if not tags and of_tags:
+        raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
+    return tags
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
