@@ -10,7 +10,7 @@ SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations: a suspicion arises above the
 SCANS = 4  # at least
 
 
-SILENT = 6.0  # log of the odds against a silence at which it is no longer taken for one of the place
+SILENT = 8.0  # log of the odds against a silence at which it is no longer taken for one of the place
 
 
 class Silence:

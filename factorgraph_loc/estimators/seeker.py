@@ -25,7 +25,7 @@ from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
 
 DENSITY = 25.0  # particles per m^2 and rad at first
-FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 2500
+FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # times as many particles, at most, after a resampling
 KERNEL = 0.25  # of the distance between particles
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
@@ -39,7 +39,7 @@ WIDEST_POSITION, WIDEST_HEADING = 0.45, 0.3
 CLEAR_SCANS, CLEAR_TAGS = 3, 2  # scans with reads, and different tags in them
 WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CLEAR_WEIGHT may be anywhere
 # s that a place must have been clear, where its standard deviations are at most this share of the largest, and where not
-NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 1.0, 10.0
+NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
 
 
 class Seeker:
