@@ -202,4 +202,5 @@ class SurveySettings(FileModel):
         """The same as a pose (3,) of the survey's origin in the world."""
         pivot = np.array((self.about_x, self.about_y))
         turned = se2.transform_from(np.array((0.0, 0.0, self.heading)), pivot)
-        return np.array((*(pivot + (self.x, self.y) - turned), self.heading))
+        origin = pivot + np.array((self.x, self.y)) - turned
+        return np.array((origin[0], origin[1], self.heading))

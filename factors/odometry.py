@@ -42,7 +42,8 @@ class OdometryModel:
     """What we believe about wheel odometry (and about the gyro that may replace its rotation).
 
     ``scale_distance``, ``scale_rotation``: true over reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
-    ``gyro_bias`` [rad/s] are what is reported at rest; ``heading_drift`` [rad/m] is what the heading turns, unreported, on the way. ``direction`` [rad]: that of travel, in the robot's frame.
+    ``gyro_bias`` [rad/s] are what is reported at rest; ``heading_drift`` [rad/m] is what the heading turns, unreported, on the
+    way. ``direction`` [rad]: that of travel, in the robot's frame.
     ``delay`` and ``lag`` [s] belong to commanded velocities, and so does ``turn_slowdown`` [m/rad]: by how much a robot
     that turns falls short of the forward speed, per turn rate. A velocity is held for at most ``max_hold`` seconds; after
     that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
@@ -139,8 +140,8 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
     """The increment under changed parameters, and its Jacobian.
 
     ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional
-    heading-rate bias [rad/s], additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of its
-    body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant curvature.
+    heading-rate bias [rad/s], additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of
+    its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant curvature.
     """
     x, y, phi = se2.log(increment.delta).tolist()
     by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.duration, math.hypot(x, y)]])

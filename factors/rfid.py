@@ -66,8 +66,8 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A logit that is linear in :data:`FEATURES`: distance r [m] in the plane, w = 1 - cosine of the bearing, height difference z [m],
-    and c, the cosine between the direction that the tag faces and that to the antenna (0 where the facing is not known)."""
+    """A logit that is linear in :data:`FEATURES`: distance r [m] in the plane, w = 1 - cosine of the bearing, height difference z
+    [m], and c, the cosine between the direction that the tag faces and that to the antenna (0 where the facing is not known)."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -115,8 +115,8 @@ class GridModel:
 
 @dataclass(frozen=True)
 class Antenna:
-    """Place and boresight in the robot's frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (upwards) [rad]; ``model``: which of the
-    models it has."""
+    """Place and boresight in the robot's frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (upwards) [rad]; ``model``: which of
+    the models it has."""
 
     x: float = 0.0
     y: float = 0.0

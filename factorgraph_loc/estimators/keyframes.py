@@ -4,8 +4,8 @@ A keyframe stands at each stamp of landmarks, unless the one before is nearer th
 ``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one, displaced
 by the odometry since.
 
-Scans of RFID antennas come many a second and each tells little. Those from one keyframe to the next, half a second or more apart, make
-one factor, which enters the graph with the next keyframe; until then the newest pose is updated by them alone, as a filter would.
+Scans of RFID antennas come many a second and each tells little. Those from one keyframe to the next, half a second later, make one
+factor, which enters the graph with the next keyframe; until then the newest pose is updated by them alone, as a filter would.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.scan_monitor import Silence
+from factorgraph_loc.estimators.tag_signals import TagSignals
 from factorgraph_loc.estimators.tags import KnownTags, TagUpdate
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
@@ -69,7 +71,9 @@ class GraphEstimator(ABC):
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
         self._tags = KnownTags(setup, self.diagnostics)
-        self._pending: list[Looks] = []  # from the newest keyframe
+        self._signals = TagSignals(setup, self._tags)
+        self._silence = Silence()
+        self._pending: list[RfidFactor] = []  # on the newest keyframe
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         # all variables but the poses: estimate and covariance
@@ -228,33 +232,58 @@ class GraphEstimator(ABC):
             self._add_keyframe(m.t, None)
         keyframe, likelihood = self._keyframe_before(m.t), self._tags.likelihood
         assert likelihood is not None
-        offset = self._since(keyframe, m.t).delta
-        placed = looks.moved(offset) if m.t > keyframe.t else looks
+        offset = self._since(keyframe, m.t).delta if m.t > keyframe.t else np.zeros(3)
+        scanned = [RfidFactor(likelihood, looks.moved(offset))]
+        strengths = self._signals.strengths(m)
+        if strengths is not None and self._signals.strength is not None:
+            scanned.append(RfidFactor(self._signals.strength, strengths.moved(offset)))
         if keyframe is not self._keyframes[-1]:
-            if not self._is_open(keyframe.index):
-                self._drop_late(m)
-                return
-            node = Node((keyframe.key,), RfidFactor(likelihood, placed), ROWS)
-            keyframe.nodes.append(node)
-            self._attach(keyframe, Addition([*self._gather(), node]), None)
+            self._add_late(keyframe, scanned, m)
             return
-        updated = tags.update(likelihood, placed, self._pose, self._covariance)
-        self.diagnostics.innovation("rfid", m.t, updated.nis, updated.dof)
-        self._pending.append(placed)
-        self._pose, self._covariance = updated.pose, updated.covariance
-        self._refine(keyframe, (updated.pose, updated.covariance))
-        self._scanned(m.t, looks, updated)
+        update = tags.updated(scanned, self._pose, self._covariance)
+        self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
+        if not self._silence.add(int(looks.hits.sum()), update.evidence):
+            self._wait(keyframe, scanned, update)
+        self._scanned(m.t, looks, update)
+        if self._signals.keep(m):
+            self._take_phases(keyframe)
+
+    def _take_phases(self, keyframe: Keyframe) -> None:
+        changes = None
+        if ODOMETRY_KEY in self._constants:
+            changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
+        offsets = self._motion.places(keyframe.odometry, self._signals.times(), changes)
+        window = self._signals.phases(offsets, self._pose)
+        if window is not None:
+            self._wait(keyframe, [window], tags.updated([window], self._pose, self._covariance))
+
+    def _wait(self, newest: Keyframe, factors: list[RfidFactor], update: TagUpdate) -> None:
+        """Keep factors on the newest keyframe until the next one, and take over what they make of its pose."""
+        self._pending += factors
+        self._pose, self._covariance = update.pose, update.covariance
+        self._refine(newest, (update.pose, update.covariance))
+
+    def _add_late(self, keyframe: Keyframe, factors: list[RfidFactor], m: RfidScan) -> None:
+        if not self._is_open(keyframe.index):
+            self._drop_late(m)
+            return
+        nodes = [Node((keyframe.key,), factor, ROWS) for factor in factors]
+        keyframe.nodes += nodes
+        self._attach(keyframe, Addition([*self._gather(), *nodes]), None)
 
     def _gather(self) -> list[Node]:
-        """The scans from the newest keyframe as a factor, which is in no graph yet."""
+        """The scans from the newest keyframe as factors, which are in no graph yet: one of what was read and not read."""
         if not self._pending:
             return []
-        likelihood = self._tags.likelihood
-        assert likelihood is not None
-        node = Node((self._keyframes[-1].key,), RfidFactor(likelihood, together(self._pending)), ROWS)
+        keyframe, waiting = self._keyframes[-1], self._pending
         self._pending = []
-        self._keyframes[-1].nodes.append(node)
-        return [node]
+        looks = [factor.seen for factor in waiting if isinstance(factor.seen, Looks)]
+        factors = [factor for factor in waiting if not isinstance(factor.seen, Looks)]
+        if looks and self._tags.likelihood is not None:
+            factors.append(RfidFactor(self._tags.likelihood, together(looks)))
+        nodes = [Node((keyframe.key,), factor, ROWS) for factor in factors]
+        keyframe.nodes += nodes
+        return nodes
 
     def _add_keyframe(self, t: float, m: BearingRange | None) -> None:
         newest = self._keyframes[-1]
@@ -368,7 +397,8 @@ class GraphEstimator(ABC):
         return OdometryFactor(keyframe.from_previous, self._odometry_constants.indices), keys
 
     def _problem(self, width: float = 1.0) -> Problem:
-        """All that is known as one problem; the robust losses ``width`` times as wide as they are."""
+        """All that is known as one problem; the robust losses ``width`` times as wide as they are, and without the phases of tags,
+        which have many optima, where that is more than once."""
         assert self._prior is not None
         body = se2.world_to_body(self._prior.pose, self._prior.covariance)
         factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(self._prior.pose, body), (pose_key(0),))]
@@ -378,8 +408,11 @@ class GraphEstimator(ABC):
         for keyframe in self._keyframes:
             for node in keyframe.nodes:
                 assert node.factor is not None
-                factor = node.factor.widened(width) if isinstance(node.factor, BearingRangeFactor) else node.factor
-                factors.append((factor, node.keys))
+                factor = node.factor
+                if isinstance(factor, BearingRangeFactor):
+                    factor = factor.widened(width)
+                if width == 1.0 or not (isinstance(factor, RfidFactor) and factor.is_phase):
+                    factors.append((factor, node.keys))
         return Problem(factors)
 
     def _settle(self, problem: Problem, values: Values) -> Array:

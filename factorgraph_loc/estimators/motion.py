@@ -68,6 +68,19 @@ class Motion:
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         return self._chain.relative(start, end)
 
+    def places(self, start: ChainState, t: Array, changes: Array | None = None) -> Array:
+        """Poses (N, 3) at times (N,), before or after, in the frame of the pose at ``start``; ``changes``: of the constants
+        :data:`factors.odometry.PARAMETERS`, taken as :func:`factors.odometry.recalibrated` does."""
+        states = self._chain.states(t)
+        deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
+        if changes is None:
+            return deltas
+        moved, later = se2.log(deltas), t - start.t
+        ways = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1])
+        moved[:, :2] *= 1.0 + changes[0]
+        moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * later + changes[3] * ways
+        return np.asarray(se2.exp(moved))
+
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in its own frame."""
         moved = self.relative(self.state(t - TWIST_TIME), self.state(t))

@@ -26,7 +26,7 @@ from factorgraph_loc.estimators.scan_finder import ScanFinder
 from factorgraph_loc.estimators.scan_monitor import ScanMonitor
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.tag_map import extent
 from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
@@ -186,6 +186,7 @@ class RelocatingGraph(GraphEstimator):
 
     def _replay(self, measurements: list[Exteroceptive | Tick]) -> None:
         self._monitor.clear()
+        self._signals.clear()
         if self._finder is not None:
             self._finder.start()
         for m in measurements:

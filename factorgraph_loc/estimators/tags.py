@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.tag_map import TagMap, tag_map
 from factors import se2
-from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.rfid_factor import RfidFactor, TagScore
+from factors.rfid_likelihood import Looks, RfidLikelihood, Score
 from factors.se2 import Array
 
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
+ITERATIONS = 4
 NOTHING_TOLD = 1e-9  # added to an information that may be singular
 
 
@@ -59,6 +63,12 @@ class KnownTags:
             diagnostics.ignore("tag not in the map", unknown)
         return Looks(np.zeros((len(used), 3)), np.array(used, dtype=np.int64), rounds, hits)
 
+    def places(self, m: RfidScan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Of each read of a scan the places of its antenna in the rig and of its tag in the map, -1 where these lack it."""
+        antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
+        tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
+        return antennas[m.antenna], tags
+
 
 @dataclass(frozen=True)
 class TagUpdate:
@@ -78,40 +88,65 @@ class TagUpdate:
     evidence: float
 
 
-def update(likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = 4) -> TagUpdate:
+def update(
+    likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = ITERATIONS
+) -> TagUpdate:
+    """The most likely pose after looks at tags; see :func:`updated`."""
+    return updated([RfidFactor(likelihood, looks)], pose, covariance, iterations)
+
+
+def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int = ITERATIONS) -> TagUpdate:
     """The most likely pose under a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
 
-    A step that does not lower the cost is halved.
+    A step that does not lower the cost is halved. What is told of the innovation is that of the first factor.
     """
     prior_information = np.linalg.inv(covariance)
     sigmas = np.sqrt(np.diag(covariance))
-    score = likelihood.score(pose, looks)
-    gradient, information = score.gradient[0], score.information[0]
-    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
-    spread = likelihood.model.tempering * information + information @ covariance @ information
-    nis = float(gradient @ np.linalg.solve(spread + NOTHING_TOLD * np.eye(3), gradient))
-    dof = int(np.linalg.matrix_rank(information, tol=1e-6)) if nis > 0.0 else 0
-    surprise, variance = float(score.nll[0] - score.expected[0]), float(score.variance[0])
-    best, cost, moved = pose, float(score.nll[0]), np.zeros(3)
+    scores = [factor.score(pose) for factor in factors]
+    nis, dof = _innovation(factors[0], scores[0], covariance)
+    first = scores[0]
+    surprise = variance = 0.0
+    if isinstance(first, Score):
+        surprise, variance = float(first.nll[0] - first.expected[0]), float(first.variance[0])
+    cost, gradient, information = _total(scores)
+    best, moved = pose, np.zeros(3)
     for _ in range(iterations):
         total = prior_information + information
-        step = -np.linalg.solve(total, gradient + prior_information @ moved)
-        step *= min(1.0, float(np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12))))
+        step: Array = -np.linalg.solve(total, gradient + prior_information @ moved)
+        step = step * min(1.0, float(np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12))))
         if np.all(np.abs(step) < CONVERGED * sigmas):
             best = se2.compose(best, se2.exp(step))
             break
         for _ in range(4):
             tried = se2.compose(best, se2.exp(step))
-            score = likelihood.score(tried, looks)
+            nll, tried_gradient, tried_information = _total([factor.score(tried) for factor in factors])
             error = se2.log(se2.between(pose, tried))
-            tried_cost = float(score.nll[0]) + 0.5 * float(error @ prior_information @ error)
+            tried_cost = nll + 0.5 * float(error @ prior_information @ error)
             if tried_cost <= cost:
                 break
             step = step / 2.0
         else:
             break
         best, cost, moved = tried, tried_cost, error
-        gradient, information = score.gradient[0], score.information[0]
-    posterior = np.linalg.inv(prior_information + information)
+        gradient, information = tried_gradient, tried_information
+    posterior: Array = np.linalg.inv(prior_information + information)
     evidence = 0.5 * float(np.linalg.slogdet(posterior @ prior_information)[1]) - cost
     return TagUpdate(best, posterior, nis, dof, surprise, variance, evidence)
+
+
+def _total(scores: Sequence[TagScore]) -> tuple[float, Array, Array]:
+    first, *others = scores
+    nll, gradient, information = float(first.nll[0]), first.gradient[0], first.information[0]
+    for score in others:
+        nll += float(score.nll[0])
+        gradient, information = gradient + score.gradient[0], information + score.information[0]
+    return nll, gradient, information
+
+
+def _innovation(factor: RfidFactor, score: TagScore, covariance: Array) -> tuple[float, int]:
+    """Normalised square of a score, and its degrees of freedom."""
+    information = score.information[0]
+    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
+    spread = factor.likelihood.model.tempering * information + information @ covariance @ information
+    nis = float(score.gradient[0] @ np.linalg.solve(spread + NOTHING_TOLD * np.eye(3), score.gradient[0]))
+    return nis, int(np.linalg.matrix_rank(information, tol=1e-6)) if nis > 0.0 else 0
