@@ -65,7 +65,7 @@ def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, An
         part = cut(log, float(t), float(t) + deadline + 2.0 * HOLD)
         result = run(part, RunConfig(estimator, settings or {}, prior="unknown", seed=i))
         claimed = np.array(result.status) == "localized"
-        good = _right(result, part)
+        good = is_right(result, part)
         first_claim = int(np.argmax(claimed)) if claimed.any() else len(claimed)
         seconds = float(result.t[first_claim] - t) if claimed.any() else math.nan
         right = bool(claimed.any()) and seconds <= deadline and bool(_holds(result.t, good, first_claim))
@@ -89,7 +89,7 @@ def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[st
         carried = join(before, after, gap=JUMP)
         result = run(carried, RunConfig(estimator, settings or {}, prior="reference", seed=i))
         moved = before.span()[1] + JUMP
-        good = _right(result, carried)
+        good = is_right(result, carried)
         later = np.flatnonzero(result.t >= moved)
         held = [int(k) for k in later if result.t[k] <= moved + deadline and _holds(result.t, good, int(k))]
         seconds = float(result.t[held[0]] - moved) if held else math.nan
@@ -125,7 +125,7 @@ def _last_start(log: Log) -> float:
     return log.span()[0]
 
 
-def _right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
+def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
     """Which causal estimates are right; where the reference has a gap, as the one before, or at the beginning as the next."""
     assert log.reference is not None
     e = errors(Trajectory(result.t, result.poses), log.reference)

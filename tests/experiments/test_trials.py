@@ -73,12 +73,12 @@ def test_right_is_near_in_position_and_heading(log):
     poses = log.reference.at(t) + np.array(
         ((0.0, 0.0, 0.0), (0.3, 0.39, 0.0), (0.3, 0.41, 0.0), (0.0, 0.0, 0.25), (0.0, 0.0, -0.27))
     )
-    right = trials._right(result_of(t, poses, ("localized",) * 5), log)
+    right = trials.is_right(result_of(t, poses, ("localized",) * 5), log)
     assert right.tolist() == [True, True, False, True, False]
     poses[0] = np.nan  # no estimate yet
-    assert not trials._right(result_of(t, poses, ("localized",) * 5), log)[0]
+    assert not trials.is_right(result_of(t, poses, ("localized",) * 5), log)[0]
     positions_only = replace(log, reference=replace(log.reference, has_heading=False))
-    assert trials._right(result_of(t, poses, ("localized",) * 5), positions_only).tolist() == [
+    assert trials.is_right(result_of(t, poses, ("localized",) * 5), positions_only).tolist() == [
         False,
         True,
         False,
@@ -93,11 +93,11 @@ def test_in_a_gap_of_the_reference_the_one_before_counts_and_at_the_beginning_th
     poses[[3, 12]] += 2.0
     known = ((log.reference.t > 0.25) & (log.reference.t < 0.65)) | (log.reference.t > 1.15)
     gappy = replace(log, reference=replace(log.reference, t=log.reference.t[known], poses=log.reference.poses[known]))
-    right = trials._right(result_of(t, poses, ("localized",) * 20), gappy)
+    right = trials.is_right(result_of(t, poses, ("localized",) * 20), gappy)
     # 0 to 0.2 s are judged by 0.3 s, which is wrong; 0.7 to 1.1 s by 0.6 s, which is right
     assert np.flatnonzero(~right).tolist() == [0, 1, 2, 3, 12]
     never = replace(log, reference=replace(log.reference, t=log.reference.t + 100.0))
-    assert not trials._right(result_of(t, poses, ("localized",) * 20), never).any()
+    assert not trials.is_right(result_of(t, poses, ("localized",) * 20), never).any()
 
 
 def test_it_must_stay_right_for_ten_seconds():

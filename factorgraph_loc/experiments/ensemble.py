@@ -1,0 +1,96 @@
+"""Many simulated logs, each run by several estimators in one process, and nothing but the errors kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.estimators.base import Status
+from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import Log
+from factorgraph_loc.simulation import simulate
+from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class Series:
+    """Errors at the times ``t`` (N,): ``position`` [m], ``heading`` [rad, absolute] and ``nees``, each (N,); NaN where there is
+    nothing to say."""
+
+    t: Array
+    position: Array
+    heading: Array
+    nees: Array
+
+    def position_rmse(self) -> float:
+        return float(np.sqrt(np.nanmean(np.square(self.position))))
+
+    def heading_rmse(self) -> float:
+        return float(np.sqrt(np.nanmean(np.square(self.heading))))
+
+    def where(self, keep: NDArray[np.bool_]) -> Series:
+        """At the times that are marked (N,)."""
+        return Series(self.t[keep], self.position[keep], self.heading[keep], self.nees[keep])
+
+
+@dataclass(frozen=True)
+class RunErrors:
+    """Of one run: ``causal`` on the grid of ticks, NaN before the first localized estimate; ``status`` at each tick; ``final``."""
+
+    causal: Series
+    final: Series
+    status: tuple[Status, ...]
+    timings: Timings
+
+    def share(self, status: Status) -> float:
+        """Share of the ticks with this status."""
+        return self.status.count(status) / len(self.status)
+
+
+@dataclass(frozen=True)
+class EnsembleJob:
+    """A simulated log, ``change`` (if any) applied to it and its seed, and the runs on it by label."""
+
+    settings: SimulationSettings
+    seed: int
+    configs: Mapping[str, RunConfig]
+    change: Callable[[Log, int], Log] | None = None
+
+
+def run_ensemble(job: EnsembleJob) -> dict[str, RunErrors]:
+    """The errors of each run of a job; jobs can be sent to other processes."""
+    return {label: run_errors(run(log, config), log) for log in [job_log(job)] for label, config in job.configs.items()}
+
+
+def job_log(job: EnsembleJob) -> Log:
+    """The log of a job."""
+    log = simulate(job.settings, job.seed)
+    return log if job.change is None else job.change(log, job.seed)
+
+
+def run_errors(result: RunResult, log: Log) -> RunErrors:
+    """The errors of a run on a log with reference."""
+    causal = series(Trajectory(result.t, result.poses, result.covariances), log)
+    first = result.first_localized()
+    for values in (causal.position, causal.heading, causal.nees):
+        values[: len(result.t) if first is None else first] = np.nan
+    return RunErrors(causal, series(result.final, log), result.status, result.timings)
+
+
+def series(trajectory: Trajectory, log: Log) -> Series:
+    """The errors of a trajectory against the reference of its log."""
+    assert log.reference is not None, "a log to score has a reference"
+    e = errors(trajectory, log.reference)
+    return Series(trajectory.t, e.position, e.heading, e.nees)
+
+
+def stacked(runs: Sequence[Series]) -> Array:
+    """NEES (R, N) of runs on one grid of times."""
+    return np.stack([one.nees for one in runs])

@@ -1,0 +1,75 @@
+"""The optimal filter on a simulated log whose odometry has white noise alone, so that the pose is all there is to know."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.tags import KnownTags
+from factorgraph_loc.evaluation.grid_filter import GridFilter
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.log import IncrementStream, Log
+from factorgraph_loc.measurements import Odometry, RfidScan
+from factorgraph_loc.readers.simulated_odometry import ALONG, HEADING, LATERAL, RATE
+from factorgraph_loc.rig import OdometryUncertainty
+from factorgraph_loc.tag_map import extent
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+
+SENSORS = ("odometry", "rfid")
+
+
+def without_constants(log: Log, seed: int) -> Log:
+    """The log with new odometry from its reference, and a rig that knows of no constant errors: it has only the white noise of
+    :func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry`."""
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference, expected one to make odometry from")
+    end = float(log.reference.t[-1])
+    t = log.reference.t[0] + np.arange(round((end - float(log.reference.t[0])) * RATE) + 1) / RATE
+    poses = log.reference.at(np.minimum(t, end))
+    steps = se2.between(poses[:-1], poses[1:])
+    root = np.sqrt(np.hypot(steps[:, 0], steps[:, 1]))
+    noise = np.random.default_rng(seed).standard_normal(steps.shape) * (ALONG, LATERAL, HEADING)
+    rows = np.zeros((len(t), 3))
+    rows[1:] = steps + root[:, None] * noise
+    odometry = log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty()})
+    return replace(
+        log,
+        rig=log.rig.model_copy(update={"odometry": odometry}),
+        streams={**log.streams, "odometry": IncrementStream(t, *np.ascontiguousarray(rows.T))},
+    )
+
+
+def optimal_filter(log: Log) -> Trajectory:
+    """Means and covariances of the optimal filter at the scans of a log, from the start that it states."""
+    prior, _ = resolve_prior(log, "log")
+    assert prior is not None
+    diagnostics = Diagnostics()
+    tags = KnownTags(Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), diagnostics)
+    motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
+    likelihood = tags.likelihood
+    if likelihood is None:
+        raise InputError(f"{log.name}: its rig says nothing of RFID")
+    grid = GridFilter(prior, *extent(log.world, tags.map.tags))
+    before = None
+    t, means, covariances = [], [], []
+    for m in log.measurements(SENSORS):
+        if isinstance(m, Odometry):
+            motion.add(m)
+            if before is None:
+                before = motion.state(prior.t)
+        elif isinstance(m, RfidScan) and before is not None and (looks := tags.looks(m)) is not None:
+            state = motion.state(m.t)
+            grid.predict(motion.relative(before, state))
+            before = state
+            grid.update(lambda poses, looks=looks: -likelihood.score(poses, looks).nll)  # type: ignore[misc]
+            mean, covariance = grid.moments()
+            t.append(m.t)
+            means.append(mean)
+            covariances.append(covariance)
+    return Trajectory(np.array(t), np.array(means).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))

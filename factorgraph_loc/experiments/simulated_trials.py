@@ -1,0 +1,96 @@
+"""Trials of an unknown start and of kidnapping on simulated logs, a new world in each, by what is right at which time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from factorgraph_loc.evaluation.ensembles import first_held
+from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.trials import BEFORE, HOLD, JUMP, is_right
+from factorgraph_loc.log import cut, join
+from factorgraph_loc.simulation import simulate
+from factorgraph_loc.simulation.settings import SimulationSettings
+
+AWAY = 3.0  # m that a robot is carried at least
+APART = 60.0  # s between the parts of a log that a kidnapping joins
+
+
+@dataclass(frozen=True)
+class SimulatedTrial:
+    """One trial. ``seconds``: from the first scan (at the new place) until the estimate is right and stays so for 10 s, whatever
+    its status; ``claimed``: until it first is ``localized`` (again right and localized, after a kidnapping); NaN if it never is.
+    ``false``: the first claim is wrong; after a kidnapping: localized is what it says at the deadline without being right."""
+
+    seed: int
+    seconds: float
+    claimed: float
+    false: bool
+
+
+@dataclass(frozen=True)
+class SimulatedTrialJob:
+    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]."""
+
+    kind: Literal["unknown start", "kidnapping"]
+    simulation: SimulationSettings
+    seeds: tuple[int, ...]
+    estimator: str
+    deadline: float
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
+    """The trials of a job; jobs can be sent to other processes."""
+    trial = start_trial if job.kind == "unknown start" else kidnapping_trial
+    return [trial(job, seed) for seed in job.seeds]
+
+
+def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+    """The beginning of a drive, from an unknown start. It lasts until a start that is right at three deadlines has held."""
+    log = simulate(_lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
+    result = run(log, RunConfig(job.estimator, job.settings, prior="unknown", seed=seed))
+    first = float(log.streams["rfid"].t[0])
+    good = is_right(result, log)
+    claims = np.flatnonzero(np.array(result.status) == "localized")
+    claimed = float(result.t[claims[0]]) - first if len(claims) else math.nan
+    return SimulatedTrial(seed, _held(result, good, first), claimed, bool(len(claims)) and not bool(good[claims[0]]))
+
+
+def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+    """A robot that drives from a known start and is then carried to where it is a minute later, or at the first time after that at
+    which this is 3 m away."""
+    after = 3.0 * job.deadline + HOLD + 1.0
+    log = simulate(_lasting(job.simulation, BEFORE + 2.0 * APART + after), seed)
+    assert log.reference is not None
+    here = log.reference.at(np.array([BEFORE]))[0]
+    later = (log.reference.t >= BEFORE + APART) & (log.reference.t <= BEFORE + 2.0 * APART)
+    away = later & (np.hypot(*(log.reference.poses[:, :2] - here[:2]).T) >= AWAY)
+    other = float(log.reference.t[np.argmax(away if away.any() else later)])
+    before = cut(log, 0.0, BEFORE)
+    carried = join(before, cut(log, other, other + after), gap=JUMP)
+    result = run(carried, RunConfig(job.estimator, job.settings, prior="reference", seed=seed))
+    stamps = carried.streams["rfid"].t
+    first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
+    good = is_right(result, carried)
+    seconds = _held(result, good, first)
+    localized = np.array(result.status) == "localized"
+    at_deadline = int(np.searchsorted(result.t, first + job.deadline).clip(max=len(result.t) - 1))
+    late = not seconds <= job.deadline
+    false = late and bool(localized[at_deadline]) and not bool(good[at_deadline])
+    return SimulatedTrial(seed, seconds, _held(result, good & localized, first), false)
+
+
+def _held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:
+    """Seconds from ``first`` until what is ``good`` (N,) stays so."""
+    later = result.t >= first - 1e-9
+    return first_held(result.t[later], good[later], HOLD) - first
+
+
+def _lasting(settings: SimulationSettings, duration: float) -> SimulationSettings:
+    return settings.model_copy(update={"drive": settings.drive.model_copy(update={"duration": duration})})
