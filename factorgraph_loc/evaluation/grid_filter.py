@@ -84,13 +84,13 @@ class GridFilter:
         return mean, np.asarray((error * mass[:, None]).T @ error)
 
     def _headings(self) -> Array:
-        return self._first + self._step * np.arange(len(self._mass))
+        return np.asarray(self._first + self._step * np.arange(len(self._mass)), dtype=float)
 
     def _poses(self, rows: tuple[NDArray[np.int64], ...]) -> Array:
         layer, i, j = rows
         x = self._low[0] + self._cell * (i + self._offsets[layer, 0])
         y = self._low[1] + self._cell * (j + self._offsets[layer, 1])
-        return np.column_stack((x, y, se2.wrap(self._headings()[layer])))
+        return np.asarray(np.column_stack((x, y, se2.wrap(self._headings()[layer]))), dtype=float)
 
     def _spread(self, covariance: Array) -> None:
         """Add noise with a body-frame covariance (3, 3)."""

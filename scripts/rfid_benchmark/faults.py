@@ -1,0 +1,86 @@
+"""What goes wrong, one thing at a time: what it costs, and whether the status says so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble
+from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.log import Log
+from factorgraph_loc.simulation.settings import preset
+from factors import se2
+from rfid_benchmark.report import Options, Report, pooled
+
+SEEDS = 10
+FIRST = 2000
+DURATION = 300.0  # s
+CONFIGS = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}
+ELSEWHERE = (3.0, math.radians(60.0))  # m, rad
+Change = Callable[[Log, int], Log]
+
+
+def start_elsewhere(log: Log, seed: int) -> Log:
+    """The stated start is 3 m and 60 degrees off, in a direction of the seed, with the deviations that it had."""
+    assert log.start is not None
+    distance, turn = ELSEWHERE
+    direction, sign = 2.4 * seed, 1.0 if seed % 2 else -1.0
+    pose = log.start.pose + np.array((distance * math.cos(direction), distance * math.sin(direction), sign * turn))
+    pose[2] = se2.wrap_scalar(float(pose[2]))
+    return replace(log, start=replace(log.start, pose=pose))
+
+
+FAULTS: dict[str, tuple[dict[str, Any], Change | None]] = {
+    "none": ({}, None),
+    "20 % false reads": ({"false_reads": 0.2}, None),
+    "10 % of tags 1 m off": ({"misplaced": 0.1, "misplaced_by": 1.0}, None),
+    "all tags silent for 60 s": ({"silence": {"time": 120.0, "duration": 60.0}}, None),
+    "an antenna stops": ({"antenna_stop": {"antenna": "1", "time": 100.0}}, None),
+    "an antenna reads nothing, rounds go on": (
+        {"antenna_stop": {"antenna": "1", "time": 100.0, "rounds_go_on": True}},
+        None,
+    ),
+    "reader's clock jumps by 0.5 s": ({"clock_jump": {"time": 150.0, "jump": 0.5}}, None),
+    "20 % of tags dead": ({"dead": 0.2}, None),
+    "no tag of the map is ever read": ({"dead": 1.0}, None),
+    "start 3 m and 60 degrees off": ({}, start_elsewhere),
+}
+
+
+def section(options: Options) -> Report:
+    report = Report("faults", options)
+    count = options.count(SEEDS)
+    jobs, labels = [], []
+    for fault, (changes, change) in FAULTS.items():
+        settings = preset("office", {"drive": {"duration": DURATION}, "faults": changes})
+        jobs += [EnsembleJob(settings, FIRST + i, CONFIGS, change) for i in range(count)]
+        labels += [fault] * count
+    outcomes = report.collect(run_ensemble, jobs, labels)
+    report.say(
+        f"`office`, {count} worlds of {DURATION:.0f} s, pooled. "
+        "*Status*: share of the time at which it is localized / ambiguous / unlocalized. Causal errors count from the first `localized`"
+    )
+    rows = []
+    for estimator in CONFIGS:
+        for fault in FAULTS:
+            runs = [outcomes[i][estimator] for i, label in enumerate(labels) if label == fault and i in outcomes]
+            if runs:
+                rows.append((fault, estimator, *cells(runs)))
+    report.table(("fault", "estimator", "causal [m] / [deg]", "worst [m]", "final [m] / [deg]", "status [%]"), rows)
+    return report
+
+
+def cells(runs: list[RunErrors]) -> tuple[str, str, str, str]:
+    causal, final = (
+        "{:.3f} / {:.1f}".format(*pooled([getattr(one, kind) for one in runs])) for kind in ("causal", "final")
+    )
+    worst = max(one.causal.position_rmse() for one in runs)
+    shares = (
+        100.0 * sum(one.share(status) for one in runs) / len(runs)
+        for status in ("localized", "ambiguous", "unlocalized")
+    )
+    return causal, f"{worst:.3f}", final, " / ".join(f"{share:.0f}" for share in shares)

@@ -1,0 +1,85 @@
+"""Simulated offices: accuracy, and whether the covariances are right, over many worlds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.evaluation.ensembles import share_in_band
+from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble, stacked
+from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.report import Options, Report, pooled, ratio_cells, together
+
+SEEDS = 100
+PRESETS = ("office", "sparse", "bursty")
+CONFIGS = {
+    "particle filter": RunConfig("particle_filter"),
+    "smoother": RunConfig("smoother"),
+    "particle filter, constants as noise": RunConfig("particle_filter", {"self_calibration": False}),
+    "smoother, constants as noise": RunConfig("smoother", {"self_calibration": False}),
+}
+# causal RMSE m, heading degrees, final RMSE m, heading degrees, final p95 m of a reference implementation
+ANCHORS = {
+    ("office", "with the constants as states"): ("0.089", "2.2", "0.052", "1.3", "0.092"),
+    ("office", "without them"): ("0.103", "–", "0.066", "–", "0.119"),
+    ("sparse", "with the constants as states"): ("0.133", "–", "0.082", "–", "0.150"),
+}
+Found = dict[str, list[RunErrors]]  # of each configuration, one a seed
+
+
+def section(options: Options) -> Report:
+    report = Report("office", options)
+    count = options.count(SEEDS)
+    found: dict[str, Found] = {}
+    for name in PRESETS:
+        jobs = [EnsembleJob(preset(name), seed, CONFIGS) for seed in range(count)]
+        outcomes = report.collect(run_ensemble, jobs, [f"{name} {seed}" for seed in range(count)])
+        if outcomes:
+            found[name] = {label: [outcomes[i][label] for i in sorted(outcomes)] for label in CONFIGS}
+            single = [
+                (i, label, *pooled([one.causal]), *pooled([one.final]))
+                for i, outcome in sorted(outcomes.items())
+                for label, one in outcome.items()
+            ]
+            heads = ("seed", "estimator", "causal_m", "causal_deg", "final_m", "final_deg")
+            report.figures(name, heads, single)
+    report.say(
+        f"{count} worlds of each preset, 10 min each, pooled. *Inside*: share of times at which ANEES over runs is in its band"
+    )
+    accuracy(report, found)
+    report.say("Ratios of position RMSE, pooled, with 95 % interval over worlds, and the largest of a single world")
+    ratios(report, found)
+    return report
+
+
+def accuracy(report: Report, found: dict[str, Found]) -> None:
+    rows = []
+    for name, runs in found.items():
+        for label, members in runs.items():
+            causal, final = [one.causal for one in members], [one.final for one in members]
+            (position, heading), (final_position, final_heading) = pooled(causal), pooled(final)
+            inside = " / ".join(f"{100 * share_in_band(stacked(kind)):.0f} %" for kind in (causal, final))
+            nees = " / ".join(f"{np.nanmean(stacked(kind)):.2f}" for kind in (causal, final))
+            p95 = np.percentile(together(final), 95)
+            cells = (f"{position:.3f}", f"{heading:.2f}", f"{final_position:.3f}", f"{final_heading:.2f}", f"{p95:.3f}")
+            rows.append((name, label, *cells, nees, inside))
+        rows += [(name, f"*anchor, {what}*", *cells, "–", "–") for (of, what), cells in ANCHORS.items() if of == name]
+    heads = ("preset", "estimator", "causal [m]", "[deg]", "final [m]", "[deg]", "final p95 [m]")
+    report.table((*heads, "ANEES causal / final", "inside causal / final"), rows)
+
+
+def ratios(report: Report, found: dict[str, Found]) -> None:
+    rows = []
+    for name, runs in found.items():
+        for suffix in ("", ", constants as noise"):
+            smoother, particles = runs[f"smoother{suffix}"], runs[f"particle filter{suffix}"]
+            causal = [[one.causal for one in members] for members in (smoother, particles)]
+            final = [[one.final for one in members] for members in (smoother, particles)]
+            what = "as noise" if suffix else "as states"
+            rows += [
+                (name, what, "smoother / particle filter, causal", *ratio_cells(*causal)),
+                (name, what, "smoother / particle filter, final", *ratio_cells(*final)),
+                (name, what, "final / causal, smoother", *ratio_cells(final[0], causal[0])),
+                (name, what, "final / causal, particle filter", *ratio_cells(final[1], causal[1])),
+            ]
+    report.table(("preset", "constants", "ratio", "pooled (95 %)", "largest"), rows)

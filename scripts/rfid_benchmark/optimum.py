@@ -1,0 +1,73 @@
+"""How near the optimum: a grid filter on a small room, and backward simulation through many particles in the office."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.experiments.ensemble import EnsembleJob, Series, job_log, run_ensemble, run_errors, series
+from factorgraph_loc.experiments.optimal import optimal_filter, without_constants
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.report import Options, Report, pooled, ratio_cells
+
+ROOMS, OFFICES = 20, 10
+ROOM = {"world": {"plan": "hall", "width": 6, "depth": 4, "tags": 8}, "drive": {"duration": 60}}
+FILTERS = {
+    "grid filter": None,
+    "particle filter": RunConfig("particle_filter", {"smooth": False}),
+    "smoother": RunConfig("smoother"),
+}
+SMOOTHERS = {
+    "smoother": RunConfig("smoother"),
+    "particle smoother": RunConfig("particle_filter", {"smoothing_trajectories": 400, "smoothing_interval": 0.5}),
+}
+
+
+@dataclass(frozen=True)
+class Room:
+    seed: int
+
+
+def section(options: Options) -> Report:
+    report = Report("optimum", options)
+    rooms, offices = options.count(ROOMS), options.count(OFFICES)
+    outcomes = report.collect(in_room, [Room(seed) for seed in range(rooms)], [f"room {i}" for i in range(rooms)])
+    report.say(
+        f"A room of 6 x 4 m with 8 tags, 60 s, odometry without constant errors; {len(outcomes)} worlds. "
+        "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal"
+    )
+    table(report, {label: [outcomes[i][label] for i in sorted(outcomes)] for label in FILTERS}, "grid filter")
+    jobs = [EnsembleJob(preset("office"), seed, SMOOTHERS) for seed in range(offices)]
+    outcomes = report.collect(run_ensemble, jobs, [f"office {i}" for i in range(offices)])
+    report.say(
+        f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
+        "and 400 trajectories drawn backwards, with the same states"
+    )
+    finals = {label: [outcomes[i][label].final for i in sorted(outcomes)] for label in SMOOTHERS}
+    table(report, finals, "particle smoother")
+    return report
+
+
+def table(report: Report, found: dict[str, list[Series]], optimal: str) -> None:
+    rows = []
+    for label, runs in found.items():
+        if runs:
+            position, heading = pooled(runs)
+            nees = np.mean([np.nanmean(one.nees) for one in runs])
+            ratios = ("1", "–") if label == optimal else ratio_cells(runs, found[optimal])
+            rows.append((label, f"{position:.4f}", f"{heading:.2f}", f"{nees:.2f}", *ratios))
+    report.table(("estimator", "RMSE [m]", "heading [deg]", "ANEES", "ratio (95 %)", "largest"), rows)
+
+
+def in_room(job: Room) -> dict[str, Series]:
+    """Causal errors of all filters at the scans."""
+    log = job_log(EnsembleJob(preset("office", ROOM), job.seed, {}, without_constants))
+    best = series(optimal_filter(log), log)
+    found = {"grid filter": best}
+    for label, config in FILTERS.items():
+        if config is not None:
+            causal = run_errors(run(log, config), log).causal
+            found[label] = causal.where(np.min(np.abs(causal.t[:, None] - best.t), axis=1) < 1e-6)
+    return found

@@ -1,0 +1,67 @@
+"""Unknown starts and kidnappings, a new world in each trial."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.experiments.simulated_trials import SimulatedTrial, SimulatedTrialJob, run_simulated_trials
+from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.report import Options, Report, share_text
+
+SEEDS = 100
+CHUNK = 10  # trials of one process
+FIRST = 1000  # seeds that the other sections do not use
+KINDS = (("unknown start", "office", 5.0), ("unknown start", "sparse", 10.0), ("kidnapping", "office", 15.0))
+
+
+def section(options: Options) -> Report:
+    report = Report("starts", options)
+    seeds = range(FIRST, FIRST + options.count(SEEDS))
+    chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
+    jobs = [
+        SimulatedTrialJob(kind, preset(name), chunk, estimator, deadline)
+        for kind, name, deadline in KINDS
+        for estimator in ("smoother", "particle_filter")
+        for chunk in chunks
+    ]
+    labels = [f"{job.kind}, {job.simulation.name}, {job.estimator}, from seed {job.seeds[0]}" for job in jobs]
+    outcomes = report.collect(run_simulated_trials, jobs, labels)
+    found: dict[tuple[str, str, str, float], list[SimulatedTrial]] = {}
+    for i in sorted(outcomes):
+        job = jobs[i]
+        found.setdefault((job.kind, job.simulation.name, job.estimator, job.deadline), []).extend(outcomes[i])
+    report.say(
+        f"{len(seeds)} trials of each kind, with 95 % intervals. *Right in time*: from then on below 0.5 m and 15 degrees "
+        "for 10 s. *Called so in time*: by then it says `localized`, rightly (in brackets: the median of when). "
+        "*False claims*: the first `localized` is wrong; after a kidnapping: it says so at the deadline without being right"
+    )
+    report.table(
+        ("", "preset", "estimator", "within", "right in time", "median [s]", "called so in time", "false claims"),
+        [row(key, trials) for key, trials in found.items()],
+    )
+    late = [
+        f"{kind}, {name}, {estimator}: " + ", ".join(str(t.seed) for t in trials if not t.seconds <= deadline)
+        for (kind, name, estimator, deadline), trials in found.items()
+        if any(not t.seconds <= deadline for t in trials)
+    ]
+    report.say("Seeds of those that were late: " + ("; ".join(late) or "none"))
+    heads = ("kind", "preset", "estimator", "seed", "seconds", "claimed", "false")
+    single = [(*key[:3], t.seed, t.seconds, t.claimed, t.false) for key, trials in found.items() for t in trials]
+    report.figures("trials", heads, single)
+    return report
+
+
+def row(key: tuple[str, str, str, float], trials: list[SimulatedTrial]) -> tuple[str, ...]:
+    kind, name, estimator, deadline = key
+    count = len(trials)
+    in_time = share_text(sum(t.seconds <= deadline for t in trials), count)
+    called = share_text(sum(t.claimed <= deadline and not t.false for t in trials), count)
+    median, claimed = (middle([getattr(t, what) for t in trials]) for what in ("seconds", "claimed"))
+    false = share_text(sum(t.false for t in trials), count)
+    return kind, name, estimator, f"{deadline:.0f} s", in_time, median, f"{called} ({claimed} s)", false
+
+
+def middle(seconds: list[float]) -> str:
+    """The median, what never came being last."""
+    median = np.median(np.where(np.isnan(seconds), np.inf, seconds))
+    return f"{median:.1f}" if np.isfinite(median) else "never"
