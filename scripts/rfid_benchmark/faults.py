@@ -62,7 +62,8 @@ def section(options: Options) -> Report:
     outcomes = report.collect(run_ensemble, jobs, labels)
     report.say(
         f"`office`, {count} worlds of {DURATION:.0f} s, pooled. "
-        "*Status*: share of the time at which it is localized / ambiguous / unlocalized. Causal errors count from the first `localized`"
+        "*Status*: share of the time at which it is localized / ambiguous / unlocalized. "
+        "Causal errors count from the first `localized`"
     )
     rows = []
     for estimator in CONFIGS:
