@@ -62,7 +62,7 @@ def calibrate(
     check(logs)
     report = progress or (lambda _done, _total: None)
     parts = _parts(logs)
-    steps = 2 + (len(logs) if len(parts) > 1 else 0)
+    steps = 2 + (len(logs) if len(set(parts)) > 1 else 0)
     start = sensing(rig or logs[0].rig, logs[0])
     logs = [_scorable(log) for log in logs]
     before = _scores(logs, start, evaluate) if _is_complete(start) else ()
@@ -75,7 +75,7 @@ def calibrate(
     report(2, steps)
     held_out = []
     # numbers that are searched with an estimator are shared: a search in each fold would take longer than all the rest
-    for i, log in enumerate(logs if len(parts) > 1 else ()):
+    for i, log in enumerate(logs if len(set(parts)) > 1 else ()):
         others = [one for one, part in zip(logs, parts, strict=True) if part != parts[i]]
         changed = _without(others, start, knowledge, grids, i)
         if consistency is not None and consistency.trial:
