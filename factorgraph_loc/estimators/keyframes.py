@@ -242,8 +242,14 @@ class GraphEstimator(ABC):
             return
         update = tags.updated(scanned, self._pose, self._covariance)
         self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
+        lasted = self._silence.lasts
         if not self._silence.add(int(looks.hits.sum()), update.evidence):
             self._wait(keyframe, scanned, update)
+        else:
+            self.diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
+            if not lasted:
+                self.diagnostics.events.append((m.t, "no tag is read where some should be"))
+            return
         self._scanned(m.t, looks, update)
         if self._signals.keep(m):
             self._take_phases(keyframe)

@@ -77,7 +77,8 @@ class RelocatingGraph(GraphEstimator):
         ``ambiguous`` before one place is clear, and while the landmarks are not where they are expected.
         """
         if self._prior is not None:
-            status: Status = "localized" if self._monitor.suspicious_since is None else "ambiguous"
+            doubted = self._monitor.suspicious_since is not None or self._silence.lasts
+            status: Status = "ambiguous" if doubted else "localized"
             return replace(super().estimate(), status=status)
         modes = self._modes()
         if not modes:
@@ -145,6 +146,9 @@ class RelocatingGraph(GraphEstimator):
         if self._finder is not None:
             self._finder.seek(since)
             refuted = self._finder.refutes(self._pose, self._covariance)
+            if isinstance(self._monitor, ScanMonitor) and self._finder.confirms(self._pose, self._covariance):
+                self._monitor.accept()
+                self._finder.rest()
         elif self._searched is not None and now.t < self._searched.t + SEARCH_INTERVAL:
             return
         else:
@@ -156,7 +160,7 @@ class RelocatingGraph(GraphEstimator):
             what = "landmarks were not where" if self._finder is None else "tags were not read as"
             event = f"lost: {what} they were expected since {since:.1f} s; goes on at another place"
             self.diagnostics.events.append((now.t, event))
-            self._go_on(since)
+            self._go_on(since if self._finder is None else self._finder.change(self._placed))
 
     def _go_on(self, since: float) -> None:
         """Take back what was added since then, and add it once more at the place that was found."""

@@ -7,6 +7,7 @@ since then, and refutes the track if "somewhere else" has become so much likelie
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from factors.se2 import Array
 
 DURATION = 60.0  # s of scans that are kept
 REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
+BEFORE = 2.0  # s before a suspicion in which a change may lie
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
@@ -75,13 +77,28 @@ class ScanFinder:
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
         """Whether another place than ``pose`` (3,), body-frame ``covariance`` (3, 3), explains the scans much better."""
-        if self._seeker is None or (best := self._seeker.best) is None:
+        if self._seeker is None or (best := self._seeker.best) is None or not self._is_apart(best, pose, covariance):
             return False
         track = sum(evidence for odometry, _, evidence in self._scans if odometry.t >= self._since)
+        return self._seeker.log_evidence - track > REFUTING
+
+    def confirms(self, pose: Array, covariance: Array) -> bool:
+        """Whether the scans alone lead to the track's place."""
+        best = self.best
+        return best is not None and not self._is_apart(best, pose, covariance)
+
+    def change(self, place: Callable[[float], Array]) -> float:
+        """When the robot must have come to the other place, of which ``place(t)`` gives the pose (3,) at ``t``: from then on scans are
+        likelier there, before on the track."""
+        scans = [s for s in self._scans if s[0].t >= self._since - BEFORE]
+        gains = [-float(self._likelihood.score(place(s[0].t), s[1]).nll[0]) - s[2] for s in scans]
+        return scans[int(np.argmax(np.cumsum(gains[::-1])[::-1]))][0].t
+
+    @staticmethod
+    def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
         error = se2.log(se2.between(pose, best.pose))
         spread = covariance + se2.world_to_body(best.pose, best.covariance)
-        apart = float(error @ np.linalg.solve(spread, error)) > APART
-        return apart and self._seeker.log_evidence - track > REFUTING
+        return float(error @ np.linalg.solve(spread, error)) > APART
 
     def _new_seeker(self) -> Seeker:
         return Seeker(self._likelihood, self._motion, self._bounds, self._rng)

@@ -40,6 +40,7 @@ class ScanMonitor:
     def __init__(self) -> None:
         self._scans: list[tuple[float, float, float]] = []
         self._since: float | None = None
+        self._usual = 0.0  # the mean surprise that was found to mean nothing
 
     @property
     def suspicious_since(self) -> float | None:
@@ -57,6 +58,12 @@ class ScanMonitor:
         else:
             self._since = None
 
+    def accept(self) -> None:
+        """The track is right all the same: the model or the map is not, and scans will go on to be as unlikely as the last ones."""
+        last = self._last()
+        self._usual = sum(s[1] for s in last) / max(len(last), 1)
+        self._since = None
+
     def clear(self) -> None:
         """Forget the scans: the track begins anew."""
         self._scans.clear()
@@ -64,17 +71,20 @@ class ScanMonitor:
 
     def _z(self) -> float:
         """The summed surprise of the last scans, in standard deviations."""
-        last = [s for s in self._scans if s[0] > self._scans[-1][0] - DURATION]
+        last = self._last()
         if len(last) < SCANS:
             return 0.0
-        return sum(s[1] for s in last) / math.sqrt(sum(s[2] for s in last) + 1e-9)
+        return sum(s[1] - self._usual for s in last) / math.sqrt(sum(s[2] for s in last) + 1e-9)
+
+    def _last(self) -> list[tuple[float, float, float]]:
+        return [s for s in self._scans if s[0] > self._scans[-1][0] - DURATION]
 
     def _beginning(self) -> float:
         """The change point: from there on the sum of the surprises is largest."""
         total, most, begin = 0.0, -math.inf, self._scans[-1][0]
         for t, surprise, variance in reversed(self._scans):
             # scans as they are expected count against
-            total += surprise - math.sqrt(variance)
+            total += surprise - self._usual - math.sqrt(variance)
             if total > most:
                 most, begin = total, t
         return begin

@@ -112,7 +112,7 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
     best, moved = pose, np.zeros(3)
     for _ in range(iterations):
         total = prior_information + information
-        step: Array = -np.linalg.solve(total, gradient + prior_information @ moved)
+        step = np.asarray(-np.linalg.solve(total, gradient + prior_information @ moved), dtype=float)
         step = step * min(1.0, float(np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12))))
         if np.all(np.abs(step) < CONVERGED * sigmas):
             best = se2.compose(best, se2.exp(step))
@@ -129,7 +129,7 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
             break
         best, cost, moved = tried, tried_cost, error
         gradient, information = tried_gradient, tried_information
-    posterior: Array = np.linalg.inv(prior_information + information)
+    posterior = np.asarray(np.linalg.inv(prior_information + information), dtype=float)
     evidence = 0.5 * float(np.linalg.slogdet(posterior @ prior_information)[1]) - cost
     return TagUpdate(best, posterior, nis, dof, surprise, variance, evidence)
 
