@@ -144,8 +144,8 @@ class RfidSettings(FileModel):
     """The RFID reader. ``antennas`` by the name that reads give, or a ``preset`` of them at the height ``preset_z``.
 
     ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
-    below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where the
-    log does not tell the rounds. ``rssi``, ``phase``: what is made of them, where an estimator is given these sensors.
+    below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where
+    the log does not tell the rounds. ``rssi``, ``phase``: what is made of them, where an estimator is given these sensors.
     """
 
     time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0

@@ -184,8 +184,8 @@ class Rig(FileModel):
     def odometry_model(self, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
         """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
 
-        ``constants_as_noise``: for an estimator that does not estimate the uncertain constants, whose error then is in its noise: as
-        of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
+        ``constants_as_noise``: for an estimator that does not estimate the uncertain constants, whose error then is in its
+        noise: as of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
         """
         s = self.odometry
         noise = s.noise

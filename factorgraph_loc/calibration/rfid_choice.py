@@ -12,7 +12,7 @@ from factorgraph_loc.calibration.rfid_pairs import Pairs, modelled
 from factors.rfid import DetectionModel
 from factors.se2 import Array
 
-SMOOTHNESS = (1.0, 5.0, 25.0)
+SMOOTHNESS = (5.0, 25.0, 125.0)
 WORTH = 1e-3  # nats a pair; what helps less does not pay for itself
 BEAM_PAIRS = 20000  # are enough for its four parameters
 

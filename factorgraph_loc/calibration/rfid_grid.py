@@ -16,7 +16,7 @@ from scipy import sparse
 
 from factorgraph_loc.calibration.rfid_fit import Floor, fit_linear
 from factorgraph_loc.calibration.rfid_pairs import Pairs
-from factors.rfid import DetectionModel, GridModel, bake
+from factors.rfid import DetectionModel, GridModel, bake, logits
 from factors.se2 import Array
 
 CELL = 0.5  # m
@@ -46,7 +46,7 @@ def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: 
     shape = base.logits.shape
     varied = (shape[0] if axes.by_height else 1, shape[1] if axes.by_facing else 1, *shape[2:])
     few = _together(pairs)
-    offset = design_of(base, few.points, few.facing) @ base.logits.ravel()
+    offset, _ = logits(base, few.points, few.facing)
     change = replace(base, logits=np.zeros(varied), heights=base.heights if axes.by_height else np.zeros(1))
     penalty = (smoothness * _roughness(varied) + PULL * sparse.eye_array(change.logits.size)).tocsc()
     found = fit_linear(design_of(change, few.points, few.facing), offset, few.hits, few.count, penalty, floor)
@@ -74,8 +74,8 @@ def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array
     for size, (places, shares) in zip(shape, axes, strict=True):
         knots = (knots[:, :, None] * size + places[:, None, :]).reshape(len(points), -1)
         weights = (weights[:, :, None] * shares[:, None, :]).reshape(len(points), -1)
-    rows = np.repeat(np.arange(len(points)), knots.shape[1])
-    return sparse.coo_array((weights.ravel(), (rows, knots.ravel())), shape=(len(points), grid.logits.size)).tocsr()
+    ends = knots.shape[1] * np.arange(len(points) + 1)
+    return sparse.csr_array((weights.ravel(), knots.ravel(), ends), shape=(len(points), grid.logits.size))
 
 
 def _step(heights: Array) -> float:

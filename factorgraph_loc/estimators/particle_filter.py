@@ -21,7 +21,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators import kld, tags
+from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
@@ -29,12 +29,10 @@ from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import Relocalizer
-from factorgraph_loc.estimators.scan_finder import ScanFinder
-from factorgraph_loc.estimators.scan_monitor import ScanMonitor, Silence
+from factorgraph_loc.estimators.scan_tracker import ScanTracker
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
-from factorgraph_loc.tag_map import extent
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
 from factors.bearing_range import TIME_OFFSET, log_likelihood
@@ -43,7 +41,6 @@ from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
 
 SLOW, FAST = 0.01, 0.1  # decay rates of the averages of the likelihood, per stamp
-KEPT = 90.0  # s of odometry, for a search among the last scans
 INJECTED = 0.05  # the least share that is drawn anew while the place is not known
 ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies within so many standard deviations of it
 
@@ -87,14 +84,7 @@ class ParticleFilter(Filter):
         self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, None)
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
         self._monitor = TrackMonitor()
-        self._tags = tags.KnownTags(setup, self.diagnostics)
-        self._finder: ScanFinder | None = None
-        self._scan_monitor = ScanMonitor()
-        self._silence = Silence()
-        if self._tags.likelihood is not None and not self._landmarks.known:
-            self._motion.keep(KEPT)
-            bounds = extent(setup.world, self._tags.map.tags)
-            self._finder = ScanFinder(self._tags.likelihood, self._motion, bounds, setup.rng)
+        self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
         self._lost = False
 
     def belief(self) -> Belief:
@@ -131,17 +121,12 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in found]).reshape(-1, 3, 3))
 
     def _start(self, prior: PosePrior) -> Cloud:
-        if self._finder is not None:
-            self._finder.rest()
+        self._scans.start(found=False)
         return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
 
     def _seek(self, m: Exteroceptive) -> Cloud | None:
         if isinstance(m, RfidScan):
-            looks = self._tags.looks(m)
-            if self._finder is None or looks is None:
-                return None
-            self._finder.add(self._odometry, looks)
-            return self._sought()
+            return self._sought() if self._scans.seek(m, self._odometry) else None
         seen = self._landmarks.factor(m)
         if seen is None:
             return None
@@ -151,9 +136,8 @@ class ParticleFilter(Filter):
 
     def _sought(self) -> Cloud:
         """Particles drawn from what scans alone tell."""
-        assert self._finder is not None
-        cloud = self._cloud(self._finder.sample(self._rng, self._settings.particles))
-        return replace(cloud, localized=self._finder.best is not None)
+        poses, clear = self._scans.sought(self._settings.particles)
+        return replace(self._cloud(poses), localized=clear)
 
     def _cloud(self, poses: Array) -> Cloud:
         """Particles at poses (N, 3), whose constants are those of the prior."""
@@ -195,9 +179,9 @@ class ParticleFilter(Filter):
         self._relocalizer.add(self._odometry, expected)
         if self._state.localized:
             self._watch(m.t, expected)
-        self._average(float(self._state.weights @ np.exp(self._likelihood(seen) / len(seen.points))))
-        self._weigh(lambda: self._likelihood(seen))
-        if not self._state.localized and self._finder is None:
+        self._average(float(self._state.weights @ np.exp(self._likelihood(seen, self._state) / len(seen.points))))
+        self._weigh(lambda cloud: self._likelihood(seen, cloud))
+        if not self._state.localized and not self._scans.finds:
             self._relocalizer.search()
             self._inject()
             self._settle()
@@ -223,52 +207,43 @@ class ParticleFilter(Filter):
             self._event(f"lost: landmarks are not where they were expected since {since:.1f} s")
 
     def _scan(self, m: RfidScan) -> None:
-        looks, likelihood = self._tags.looks(m), self._tags.likelihood
-        if looks is None or likelihood is None:
+        if not self._state.localized and self._scans.finds:
+            if self._scans.seek(m, self._odometry):
+                self._go_on_found("localized")
             return
-        if not self._state.localized and self._finder is not None:
-            if self._finder.add(self._odometry, looks):
-                self._state = self._sought()
-                if self._state.localized:
-                    self._finder.start()
-                    self._event("localized")
+        silent = self._scans.silent
+        taken = self._scans.track(m, self._odometry, self._state, self._weigh)
+        if self._scans.silent and not silent:
+            self._event("no tag is read where some should be")
+        if not taken:
             return
-        mean, covariance = self._state.moments
-        update = tags.update(likelihood, looks, mean, se2.world_to_body(mean, covariance), iterations=1)
-        self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
-        lasted = self._silence.lasts
-        if self._silence.add(int(looks.hits.sum()), update.evidence):
-            self.diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
-            if not lasted:
-                self._event("no tag is read where some should be")
-            return
-        evidence = self._weigh(lambda: likelihood.log_likelihood(self._state.poses, looks))
-        if self._finder is not None:
-            self._finder.add(self._odometry, looks, evidence)
-            self._scan_monitor.add(m.t, update.surprise, update.variance)
-            self._doubt(self._finder)
-
-    def _doubt(self, finder: ScanFinder) -> None:
-        """See whether another place explains the scans since they became unlikely, and go on there."""
-        since = self._scan_monitor.suspicious_since
-        if since is None:
-            finder.rest()
-            return
-        finder.seek(since)
-        mean, covariance = self._state.moments
-        if finder.refutes(mean, se2.world_to_body(mean, covariance)):
+        if self._state.localized:
+            self._scans.take_phases(m, self._state, self._places, self._weigh)
+        since = self._scans.refuted_since(self._state)
+        if since is not None:
             # for the final trajectory: since then the track was elsewhere
             self._records = [r.lost() if r.t >= since else r for r in self._records]
-            self._state = self._sought()
-            finder.start()
-            self._scan_monitor.clear()
             self._event(f"lost: tags were not read as they were expected since {since:.1f} s")
-            self._event("recovered")
+            self._go_on_found("recovered")
 
-    def _weigh(self, log_likelihood: Callable[[], Array]) -> float:
+    def _go_on_found(self, what: str) -> None:
+        """Go on where scans alone lead to; ``what`` that is, once it is one place."""
+        self._state = self._sought()
+        if self._state.localized:
+            self._scans.start(found=True)
+            self._event(what)
+
+    def _places(self, times: Array) -> Array:
+        """Where the robot was at these times (R,), in the frame of its pose, (R, 3)."""
+        if not self._odometry_constants.names:
+            return self._motion.places(self._odometry, times)
+        mean = self._state.weights @ self._state.constants[:, self._odometry_part]
+        return self._motion.places(self._odometry, times, self._odometry_constants.full(mean, len(odometry.PARAMETERS)))
+
+    def _weigh(self, log_likelihood: Callable[[Cloud], Array]) -> float:
         """Weigh the particles by the likelihood, by a share of it at a time if it leaves too few effective ones: they are resampled
         in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of its mean."""
-        likelihood = log_likelihood()
+        likelihood = log_likelihood(self._state)
         mean, left = 0.0, 1.0
         while True:
             cloud = self._state
@@ -281,7 +256,7 @@ class ParticleFilter(Filter):
             if left <= 0.0:
                 return mean
             self._resample()
-            likelihood = log_likelihood()
+            likelihood = log_likelihood(self._state)
 
     def _average(self, likelihood: float) -> None:
         """Keep the averages of the likelihood, over many and over few stamps."""
@@ -290,9 +265,8 @@ class ParticleFilter(Filter):
         fast = cloud.fast + FAST * (likelihood - cloud.fast) if cloud.fast else likelihood
         self._state = replace(cloud, slow=slow, fast=fast)
 
-    def _likelihood(self, seen: BearingRangeFactor) -> Array:
+    def _likelihood(self, seen: BearingRangeFactor, cloud: Cloud) -> Array:
         """Log-likelihood (N,) of the particles, each with its own constants."""
-        cloud = self._state
         changes = self._sensor_constants.full(cloud.constants[:, self._sensor_part], len(bearing_range.PARAMETERS))
         return log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings, changes)
 
@@ -334,8 +308,7 @@ class ParticleFilter(Filter):
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            doubted = self._scan_monitor.suspicious_since is not None or self._silence.lasts
-            status: Status = "ambiguous" if doubted else "localized"
+            status: Status = "ambiguous" if self._scans.doubts else "localized"
             return PoseEstimate(self._t, *self._state.moments, status)
         mode = self._state.modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")

@@ -88,8 +88,8 @@ class ScanFinder:
         return best is not None and not self._is_apart(best, pose, covariance)
 
     def change(self, place: Callable[[float], Array]) -> float:
-        """When the robot must have come to the other place, of which ``place(t)`` gives the pose (3,) at ``t``: from then on scans are
-        likelier there, before on the track."""
+        """When the robot must have come to the other place, of which ``place(t)`` gives the pose (3,) at ``t``: from then on scans
+        are likelier there, before on the track."""
         scans = [s for s in self._scans if s[0].t >= self._since - BEFORE]
         gains = [-float(self._likelihood.score(place(s[0].t), s[1]).nll[0]) - s[2] for s in scans]
         return scans[int(np.argmax(np.cumsum(gains[::-1])[::-1]))][0].t

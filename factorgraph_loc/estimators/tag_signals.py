@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.tags import KnownTags
 from factorgraph_loc.measurements import RfidScan
@@ -19,12 +20,16 @@ Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, ph
 
 class TagSignals:
     """Turns scans into reads with a strength, and into windows of reads with a phase; without these sensors into nothing.
+    InputError if the rig does not say what is made of a sensor.
 
     Windows of the rig's ``window`` seconds end at least ``step`` seconds apart.
     """
 
     def __init__(self, setup: Setup, tags: KnownTags) -> None:
         settings, self._tags = setup.rig.rfid, tags
+        for sensor in ("rssi", "phase"):
+            if sensor in setup.sensors and getattr(settings, sensor, None) is None:
+                raise InputError(f"the rig has no [rfid.{sensor}], which the sensor {sensor} needs")
         self.strength: RssiLikelihood | None = None
         self.phase: PhaseLikelihood | None = None
         self._rows: deque[Row] = deque()

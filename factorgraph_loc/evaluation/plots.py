@@ -14,6 +14,7 @@ from factorgraph_loc.evaluation.figures import COLOURS, Track, grid, legend, mar
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
+from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -85,15 +86,23 @@ def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Causal and final trajectories over landmarks and reference; the view is that of the map and the reference."""
-    landmarks = log.world.positions()
-    view = _view(landmarks, log.reference)
+    """Causal and final trajectories over walls, tags, landmarks and reference; the view is that of the map and the reference.
+
+    Tags are where the estimators take them to be: moved by what the rig knows of their survey.
+    """
+    landmarks, walls = log.world.positions(), np.array(log.world.walls).reshape(-1, 2, 2)
+    tags = tag_map(log.world, log.rig.survey).tags.points[:, :2]
+    view = _view(np.concatenate((landmarks, tags, walls.reshape(-1, 2))), log.reference)
     height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         if log.reference is not None:
             line = _with_gaps(log.reference.t, log.reference.poses)
             axis.plot(line[:, 0], line[:, 1], color="0.75", linewidth=4.0, label="reference", zorder=1)
+        if len(walls):
+            axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
+        if len(tags):
+            axis.plot(*tags.T, "ks", markersize=5, markerfacecolor="none", label="tags", zorder=2)
         if len(landmarks):
             axis.plot(*landmarks.T, "k^", markersize=7, markerfacecolor="none", label="landmarks", zorder=4)
         for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
@@ -183,11 +192,16 @@ def _with_gaps(t: Array, poses: Array) -> Array:
     return np.insert(poses, gaps, np.nan, axis=0)
 
 
-def _view(landmarks: Array, reference: Trajectory | None) -> Array | None:
+def _joined(segments: Array) -> Array:
+    """Segments (W, 2, 2) as one line (3 W, 2) with a row of NaN after each."""
+    return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
+
+
+def _view(places: Array, reference: Trajectory | None) -> Array | None:
     """Lower and upper corner (2, 2) of map and reference: dead reckoning may run far away. None without a reference."""
     if reference is None or not len(reference):
         return None
-    points = np.concatenate((landmarks, reference.poses[:, :2]))
+    points = np.concatenate((places, reference.poses[:, :2]))
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.08 * max(*(high - low), 1.0)
     return np.array((low - margin, high + margin))

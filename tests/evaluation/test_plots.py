@@ -13,9 +13,10 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
 from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
 from factorgraph_loc.readers import write_native
+from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import BearingRangeSettings, Rig
 from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.world import Landmark, Tag, World
 
 
 def width(path: Path) -> int:
@@ -52,6 +53,29 @@ def test_files_of_one_run(track, tmp_path):
     remove_plots(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
     remove_plots(tmp_path / "nowhere")
+
+
+def test_walls_and_tags_are_drawn_where_the_estimators_take_them_to_be(track):
+    """The survey is shifted by 5 m: the tag is drawn there, within the view, and named in the legend."""
+    first, second = ((0.0, 0.0), (8.0, 0.0)), ((8.0, 0.0), (8.0, 7.0))
+    walls = tuple((*start, *end) for start, end in (first, second))
+    world = World(tags={"E2": Tag(x=1.0, y=-4.0)}, walls=walls)
+    log = replace(log_of(track), world=world, rig=Rig(survey=SurveySettings(x=5.0)))
+    figure, nothing = trajectories(log, {"ekf": track}), (np.nan, np.nan)
+    for axis in figure.axes:
+        lines = {line.get_label(): line.get_xydata() for line in axis.lines}
+        assert "landmarks" not in lines
+        np.testing.assert_allclose(lines["tags"], ((6.0, -4.0),))
+        np.testing.assert_array_equal(lines["walls"], (*first, nothing, *second, nothing))
+        for (low, high), values in zip((axis.get_xlim(), axis.get_ylim()), ((0.0, 8.0), (-4.0, 7.0)), strict=True):
+            assert low < values[0]
+            assert values[1] < high
+    assert {"tags", "walls", "reference", "ekf"} <= {text.get_text() for text in figure.legends[0].texts}
+
+
+def test_without_tags_and_walls_nothing_tells_of_them(track):
+    labels = {text.get_text() for text in trajectories(log_of(track), {"ekf": track}).legends[0].texts}
+    assert labels == {"landmarks", "reference", "ekf"}
 
 
 def test_without_reference(track, tmp_path):

@@ -126,7 +126,7 @@ def random_covariance(seed):
     return root @ root.T
 
 
-@given(increments, st.tuples(*[st.floats(-0.2, 0.2)] * 3).map(np.array))
+@given(increments, st.tuples(*[st.floats(-0.2, 0.2)] * 4).map(np.array))
 def test_jacobian_of_the_parameters_is_the_numerical_one(delta, parameters):
     increment = Increment(delta, np.eye(3), 0.7)
     _, jacobian = recalibrated(increment, parameters)
@@ -135,7 +135,7 @@ def test_jacobian_of_the_parameters_is_the_numerical_one(delta, parameters):
         [
             se2.log(se2.between(recalibrated(increment, parameters - d)[0], recalibrated(increment, parameters + d)[0]))
             / (2 * step)
-            for d in step * np.eye(3)
+            for d in step * np.eye(4)
         ]
     )
     np.testing.assert_allclose(jacobian, numerical, atol=1e-7)

@@ -60,7 +60,9 @@ def test_logistic_is_linear_in_its_features() -> None:
     x, y, z, c = 1.2, -0.8, -0.4, 0.6
     r, w = math.hypot(x, y), 1.0 - x / math.hypot(x, y)
     features = (1.0, r, r * r, w, w * w, r * w, abs(z), c, c * c, r * c, w * c)
-    assert logits(MODELS["logistic"], np.array((x, y, z)), c)[0][0] == pytest.approx(np.dot(COEFFICIENTS, features), abs=1e-3)
+    assert logits(MODELS["logistic"], np.array((x, y, z)), c)[0][0] == pytest.approx(
+        np.dot(COEFFICIENTS, features), abs=1e-3
+    )
 
 
 def test_grid_goes_through_its_knots() -> None:

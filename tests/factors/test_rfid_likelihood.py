@@ -21,7 +21,9 @@ MODELS: dict[str, DetectionModel] = {
 POSE = np.array((4.0, 3.0, 0.5))
 
 
-def scene(model: DetectionModel, seed: int = 0, tempering: float = 1.0, pitch: float = 0.1) -> tuple[RfidLikelihood, Looks]:
+def scene(
+    model: DetectionModel, seed: int = 0, tempering: float = 1.0, pitch: float = 0.1
+) -> tuple[RfidLikelihood, Looks]:
     """Four antennas with different places, 15 tags, of which some have no facing, and looks at different offsets."""
     rng = np.random.default_rng(seed)
     antennas = tuple(Antenna(0.3 * math.cos(a), 0.3 * math.sin(a), 1.0, a, pitch) for a in np.arange(4) * math.pi / 2.0)
@@ -50,14 +52,16 @@ def test_gradient(name: str, seed: int) -> None:
 
 
 def test_information_and_expectation_are_those_of_drawn_reads() -> None:
-    """Over reads drawn from the model: the gradient has mean zero and the information as covariance. 4,000 draws: each of the checks
-    is at 5 standard errors, so that all together fail by chance once in 100,000 runs."""
+    """Over reads drawn from the model: the gradient has mean zero and the information as covariance. 4,000 draws: each of the
+    checks is at 5 standard errors, so that all together fail by chance once in 100,000 runs."""
     likelihood, looks = scene(BeamModel(), pitch=0.0)
     looks = Looks(np.zeros((4, 3)), looks.antennas, np.ones(4, dtype=np.int64), looks.hits)
     rng = np.random.default_rng(5)
     q = np.array([likelihood.probabilities(POSE[None], a)[0] for a in range(4)])
     scores = [
-        likelihood.score(POSE, Looks(looks.offsets, looks.antennas, looks.rounds, (rng.random(q.shape) < q).astype(np.int64)))
+        likelihood.score(
+            POSE, Looks(looks.offsets, looks.antennas, looks.rounds, (rng.random(q.shape) < q).astype(np.int64))
+        )
         for _ in range(4000)
     ]
     gradients = np.array([s.gradient[0] for s in scores])

@@ -1,0 +1,165 @@
+"""Smoother and batch with scans of RFID tags, on simulated offices."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import Log, RfidStream, cut, join
+from factorgraph_loc.simulation import preset, simulate
+from factors import se2
+
+DURATION = 80.0
+
+
+def office(faults: Mapping[str, Any] | None = None, seed: int = 1, **changes: Any) -> Log:
+    settings = {"drive": {"duration": DURATION}, "faults": dict(faults or {}), **changes}
+    return simulate(preset("office", settings), seed)
+
+
+@cache
+def plain() -> tuple[Log, RunResult]:
+    log = office()
+    return log, run(log, RunConfig("smoother"))
+
+
+def errors(log: Log, result: RunResult) -> np.ndarray:
+    """Position errors (N,) [m] of the causal estimates."""
+    assert log.reference is not None
+    difference = result.poses - log.reference.at(result.t, max_gap=0.2)
+    return np.hypot(difference[:, 0], difference[:, 1])
+
+
+def test_smoother_is_near_and_knows_how_near() -> None:
+    """One run of 80 s has a dozen independent stretches: bounds at three times what many runs have on average."""
+    log, result = plain()
+    figures = score(result, log)
+    assert figures["causal.position_rmse"] < 0.2
+    assert figures["final.position_rmse"] < 0.12
+    assert figures["final.position_rmse"] < figures["causal.position_rmse"]
+    assert 0.5 < figures["causal.anees"] < 9.0
+    assert 0.5 < figures["final.anees"] < 9.0
+
+
+def test_final_is_the_optimum() -> None:
+    log, result = plain()
+    batch = run(log, RunConfig("batch"))
+    assert np.hypot(*(batch.final.poses - result.final.poses)[:, :2].T).max() < 0.01
+
+
+def test_a_window_is_between_filter_and_optimum() -> None:
+    log, full = plain()
+    window = run(log, RunConfig("smoother", {"lag": 10.0}))
+    of_full, of_window = score(full, log), score(window, log)
+    assert of_window["causal.position_rmse"] < 1.1 * of_full["causal.position_rmse"] + 0.01
+    assert of_window["final.position_rmse"] < of_window["causal.position_rmse"]
+
+
+def test_scans_that_come_late_are_put_in_at_their_time() -> None:
+    """Each third scan arrives after the two that follow it: rows in another order, with the same stamps."""
+    log, in_time = plain()
+    stream = log.streams["rfid"]
+    assert isinstance(stream, RfidStream)
+    stamps = {t: i for i, t in enumerate(np.unique(stream.t))}
+    # scans are half a second apart: a delay of one of them is what is allowed by default
+    place = np.array([stamps[t] + (1.5 if stamps[t] % 3 == 0 else 0.0) for t in stream.t])
+    order = np.argsort(place, kind="stable")
+    columns = {
+        name: getattr(stream, name)[order] if isinstance(getattr(stream, name), np.ndarray) else None
+        for name in ("t", "round", "age", "rssi", "phase", "frequency")
+    }
+    late = replace(stream, antenna=[stream.antenna[i] for i in order], epc=[stream.epc[i] for i in order], **columns)
+    result = run(replace(log, streams={**log.streams, "rfid": late}), RunConfig("smoother"))
+    assert not result.diagnostics.late
+    assert np.hypot(*(result.final.poses - in_time.final.poses)[:, :2].T).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("faults", "bound"),
+    [
+        ({"false_reads": 0.2}, 0.3),
+        ({"misplaced": 0.1}, 0.5),
+        ({"dead": 0.2}, 0.3),
+        ({"antenna_stop": {"antenna": "1", "time": 20.0, "rounds_go_on": True}}, 0.4),
+        ({"antenna_stop": {"antenna": "1", "time": 20.0}}, 0.3),
+        ({"clock_jump": {"time": 30.0, "jump": -3.0}}, 4.0),
+    ],
+)
+def test_faults_degrade(faults: Mapping[str, Any], bound: float) -> None:
+    log = office(faults)
+    result = run(log, RunConfig("smoother"))
+    assert np.all(np.isfinite(result.poses))
+    assert score(result, log)["causal.position_rmse"] < bound
+
+
+def test_a_silence_of_all_tags_is_no_place() -> None:
+    """For 40 s nothing is read: the robot goes on by odometry, says so, and is back soon after."""
+    log = office({"silence": {"time": 25.0, "duration": 40.0}})
+    result = run(log, RunConfig("smoother"))
+    figures = score(result, log)
+    assert figures["causal.anees"] < 12.0
+    assert any("no tag is read" in what for _, what in result.diagnostics.events)
+    status = np.array(result.status)
+    assert np.all(status[(result.t > 30.0) & (result.t < 64.0)] == "ambiguous")
+    assert np.all(status[result.t > 72.0] == "localized")
+    assert errors(log, result)[result.t > 72.0].max() < 0.5
+
+
+def test_unknown_start() -> None:
+    log, _ = plain()
+    result = run(log, RunConfig("smoother", prior="unknown"))
+    first = result.status.index("localized")
+    assert result.t[first] - result.t[0] < 20.0
+    assert errors(log, result)[first:].max() < 0.6
+    assert set(result.status[:first]) <= {"ambiguous", "unlocalized"}
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "batch"])
+def test_kidnapping(estimator: str) -> None:
+    log, _ = plain()
+    carried = join(cut(log, 0.0, 30.0), cut(log, 50.0, 80.0))
+    result = run(carried, RunConfig(estimator))
+    figures = score(result, carried)
+    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
+    assert errors(carried, result)[result.t > 45.0].max() < 0.7
+    if estimator == "smoother":
+        assert figures["final.position_rmse"] < 0.2
+
+
+def test_a_wrong_start_is_left() -> None:
+    log, _ = plain()
+    assert log.reference is not None
+    x, y, heading = log.reference.poses[0]
+    prior = f"{x + 3.0:.3f},{y:.3f},{se2.wrap_scalar(heading + 1.05):.3f}"
+    result = run(log, RunConfig("smoother", prior=prior))
+    assert errors(log, result)[result.t > 20.0].max() < 0.6
+
+
+def test_nothing_known_is_read() -> None:
+    """Every tag is dead: dead reckoning, without a claim to know better."""
+    log = office({"dead": 1.0})
+    result = run(log, RunConfig("smoother"))
+    assert any("never read" in warning for warning in result.warnings)
+    assert np.all(np.isfinite(result.poses))
+    assert np.sqrt(result.covariances[-1, 0, 0]) > 0.3
+
+
+def test_what_the_map_or_the_rig_lacks_is_counted() -> None:
+    log, _ = plain()
+    tags = dict(itertools.islice(log.world.tags.items(), 30))
+    antennas = {k: v for k, v in log.rig.rfid.all_antennas().items() if k != "8"} if log.rig.rfid else {}
+    rfid = log.rig.rfid.model_copy(update={"preset": None, "antennas": antennas}) if log.rig.rfid else None
+    poorer = replace(
+        log, world=log.world.model_copy(update={"tags": tags}), rig=log.rig.model_copy(update={"rfid": rfid})
+    )
+    result = run(poorer, RunConfig("smoother"))
+    assert result.diagnostics.ignored["tag not in the map"] > 100
+    assert result.diagnostics.ignored["antenna that the rig lacks"] == 160
+    assert score(result, poorer)["causal.position_rmse"] < 0.3
