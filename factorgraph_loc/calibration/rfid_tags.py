@@ -8,7 +8,7 @@ factor for reads that go together and for what the model of detection does not k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -71,7 +71,8 @@ def misplaced(
 @dataclass(frozen=True, eq=False)
 class _Reads:
     """Of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height`` (K,) of
-    the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if not known."""
+    the tag above it and ``pitch`` (K,); ``place`` (K, 2) of the tag in the map of the round's log, and the direction (K, 2) that it
+    faces, zero if not known."""
 
     hits: Array
     count: Array
@@ -90,7 +91,7 @@ class _Reads:
         away = self.place + shift - self.poses[:, :2]
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
         along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
-        facing = -(away @ self.normal) / np.sqrt(np.sum(away**2, axis=1) + 1e-9)
+        facing = -np.sum(away * self.normal, axis=1) / np.sqrt(np.sum(away**2, axis=1) + 1e-9)
         cp, sp = np.cos(self.pitch), np.sin(self.pitch)
         points = np.column_stack((cp * along + sp * self.height, across, cp * self.height - sp * along))
         mine = np.asarray(which)[self.antenna]
@@ -116,11 +117,13 @@ def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: Su
         normal = np.array((np.cos(angle), np.sin(angle))) if np.isfinite(angle) else np.zeros(2)
         height = log.tags.points[column, 2] - mounted[:, 3]
         hits, pitch = log.hits[near, column], mounted[near, 4]
-        parts.append(_Reads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal))
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS})
+        # each log has its own map: tags of two buildings may have one name
+        there, faced = (np.tile(value, (len(hits), 1)) for value in (place, normal))
+        parts.append(_Reads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, there, faced))
+    return _Reads(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
 
 
-_COLUMNS = ("hits", "count", "poses", "antenna", "height", "pitch")
+_COLUMNS = tuple(field.name for field in fields(_Reads))
 
 
 def _moved(reads: _Reads, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor) -> tuple[float, Array]:

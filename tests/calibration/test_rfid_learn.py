@@ -64,10 +64,11 @@ def test_misplaced_tags_are_named(read_tags):
     assert all(distance == pytest.approx(1.0, abs=0.4) for distance in named.values())
 
 
-def test_in_a_right_map_no_tag_is_named(read_tags):
+@pytest.mark.parametrize("seeds", [(1,), (1, 2)], ids=["one map", "two maps that name other tags alike"])
+def test_in_a_right_map_no_tag_is_named(read_tags, seeds):
     """One map in 100 would have one."""
-    log = read_tags(seconds=200.0)
-    rounds = [rounds_of(log, log.rig.rfid)]
+    logs = [read_tags(seed, seconds=200.0) for seed in seeds]
+    log, rounds = logs[0], [rounds_of(log, log.rig.rfid) for log in logs]
     assert not misplaced(
         rounds, log.rig.rfid, SurveySettings(), *model_of(rounds, log.rig.rfid, SurveySettings()), FLOOR
     )
