@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from factors.compressed import compressed
 from factors.rfid import Packed
-from factors.rfid_likelihood import Looks, RfidLikelihood, _of_tag, _placed, _terms
+from factors.rfid_kernels import of_tag, placed, terms
+from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
 
 ROWS = 6  # of the residual
@@ -75,9 +76,9 @@ def _joint(
     nll = 0.0
     for k in range(len(antennas)):
         a = antennas[k]
-        x, y, c, s, _, _ = _placed(packed, a, pose, offsets[k])
-        z, by_p, by_q, by_heading = _of_tag(packed, a, x, y, c, s, point, normal)
-        e, g, f, _, _ = _terms(packed, z, hits[k, tag], rounds[k])
+        x, y, c, s, _, _ = placed(packed, a, pose, offsets[k])
+        z, by_p, by_q, by_heading = of_tag(packed, a, x, y, c, s, point, normal)
+        e, g, f, _, _ = terms(packed, z, hits[k, tag], rounds[k])
         nll += e
         if f == 0.0 and g == 0.0:
             continue
