@@ -50,9 +50,9 @@ class RelocatingGraph(GraphEstimator):
         self._relocalizer = Relocalizer(self._motion, setup.world.positions())
         self._finder = None
         self._monitor: TrackMonitor | ScanMonitor = TrackMonitor()
-        if self._tags.likelihood is not None and not self._landmarks.known:
-            bounds = extent(setup.world, self._tags.map.tags)
-            self._finder = ScanFinder(self._tags.likelihood, self._motion, bounds, setup.rng)
+        if self._scans.tags.likelihood is not None and not self._landmarks.known:
+            bounds = extent(setup.world, self._scans.tags.map.tags)
+            self._finder = ScanFinder(self._scans.tags.likelihood, self._motion, bounds, setup.rng)
             self._monitor = ScanMonitor()
         # what is seen before the start is counted when it is taken in
         self._sought = KnownLandmarks(setup, Diagnostics())
@@ -77,7 +77,7 @@ class RelocatingGraph(GraphEstimator):
         ``ambiguous`` before one place is clear, and while the landmarks are not where they are expected.
         """
         if self._prior is not None:
-            doubted = self._monitor.suspicious_since is not None or self._silence.lasts
+            doubted = self._monitor.suspicious_since is not None or self._scans.silent
             status: Status = "ambiguous" if doubted else "localized"
             return replace(super().estimate(), status=status)
         modes = self._modes()
@@ -127,7 +127,7 @@ class RelocatingGraph(GraphEstimator):
         """Search with one more measurement; False if it tells nothing."""
         state = self._motion.state(m.t)
         if isinstance(m, RfidScan):
-            looks = self._tags.looks(m, count=False)
+            looks = self._scans.tags.looks(m, count=False)
             if looks is None or self._finder is None:
                 return False
             self._finder.add(state, looks)
@@ -177,7 +177,8 @@ class RelocatingGraph(GraphEstimator):
         keyframe = Keyframe(index, t, self._motion.state(t), jump)
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
-        self._pose, self._covariance, self._pending = pose, UNKNOWN, []
+        self._pose, self._covariance = pose, UNKNOWN
+        self._scans.clear()
         self._begin_again(keyframe)
         self._replay(replay)
 
@@ -190,7 +191,6 @@ class RelocatingGraph(GraphEstimator):
 
     def _replay(self, measurements: list[Exteroceptive | Tick]) -> None:
         self._monitor.clear()
-        self._signals.clear()
         if self._finder is not None:
             self._finder.start()
         for m in measurements:
@@ -204,10 +204,10 @@ class RelocatingGraph(GraphEstimator):
     def _scanned(self, t: float, looks: Looks, update: TagUpdate) -> None:
         if self._finder is None or not isinstance(self._monitor, ScanMonitor):
             return
-        self._finder.add(self._motion.state(t), looks, update.evidence)
         self._monitor.add(t, update.surprise, update.variance)
         if self._monitor.suspicious_since is None:
             self._finder.rest()
+        self._finder.add(self._motion.state(t), looks, update.evidence)
 
     @abstractmethod
     def _pose_of(self, keyframe: int) -> Array:
