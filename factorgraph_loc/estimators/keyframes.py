@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.estimators import landmarks, tags
+from factorgraph_loc.estimators import landmarks
 from factorgraph_loc.estimators.base import (
     Belief,
     Diagnostics,
@@ -33,10 +33,9 @@ from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.scan_monitor import Silence
-from factorgraph_loc.estimators.tag_signals import TagSignals
-from factorgraph_loc.estimators.tags import KnownTags, TagUpdate
+from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
+from factorgraph_loc.estimators.waiting_scans import WaitingScans
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
@@ -46,7 +45,7 @@ from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
 from factors.rfid_factor import ROWS, RfidFactor
-from factors.rfid_likelihood import Looks, together
+from factors.rfid_likelihood import Looks
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
@@ -70,10 +69,7 @@ class GraphEstimator(ABC):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
-        self._tags = KnownTags(setup, self.diagnostics)
-        self._signals = TagSignals(setup, self._tags)
-        self._silence = Silence()
-        self._pending: list[RfidFactor] = []  # on the newest keyframe
+        self._scans = WaitingScans(setup, self.diagnostics)
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         # all variables but the poses: estimate and covariance
@@ -225,49 +221,36 @@ class GraphEstimator(ABC):
             self._attach(before, addition, guess)
 
     def _scan(self, m: RfidScan) -> None:
-        looks = self._tags.looks(m)
+        looks = self._scans.tags.looks(m)
         if looks is None:
             return
         if m.t - self._keyframes[-1].t >= SCAN_KEYFRAME_INTERVAL:
             self._add_keyframe(m.t, None)
-        keyframe, likelihood = self._keyframe_before(m.t), self._tags.likelihood
-        assert likelihood is not None
+        keyframe = self._keyframe_before(m.t)
         offset = self._since(keyframe, m.t).delta if m.t > keyframe.t else np.zeros(3)
-        scanned = [RfidFactor(likelihood, looks.moved(offset))]
-        strengths = self._signals.strengths(m)
-        if strengths is not None and self._signals.strength is not None:
-            scanned.append(RfidFactor(self._signals.strength, strengths.moved(offset)))
+        here = looks.moved(offset)
         if keyframe is not self._keyframes[-1]:
-            self._add_late(keyframe, scanned, m)
+            self._add_late(keyframe, self._scans.factors(m, here), m)
             return
-        update = tags.updated(scanned, self._pose, self._covariance)
-        self.diagnostics.innovation("rfid", m.t, update.nis, update.dof)
-        lasted = self._silence.lasts
-        if not self._silence.add(int(looks.hits.sum()), update.evidence):
-            self._wait(keyframe, scanned, update)
-        else:
-            self.diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
-            if not lasted:
-                self.diagnostics.events.append((m.t, "no tag is read where some should be"))
+        update = self._scans.update(m, here, self._pose, self._covariance)
+        if update is None:
             return
+        self._take_over(update)
         self._scanned(m.t, looks, update)
-        if self._signals.keep(m):
-            self._take_phases(keyframe)
+        by_phases = self._scans.update_by_phases(m, self._places_at, self._pose, self._covariance)
+        if by_phases is not None:
+            self._take_over(by_phases)
 
-    def _take_phases(self, keyframe: Keyframe) -> None:
+    def _places_at(self, times: Array) -> Array:
+        """Where the robot was at these times (R,), in the frame of the newest keyframe, (R, 3)."""
         changes = None
         if ODOMETRY_KEY in self._constants:
             changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
-        offsets = self._motion.places(keyframe.odometry, self._signals.times(), changes)
-        window = self._signals.phases(offsets, self._pose)
-        if window is not None:
-            self._wait(keyframe, [window], tags.updated([window], self._pose, self._covariance))
+        return self._motion.places(self._keyframes[-1].odometry, times, changes)
 
-    def _wait(self, newest: Keyframe, factors: list[RfidFactor], update: TagUpdate) -> None:
-        """Keep factors on the newest keyframe until the next one, and take over what they make of its pose."""
-        self._pending += factors
+    def _take_over(self, update: TagUpdate) -> None:
         self._pose, self._covariance = update.pose, update.covariance
-        self._refine(newest, (update.pose, update.covariance))
+        self._refine(self._keyframes[-1], (update.pose, update.covariance))
 
     def _add_late(self, keyframe: Keyframe, factors: list[RfidFactor], m: RfidScan) -> None:
         if not self._is_open(keyframe.index):
@@ -278,16 +261,9 @@ class GraphEstimator(ABC):
         self._attach(keyframe, Addition([*self._gather(), *nodes]), None)
 
     def _gather(self) -> list[Node]:
-        """The scans from the newest keyframe as factors, which are in no graph yet: one of what was read and not read."""
-        if not self._pending:
-            return []
-        keyframe, waiting = self._keyframes[-1], self._pending
-        self._pending = []
-        looks = [factor.seen for factor in waiting if isinstance(factor.seen, Looks)]
-        factors = [factor for factor in waiting if not isinstance(factor.seen, Looks)]
-        if looks and self._tags.likelihood is not None:
-            factors.append(RfidFactor(self._tags.likelihood, together(looks)))
-        nodes = [Node((keyframe.key,), factor, ROWS) for factor in factors]
+        """The scans from the newest keyframe, which are in no graph yet."""
+        keyframe = self._keyframes[-1]
+        nodes = [Node((keyframe.key,), factor, ROWS) for factor in self._scans.gather()]
         keyframe.nodes += nodes
         return nodes
 
