@@ -219,7 +219,7 @@ class ParticleFilter(Filter):
             return
         if self._state.localized:
             self._scans.take_phases(m, self._state, self._places, self._weigh)
-        since = self._scans.refuted_since(self._state)
+        since = self._scans.refuted_since(self._state, self._places)
         if since is not None:
             # for the final trajectory: since then the track was elsewhere
             self._records = [r.lost() if r.t >= since else r for r in self._records]

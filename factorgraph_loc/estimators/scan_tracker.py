@@ -30,6 +30,8 @@ from factors.se2 import Array
 
 KEPT = 90.0  # s of odometry, for a search among the last scans
 
+# from times (R,) to where the robot was then, (R, 3), in the frame of its pose
+Places = Callable[[Array], Array]
 # weighs the particles by a log-likelihood (N,) of a cloud, and returns the log of its mean
 Weigh = Callable[[Callable[[Cloud], Array]], float]
 
@@ -43,7 +45,6 @@ class ScanTracker:
         self._signals = TagSignals(setup, self._tags)
         self._monitor = ScanMonitor()
         self._silence = Silence()
-        self._kept_until = -np.inf
         self._finder: ScanFinder | None = None
         if finds and self._tags.likelihood is not None:
             motion.keep(KEPT)
@@ -105,15 +106,12 @@ class ScanTracker:
             weigh(lambda cloud: strength.log_likelihood(cloud.poses, strengths))
         return True
 
-    def take_phases(self, m: RfidScan, cloud: Cloud, places: Callable[[Array], Array], weigh: Weigh) -> None:
+    def take_phases(self, m: RfidScan, cloud: Cloud, places: Places, weigh: Weigh) -> None:
         """Keep the phases of a scan, and take the window of them that ends with it, if one does.
 
-        ``places``: from times (R,) to where the robot was then, (R, 3), in the frame of its pose. Phases of scans that are older
-        than the last, or that come again as the filter went back, are not taken.
+        Scans from its time on that were taken before, as the filter went back, are forgotten.
         """
-        if m.t <= self._kept_until:
-            return
-        self._kept_until = m.t
+        self._signals.forget(m.t)
         if not self._signals.keep(m):
             return
         window = self._signals.phases(places(self._signals.times()), cloud.moments[0])
@@ -124,8 +122,9 @@ class ScanTracker:
         assert isinstance(reads, PhaseReads)
         weigh(lambda cloud: likelihood.log_likelihood(cloud.poses, reads))
 
-    def refuted_since(self, cloud: Cloud) -> float | None:
-        """Since when the scans refute the track, as another place explains them; None where none does."""
+    def refuted_since(self, cloud: Cloud, places: Places) -> float | None:
+        """Since when the robot must have been elsewhere, as another place explains the scans; None where none does. ``places`` as
+        for phases. A suspicion that the scans deny, as they alone lead to where the cloud is, is dropped."""
         since = self._monitor.suspicious_since
         if self._finder is None:
             return None
@@ -134,4 +133,13 @@ class ScanTracker:
             return None
         self._finder.seek(since)
         mean, covariance = cloud.moments
-        return since if self._finder.refutes(mean, se2.world_to_body(mean, covariance)) else None
+        track = mean, se2.world_to_body(mean, covariance)
+        if self._finder.confirms(*track):
+            self._monitor.accept()
+            self._finder.rest()
+        if not self._finder.refutes(*track):
+            return None
+        found = self._finder.best
+        assert found is not None
+        here = found.pose
+        return self._finder.change(lambda t: np.asarray(se2.compose(here, places(np.array([t]))[0])))
