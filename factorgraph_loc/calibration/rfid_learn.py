@@ -16,10 +16,18 @@ from factorgraph_loc.calibration.rfid_pairs import Pairs, pairs_of
 from factorgraph_loc.calibration.rfid_rounds import Rounds, distinct, rounds_of
 from factorgraph_loc.calibration.rfid_tags import TagDoubt, misplaced
 from factorgraph_loc.calibration.rfid_tempering import independent_share, tempered
+from factorgraph_loc.calibration.rssi import fit_rssi
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.grids import write_grid
 from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.rfid_settings import BeamSettings, GridSettings, LogisticSettings, RfidSettings, SurveySettings
+from factorgraph_loc.rfid_settings import (
+    BeamSettings,
+    GridSettings,
+    LogisticSettings,
+    PhaseSettings,
+    RfidSettings,
+    SurveySettings,
+)
 from factorgraph_loc.rig import Rig
 from factors.rfid import BeamModel, DetectionModel, GridModel, LogisticModel
 
@@ -75,6 +83,7 @@ def learn_rfid(
     assert used is not None
     models, which = fit(pairs, used, floor, len(names))
     settings = _with_models(settings, models, which, grids, floor)
+    settings = _with_signals(logs, settings, survey, focused=phase is not None)
     rig = rig.model_copy(update={"rfid": settings, "survey": survey})
     if choice is None:
         return rig, None
@@ -168,6 +177,24 @@ def _with_models(
             "miss": floor.miss,
         }
     )
+
+
+def _with_signals(
+    logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings, *, focused: bool
+) -> RfidSettings:
+    """With what estimators need for the strength of reads, where logs have it, and for their phase, where it came into focus:
+    without that the geometry is not good enough. Whether they use it is for the rig's sensors to say."""
+    changes: dict[str, object] = {}
+    try:
+        strength = fit_rssi(logs, settings, survey).settings
+    except InputError:  # too few reads have one
+        pass
+    else:
+        tempering = strength.tempering if settings.rssi is None else settings.rssi.tempering
+        changes["rssi"] = strength.model_copy(update={"tempering": tempering})
+    if focused and settings.phase is None:
+        changes["phase"] = PhaseSettings()
+    return settings.model_copy(update=changes)
 
 
 def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:

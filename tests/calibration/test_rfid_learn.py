@@ -1,8 +1,12 @@
 """Survey, mounting, misplaced tags and tempering, from logs of which they are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from factorgraph_loc.calibration import rfid_learn
+from factorgraph_loc.calibration.phase import PhaseFit
 from factorgraph_loc.calibration.rfid_choice import Kind
 from factorgraph_loc.calibration.rfid_fit import Floor, fit_logistic
 from factorgraph_loc.calibration.rfid_learn import learn_rfid
@@ -12,7 +16,7 @@ from factorgraph_loc.calibration.rfid_rounds import rounds_of
 from factorgraph_loc.calibration.rfid_tags import misplaced
 from factorgraph_loc.calibration.rfid_tempering import independent_share, tempered
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.rfid_settings import GridSettings, SurveySettings
+from factorgraph_loc.rfid_settings import GridSettings, PhaseSettings, SurveySettings
 from factorgraph_loc.rig import read_rig, write_rig
 
 FLOOR = Floor()
@@ -84,8 +88,6 @@ def test_independent_reads_need_no_tempering(read_tags):
 
 def test_reads_in_bursts_need_it(read_tags):
     """Each round five times over: the share is a fifth."""
-    from dataclasses import replace  # noqa: PLC0415
-
     log = read_tags(seconds=400.0)
     once = rounds_of(log, log.rig.rfid, merged=False)
     models, which = model_of([once], log.rig.rfid, SurveySettings())
@@ -117,6 +119,29 @@ def test_a_learnt_rig_is_complete(read_tags, tmp_path):
     for mine, theirs in zip(rig.rfid.model().models, back.rfid.model().models, strict=True):
         np.testing.assert_array_equal(mine.logits, theirs.logits)
     assert (back.rfid.false_read, back.rfid.miss) == (0.02, 0.02)
+
+
+def test_a_learnt_rig_says_what_is_made_of_strength_and_phase(read_tags, tmp_path, monkeypatch):
+    """Where reads have them, and phases came into focus. What the rig says of them already stays, but for the fitted strength: -50
+    dBm with a noise of 2 dB, wherever the tag is."""
+    focus = PhaseFit(SurveySettings(), (0.0, 0.0), np.full(5, 0.01), 0.5, 0.9, 2000)
+    monkeypatch.setattr(rfid_learn, "fit_phase", lambda *_: focus)
+    log = read_tags(seconds=40.0)
+    reads = log.streams["rfid"]
+    strength = np.random.default_rng(0).normal(-50.0, 2.0, len(reads.t))
+    told = replace(log, streams=dict(log.streams) | {"rfid": replace(reads, rssi=strength, phase=strength * 0.0)})
+    kind = Kind("logistic", True)
+    rig, _ = learn_rfid([told], log.rig, tmp_path / "cart", kind)
+    assert rig.rfid.rssi.sigma == pytest.approx(2.0, rel=0.2)
+    assert rig.rfid.phase == PhaseSettings()
+    assert rig.sensors == log.rig.sensors
+    given = {"rssi": rig.rfid.rssi.model_copy(update={"tempering": 0.3}), "phase": PhaseSettings(kappa=2.0)}
+    rig, _ = learn_rfid([told], rig.model_copy(update={"rfid": rig.rfid.model_copy(update=given)}), tmp_path, kind)
+    assert rig.rfid.rssi.tempering == 0.3
+    assert rig.rfid.phase == given["phase"]
+    rig, _ = learn_rfid([log], log.rig, tmp_path / "cart", kind)
+    assert rig.rfid.rssi is None
+    assert rig.rfid.phase is None
 
 
 def test_a_floor_that_the_rig_gives_is_kept(read_tags, tmp_path):
