@@ -6,10 +6,9 @@ Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapte
 adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their stated spread is a
 little too small where landmarks tell next to nothing of them: resampling moves their mean at random.
 
-Where the place is not known, at an unknown start or once the landmarks refute it, a share of the particles is drawn anew at each
-stamp (augmented Monte Carlo localization: Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, table 8.3), not anywhere but from
-what the last sightings tell (:mod:`~factorgraph_loc.estimators.relocalization`). Where no landmarks are used, scans of RFID tags
-tell the place: the particles are drawn from a seeker (:mod:`~factorgraph_loc.estimators.seeker`) until it is sure.
+Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what landmarks tell of it
+(:mod:`~factorgraph_loc.estimators.landmark_tracker`), or where no landmarks are used from what scans of RFID tags tell
+(:mod:`~factorgraph_loc.estimators.scan_tracker`).
 """
 
 from __future__ import annotations
@@ -25,24 +24,17 @@ from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
+from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.relocalization import Relocalizer
 from factorgraph_loc.estimators.scan_tracker import ScanTracker
-from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
-from factors.bearing_range import TIME_OFFSET, log_likelihood
-from factors.bearing_range_factor import BearingRangeFactor
+from factors.bearing_range import TIME_OFFSET
 from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
-
-SLOW, FAST = 0.01, 0.1  # decay rates of the averages of the likelihood, per stamp
-INJECTED = 0.05  # the least share that is drawn anew while the place is not known
-ONE_PLACE, REACH = 0.98, 5.0  # the place is known when so much weight lies within so many standard deviations of it
 
 
 class ParticleFilterSettings(FilterSettings):
@@ -78,12 +70,9 @@ class ParticleFilter(Filter):
         if settings.self_calibration:
             self._odometry_constants = setup.rig.estimated_odometry()
             self._sensor_constants = Estimated.of(bearing_range.PARAMETERS[:TIME_OFFSET], sensor and sensor.uncertainty)
-        self._landmarks = KnownLandmarks(setup, self.diagnostics, estimated=self._sensor_constants.indices)
-        # where the constants lie in those of the particles
         middle = len(self._odometry_constants.names)
-        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, None)
-        self._relocalizer = Relocalizer(self._motion, setup.world.positions())
-        self._monitor = TrackMonitor()
+        self._odometry_part = slice(0, middle)  # where they lie in the constants of the particles
+        self._landmarks = LandmarkTracker(setup, self._motion, self.diagnostics, self._sensor_constants, first=middle)
         self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
         self._lost = False
 
@@ -130,9 +119,8 @@ class ParticleFilter(Filter):
         seen = self._landmarks.factor(m)
         if seen is None:
             return None
-        self._relocalizer.add(self._odometry, self._expected(seen, np.zeros(len(self._sensor_constants.names))))
-        self._relocalizer.search()
-        return replace(self._cloud(self._relocalizer.sample(self._rng, self._settings.particles)), localized=False)
+        self._landmarks.seek(seen, self._odometry)
+        return replace(self._cloud(self._landmarks.sample(self._settings.particles)), localized=False)
 
     def _sought(self) -> Cloud:
         """Particles drawn from what scans alone tell."""
@@ -175,36 +163,20 @@ class ParticleFilter(Filter):
         seen = self._landmarks.factor(m)
         if seen is None:
             return
-        expected = self._expected(seen, self._state.weights @ self._state.constants[:, self._sensor_part])
-        self._relocalizer.add(self._odometry, expected)
-        if self._state.localized:
-            self._watch(m.t, expected)
-        self._average(float(self._state.weights @ np.exp(self._likelihood(seen, self._state) / len(seen.points))))
-        self._weigh(lambda cloud: self._likelihood(seen, cloud))
-        if not self._state.localized and not self._scans.finds:
-            self._relocalizer.search()
-            self._inject()
-            self._settle()
-
-    def _expected(self, seen: BearingRangeFactor, constants: Array) -> BearingRangeFactor:
-        """The factor on the pose alone, of a sensor with these constants (P,)."""
-        return seen.fixed([constants], None) if self._sensor_constants.names else seen
-
-    def _watch(self, t: float, seen: BearingRangeFactor) -> None:
-        """Report the innovation; see whether the landmarks refute the place."""
-        mean, covariance = self._state.moments
-        covariance = se2.world_to_body(mean, covariance)
-        self._landmarks.report(t, seen, robust_update(seen, mean, covariance, iterations=1))
-        self._monitor.add(t, seen, mean, covariance)
-        since = self._monitor.suspicious_since
-        if since is None:
-            return
-        self._relocalizer.forget(since)
-        self._relocalizer.search()
-        if self._relocalizer.refutes(mean, covariance):
+        since = self._landmarks.refuted_since(m.t, seen, self._odometry, self._state)
+        if since is not None:
             self._lost = True
             self._state = replace(self._state, localized=False)
             self._event(f"lost: landmarks are not where they were expected since {since:.1f} s")
+        self._state = self._landmarks.averaged(seen, self._state)
+        self._weigh(lambda cloud: self._landmarks.log_likelihood(seen, cloud))
+        if not self._state.localized and not self._scans.finds:
+            self._landmarks.search()
+            self._resample()
+            self._state = self._landmarks.injected(self._state)
+            if self._landmarks.settled(self._state):
+                self._state = replace(self._state, localized=True)
+                self._event("recovered" if self._lost else "localized")
 
     def _scan(self, m: RfidScan) -> None:
         if not self._state.localized and self._scans.finds:
@@ -258,48 +230,12 @@ class ParticleFilter(Filter):
             self._resample()
             likelihood = log_likelihood(self._state)
 
-    def _average(self, likelihood: float) -> None:
-        """Keep the averages of the likelihood, over many and over few stamps."""
-        cloud = self._state
-        slow = cloud.slow + SLOW * (likelihood - cloud.slow) if cloud.slow else likelihood
-        fast = cloud.fast + FAST * (likelihood - cloud.fast) if cloud.fast else likelihood
-        self._state = replace(cloud, slow=slow, fast=fast)
-
-    def _likelihood(self, seen: BearingRangeFactor, cloud: Cloud) -> Array:
-        """Log-likelihood (N,) of the particles, each with its own constants."""
-        changes = self._sensor_constants.full(cloud.constants[:, self._sensor_part], len(bearing_range.PARAMETERS))
-        return log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings, changes)
-
     def _resample(self) -> None:
         chosen = systematic(self._state.weights, self._rng, self._settings.particles)
         if self._settings.kld:
             chosen = chosen[kld.prefix(self._state.poses[chosen], self._rng, self._settings.min_particles)]
         cloud, kernel = self._state.density()
         self._state = cloud.drawn(chosen, kernel, self._rng)
-
-    def _inject(self) -> None:
-        """Draw particles anew from the last sightings: the more, the less likely they are than they used to be."""
-        self._resample()
-        cloud = self._state
-        share = max(INJECTED, 1.0 - cloud.fast / cloud.slow)
-        chosen = self._rng.choice(len(cloud.poses), int(share * len(cloud.poses)), replace=False)
-        poses = cloud.poses.copy()
-        poses[chosen] = self._relocalizer.sample(self._rng, len(chosen))
-        self._state = replace(cloud, poses=poses)
-
-    def _settle(self) -> None:
-        """The place is known when the sightings tell it and the particles are there."""
-        best = self._relocalizer.best
-        if best is None:
-            return
-        error = self._state.poses - best.pose
-        error[:, 2] = se2.wrap(error[:, 2])
-        squared = np.sum(error * np.linalg.solve(best.covariance, error.T).T, axis=1)
-        if self._state.weights[squared < REACH**2].sum() < ONE_PLACE:
-            return
-        self._state = replace(self._state, localized=True)
-        self._monitor.clear()
-        self._event("recovered" if self._lost else "localized")
 
     def _event(self, what: str) -> None:
         # a late measurement makes the filter go through the last ones again
