@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from factors.rfid import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array
 
+FAST = {"contract", "reassoc", "arcp", "nsz"}  # what an optimiser may do, without taking infinities for impossible
 
-@numba.njit(cache=True)
+
+@numba.njit(cache=True, inline="always")
 def seen(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
@@ -26,7 +28,7 @@ def seen(
     return value, cp * by_x - sp * by_z, by_y, sp * by_x + cp * by_z, by_c
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
     """Where an antenna is in the world (x, y, cosine and sine of its heading), for a robot at ``offset`` from ``pose``; and the
     cosine and sine of the robot's heading."""
@@ -38,7 +40,7 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
     return x, y, c * a[3] - s * a[4], s * a[3] + c * a[4], c, s
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float]:
@@ -60,7 +62,7 @@ def of_tag(
     return value, by_p, by_q, by_heading
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
     """Negative log-likelihood of k hits in n rounds, its derivative by the logit, Fisher's information on the logit, and mean and
     variance of the negative log-likelihood."""
@@ -78,7 +80,7 @@ def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, floa
     return nll, gradient, information, expected, variance
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def score(
     packed: Packed,
     poses: Array,
@@ -88,19 +90,18 @@ def score(
     antennas: NDArray[np.int64],
     rounds: NDArray[np.int64],
     hits: NDArray[np.int64],
+    tempering: float,
     nll: Array,
     gradient: Array,
     information: Array,
     expected: Array,
     variance: Array,
 ) -> None:
-    nll[:] = 0.0
-    gradient[:] = 0.0
-    information[:] = 0.0
-    expected[:] = 0.0
-    variance[:] = 0.0
-    by = np.empty(3)
     for n in range(len(poses)):
+        # sums in registers, not in arrays: a scan is one pose, and this loop is most of a smoother's step
+        e_sum = mean_sum = spread_sum = 0.0
+        g_x = g_y = g_a = 0.0
+        xx = xy = xa = yy = ya = aa = 0.0
         for k in range(len(antennas)):
             a = antennas[k]
             x, y, c, s, _, _ = placed(packed, a, poses[n], offsets[k])
@@ -113,21 +114,30 @@ def score(
             for t in range(len(points)):
                 z, by_p, by_q, by_heading = of_tag(packed, a, x, y, c, s, points[t], normals[t])
                 e, g, f, mean, spread = terms(packed, z, hits[k, t], rounds[k])
-                nll[n] += e
-                expected[n] += mean
-                variance[n] += spread
-                if f == 0.0 and g == 0.0:
-                    continue
+                e_sum += e
+                mean_sum += mean
+                spread_sum += spread
                 # the antenna moves, the tag does not
-                gx, gy = cb * by_p - sb * by_q, sb * by_p + cb * by_q
-                by[0], by[1], by[2] = -gx, -gy, by_heading + gx * py - gy * px
-                for i in range(3):
-                    gradient[n, i] += g * by[i]
-                    for j in range(3):
-                        information[n, i, j] += f * by[i] * by[j]
+                by_x, by_y = sb * by_q - cb * by_p, -sb * by_p - cb * by_q
+                by_a = by_heading - by_x * py + by_y * px
+                g_x += g * by_x
+                g_y += g * by_y
+                g_a += g * by_a
+                xx += f * by_x * by_x
+                xy += f * by_x * by_y
+                xa += f * by_x * by_a
+                yy += f * by_y * by_y
+                ya += f * by_y * by_a
+                aa += f * by_a * by_a
+        nll[n], expected[n], variance[n] = tempering * e_sum, tempering * mean_sum, tempering * spread_sum
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = tempering * g_x, tempering * g_y, tempering * g_a
+        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = tempering * xx, tempering * yy, tempering * aa
+        information[n, 0, 1] = information[n, 1, 0] = tempering * xy
+        information[n, 0, 2] = information[n, 2, 0] = tempering * xa
+        information[n, 1, 2] = information[n, 2, 1] = tempering * ya
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def by_tag(
     packed: Packed,
     pose: Array,
@@ -156,7 +166,7 @@ def by_tag(
             information[t, 1, 1] += f * gy * gy
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def probabilities(packed: Packed, antenna: int, poses: Array, points: Array, normals: Array, out: Array) -> None:
     none = np.zeros(3)
     for n in range(len(poses)):

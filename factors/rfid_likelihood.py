@@ -91,9 +91,10 @@ class RfidLikelihood:
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         n = len(poses)
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
-        arrays = (looks.offsets, looks.antennas, looks.rounds, looks.hits)
-        rfid_kernels.score(self._packed, poses, self.tags.points, self.tags.normals, *arrays, *out)
-        return Score(*(self.model.tempering * part for part in out))
+        tags = (self.tags.points, self.tags.normals)
+        where, seen = (looks.offsets, looks.antennas), (looks.rounds, looks.hits)
+        rfid_kernels.score(self._packed, poses, *tags, *where, *seen, self.model.tempering, *out)
+        return out
 
     def log_likelihood(self, poses: Array, looks: Looks) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid_tables`): for particles."""
