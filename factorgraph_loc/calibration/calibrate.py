@@ -17,19 +17,22 @@ from factorgraph_loc.calibration.windows import REFERENCE_GAP
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, RfidStream, VelocityStream
+from factorgraph_loc.rfid_settings import default_models
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
 
 Scores = Mapping[str, Any]
+STEPS = 5  # that are told of progress
 
 
 @dataclass(frozen=True)
 class Calibration:
     """What came out.
 
-    ``consistency``: of the landmark sensor with the EKF; ``rfid_consistency``: of the tempering with the smoother; None without
-    such a sensor. ``before`` and ``after``: scores on each log with the input rig and the new one; ``held_out``: with a rig learnt
-    from the other logs, but for the factor on the noise; empty where there are none. ``doubts``: one line each.
+    ``consistency``: of the landmark sensor with the EKF; ``rfid_consistency``: of the tempering with the smoother, with rigs learnt
+    from the other logs where there are any; None without such a sensor. ``before`` and ``after``: scores on each log with the input
+    rig and the new one; ``held_out``: with a rig learnt from the other logs, but for the factor on the noise; empty where there are
+    none. ``doubts``: one line each.
     """
 
     logs: tuple[str, ...]
@@ -61,29 +64,28 @@ def calibrate(
     """
     check(logs)
     report = progress or (lambda _done, _total: None)
-    parts = _parts(logs)
-    steps = 2 + (len(logs) if len(set(parts)) > 1 else 0)
     start = sensing(rig or logs[0].rig, logs[0])
     logs = [_scorable(log) for log in logs]
     before = _scores(logs, start, evaluate) if _is_complete(start) else ()
-    report(1, steps)
+    report(1, STEPS)
     knowledge = learn(logs, start, grids)
-    rig, consistency, of_rfid = _consistent(logs, knowledge, evaluate)
-    searches = [one for one in (consistency, of_rfid) if one is not None]
-    last = searches[-1]
-    after = last.trial.scores if last.trial and len(searches) == 1 else _scores(logs, rig, evaluate)
-    report(2, steps)
-    held_out = []
+    folds = _folds(logs, start, knowledge, grids) if len(set(_parts(logs))) > 1 else []
+    report(2, STEPS)
+    rig, consistency, of_rfid = _consistent(logs, knowledge, folds, evaluate)
     # numbers that are searched with an estimator are shared: a search in each fold would take longer than all the rest
-    for i, log in enumerate(logs if len(set(parts)) > 1 else ()):
-        others = [one for one, part in zip(logs, parts, strict=True) if part != parts[i]]
-        changed = _without(others, start, knowledge, grids, i)
-        if consistency is not None and consistency.trial:
-            changed = inflated(changed, consistency.trial.factor)
-        if of_rfid is not None and changed.rfid is not None and rig.rfid is not None:
-            changed = tempered(changed, rig.rfid.tempering**-0.5)
-        held_out.append(evaluate(replace(log, rig=changed)))
-        report(3 + i, steps)
+    folds = [_with_noise(fold, rig, consistency) for fold in folds]
+    report(3, STEPS)
+    searches = [one for one in (consistency, of_rfid) if one is not None]
+    known = searches[0].trial.scores if len(searches) == 1 and searches[0].trial else None
+    of_folds = of_rfid is not None and bool(folds)
+    after = known if known and not of_folds else _scores(logs, rig, evaluate)
+    report(4, STEPS)
+    held_out = (
+        known
+        if known and of_folds
+        else tuple(evaluate(replace(log, rig=fold)) for log, fold in zip(logs, folds, strict=False))
+    )
+    report(5, STEPS)
     return Calibration(
         logs=tuple(log.name for log in logs),
         input_rig=start,
@@ -93,39 +95,67 @@ def calibrate(
         rfid_consistency=of_rfid,
         before=before,
         after=after,
-        held_out=tuple(held_out),
+        held_out=held_out,
         doubts=_doubts(knowledge, searches),
     )
 
 
 def _consistent(
-    logs: Sequence[Log], knowledge: Knowledge, evaluate: Evaluate
+    logs: Sequence[Log], knowledge: Knowledge, folds: Sequence[Rig], evaluate: Evaluate
 ) -> tuple[Rig, Consistency | None, Consistency | None]:
-    """Each sensor with honest noise, by runs without the other one."""
+    """Each sensor with honest noise, by runs without the other one. That of RFID, whose models have many parameters, is honest
+    only on logs that these were not fitted to: with the rig of ``folds``, if there are any, that had no part of a log."""
     rig, sensors = knowledge.rig, knowledge.rig.sensors
 
-    def alone(sensor: str) -> Rig:
+    def alone(rig: Rig, sensor: str) -> Rig:
         kept = tuple(name for name in sensors if name == sensor or name not in EXTEROCEPTIVE)
         return rig.model_copy(update={"sensors": kept})
 
     of_landmarks = of_rfid = None
     if "bearing_range" in sensors:
-        of_landmarks = make_consistent(logs, alone("bearing_range"), evaluate)
+        of_landmarks = make_consistent(logs, alone(rig, "bearing_range"), evaluate)
         rig = rig.model_copy(update={"bearing_range": of_landmarks.rig.bearing_range})
     if knowledge.rfid is not None:
+        unseen = {log.name: alone(fold, "rfid") for log, fold in zip(logs, folds, strict=False)}
+
+        def held_out(log: Log) -> Scores:
+            return evaluate(replace(log, rig=_tempered_as(unseen[log.name], log.rig)))
+
         guess = knowledge.rfid.share**-0.5
-        of_rfid = make_consistent(logs, alone("rfid"), evaluate, guess, tempered, least=1.0)
+        # reads are not less alike than their scatter says, even if this estimator on these logs would bear it
+        of_rfid = make_consistent(
+            logs, alone(rig, "rfid"), held_out if unseen else evaluate, guess, tempered, least=guess
+        )
         rig = rig.model_copy(update={"rfid": of_rfid.rig.rfid})
     return rig, of_landmarks, of_rfid
 
 
-def _without(others: Sequence[Log], start: Rig, knowledge: Knowledge, grids: Path | None, fold: int) -> Rig:
-    """The rig that other logs tell; RFID's models are fitted in the way that was chosen with all."""
-    if knowledge.rfid is None or grids is None:
-        return learn(others, start).rig
-    folder = grids.parent / f"{grids.name}.fold{fold}"
-    folder.mkdir()
-    return learn(others, start, folder / grids.name, knowledge.rfid.choice.kind).rig
+def _with_noise(fold: Rig, rig: Rig, of_landmarks: Consistency | None) -> Rig:
+    """The rig of a fold with what was searched for with all logs."""
+    if of_landmarks is not None and of_landmarks.trial:
+        fold = inflated(fold, of_landmarks.trial.factor)
+    return _tempered_as(fold, rig)
+
+
+def _tempered_as(rig: Rig, other: Rig) -> Rig:
+    if rig.rfid is None or other.rfid is None:
+        return rig
+    return tempered(rig, other.rfid.tempering**-0.5)
+
+
+def _folds(logs: Sequence[Log], start: Rig, knowledge: Knowledge, grids: Path | None) -> list[Rig]:
+    """For each log the rig that the others tell; RFID's models are fitted in the way that was chosen with all."""
+    parts = _parts(logs)
+    out = []
+    for i, part in enumerate(parts):
+        others = [log for log, p in zip(logs, parts, strict=True) if p != part]
+        if knowledge.rfid is None or grids is None:
+            out.append(learn(others, start).rig)
+            continue
+        folder = grids.parent / f"{grids.name}.fold{i}"
+        folder.mkdir()
+        out.append(learn(others, start, folder / grids.name, knowledge.rfid.choice.kind).rig)
+    return out
 
 
 def _parts(logs: Sequence[Log]) -> list[int]:
@@ -135,7 +165,7 @@ def _parts(logs: Sequence[Log]) -> list[int]:
 
 def _is_complete(rig: Rig) -> bool:
     """Whether a rig has what its sensors need, learnt or stated: with the default model of detection a run tells nothing."""
-    given = rig.rfid is None or "models" in rig.rfid.model_fields_set
+    given = rig.rfid is None or rig.rfid.models != default_models()
     return given and all(getattr(rig, name) is not None for name in EXTEROCEPTIVE if name in rig.sensors)
 
 

@@ -39,7 +39,8 @@ class Trial:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The rig with effective noise, the trial with it, and ``reached``: whether ANEES is ideal within the tolerance.
+    """The rig with effective noise, the trial with it, and ``reached``: whether ANEES is ideal within the tolerance, or below it
+    with the least factor.
 
     ``trial`` is None where no log can be scored: then the rig's noise is the scatter.
     """
@@ -77,7 +78,8 @@ def make_consistent(
     change: Change = inflated,
     least: float = FACTORS[0],
 ) -> Consistency:
-    """The factor for which the estimator's ANEES is ideal on ``logs``; ``guess``: where the search begins, ``least``: its end.
+    """The factor for which the estimator's ANEES is ideal on ``logs``; ``guess``: where the search begins, ``least``: its end,
+    where an estimator may be more careful than it needs to be.
 
     ``change``: the rig with the standard deviations of a sensor multiplied by a factor. First the factor is made right for the
     causal estimates. Where the final ones are then too sure, for the geometric mean of both.
@@ -94,9 +96,10 @@ def make_consistent(
     trial = _solve(at, trials, lambda t: math.log(t.causal), least)
     if trial.final > MAX_FINAL:
         trial = _solve(at, trials, _both, least)
-        reached = abs(_both(trial)) < 2.0 * TOLERANCE
+        left = _both(trial)
     else:
-        reached = abs(math.log(trial.causal)) < 2.0 * TOLERANCE
+        left = math.log(trial.causal)
+    reached = abs(left) < 2.0 * TOLERANCE or (left < 0.0 and trial.factor <= least)
     return Consistency(change(rig, trial.factor), trial, reached)
 
 

@@ -5,19 +5,36 @@ import pytest
 
 from factorgraph_loc.calibration.calibrate import calibrate
 from factorgraph_loc.calibration.report import document
+from factorgraph_loc.rfid_settings import BeamSettings, RfidSettings
+from factorgraph_loc.rig import read_rig, write_rig
 
 
-def evaluate(log):
-    """Ideal at a tempering of 0.25."""
-    anees = 3.0 * (log.rig.rfid.tempering / 0.25) ** 0.8
+def scores(tempering, ideal):
+    anees = 3.0 * (tempering / ideal) ** 0.8
     kinds = {f"{kind}.{name}": 0.1 for kind in ("causal", "final") for name in ("position_rmse", "heading_rmse")}
     return kinds | {"causal.anees": anees, "final.anees": anees, "causal.scored": 1000, "final.scored": 1000}
 
 
+def evaluate(log):
+    """Ideal at a tempering of 0.25."""
+    return scores(log.rig.rfid.tempering, 0.25)
+
+
 @pytest.fixture(scope="module")
-def found(read_tags, tmp_path_factory):
-    logs = [read_tags(seed=seed, seconds=70.0) for seed in (1, 2)]
-    return calibrate(logs, evaluate, grids=tmp_path_factory.mktemp("grids") / "cart")
+def logs(read_tags):
+    return [read_tags(seed=seed, seconds=70.0) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def rig(logs):
+    """With a model stated, so that it is worth scoring."""
+    models = {"default": BeamSettings(p0=0.8)}
+    return logs[0].rig.model_copy(update={"rfid": logs[0].rig.rfid.model_copy(update={"models": models})})
+
+
+@pytest.fixture(scope="module")
+def found(logs, rig, tmp_path_factory):
+    return calibrate(logs, evaluate, rig, grids=tmp_path_factory.mktemp("grids") / "cart")
 
 
 def test_tempering_makes_the_estimator_consistent(found):
@@ -28,7 +45,38 @@ def test_tempering_makes_the_estimator_consistent(found):
 def test_each_log_is_scored_with_a_rig_from_the_others(found):
     assert len(found.held_out) == 2
     assert len(found.after) == 2
-    assert found.before == ()
+
+
+def test_tempering_is_sought_on_logs_that_the_models_have_not_seen(logs, tmp_path):
+    """The rig that was learnt from all of them is run last, for its scores."""
+    models = []
+
+    def noted(log):
+        models.append(log.rig.rfid.models)
+        return evaluate(log)
+
+    found = calibrate(logs, noted, grids=tmp_path / "cart")
+    of_all = found.rig.rfid.models
+    assert of_all not in models[:-2]
+    assert models[-2:] == [of_all, of_all]
+    assert found.held_out == found.rfid_consistency.trial.scores
+
+
+def test_tempering_is_never_above_what_the_scatter_of_reads_says(logs, tmp_path):
+    """Even if an estimator would bear it, and that is no reason to doubt the rig."""
+    found = calibrate(logs[:1], lambda log: scores(log.rig.rfid.tempering, 10.0), grids=tmp_path / "cart")
+    assert found.rig.rfid.tempering == pytest.approx(found.knowledge.rfid.share)
+    assert found.rfid_consistency.trial.causal < 0.5
+    assert not any("consistent" in doubt for doubt in found.doubts)
+    assert found.after == found.rfid_consistency.trial.scores
+
+
+def test_a_rig_without_a_model_is_not_scored(logs, found, tmp_path):
+    """Read from a file or not: its default model tells nothing."""
+    assert len(found.before) == 2
+    path = tmp_path / "places.rig.toml"
+    write_rig(logs[0].rig.model_copy(update={"rfid": RfidSettings(antennas=logs[0].rig.rfid.antennas)}), path)
+    assert calibrate(logs[:1], evaluate, read_rig(path), grids=tmp_path / "cart").before == ()
 
 
 def test_the_document_holds_plain_numbers(found):
