@@ -98,6 +98,10 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
     pose = np.asarray(pose, dtype=float)
+    if pose.ndim == 1:
+        x, y, heading = pose.tolist()
+        cos, sin = math.cos(heading), math.sin(heading)
+        return np.array(((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0)))
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     out = np.zeros((*pose.shape[:-1], 3, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = c, -s, pose[..., 1]
@@ -109,6 +113,11 @@ def adjoint(pose: Array) -> Array:
 def right_jacobian(xi: Array) -> Array:
     """Right Jacobian ``(..., 3, 3)`` of :func:`exp`: ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
     xi = np.asarray(xi, dtype=float)
+    if xi.ndim == 1:
+        x, y, angle = xi.tolist()
+        p, q = arc_coefficients(angle)
+        r, s = (angle / 6.0, 0.5 - angle**2 / 24.0) if abs(angle) < _SMALL_ANGLE else ((1.0 - p) / angle, q / angle)
+        return np.array(((p, q, r * x - s * y), (-q, p, s * x + r * y), (0.0, 0.0, 1.0)))
     phi = xi[..., 2]
     a, b = _arc_coefficients(phi)
     small = np.abs(phi) < _SMALL_ANGLE
@@ -186,6 +195,9 @@ def _inverse_one(x: float, y: float, heading: float) -> tuple[float, float, floa
 
 
 def _rotation3(heading: Array) -> Array:
+    if np.ndim(heading) == 0:
+        cos, sin = math.cos(heading), math.sin(heading)
+        return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
     c, s = np.cos(heading), np.sin(heading)
     out = np.zeros((*np.shape(heading), 3, 3))
     out[..., 0, 0], out[..., 0, 1] = c, -s

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import deque
 
 DURATION = 5.0  # s over which scans are taken together
 KEPT = 60.0  # s
@@ -38,7 +40,7 @@ class ScanMonitor:
     """
 
     def __init__(self) -> None:
-        self._scans: list[tuple[float, float, float]] = []
+        self._scans: deque[tuple[float, float, float]] = deque()
         self._since: float | None = None
         self._usual = 0.0  # the mean surprise that was found to mean nothing
 
@@ -50,8 +52,11 @@ class ScanMonitor:
     def add(self, t: float, surprise: float, variance: float) -> None:
         """Take a scan: how much larger its negative log-likelihood is than expected, and the variance of that, both at the
         predicted pose. Scans from ``t`` on that were taken before are forgotten."""
-        self._scans = [s for s in self._scans if t - KEPT <= s[0] < t]
+        while self._scans and self._scans[-1][0] >= t:
+            self._scans.pop()
         self._scans.append((t, surprise, variance))
+        while self._scans[0][0] < t - KEPT:
+            self._scans.popleft()
         z = self._z()
         if z > SUSPICIOUS or (self._since is not None and z > CALM):
             self._since = self._beginning()
@@ -77,7 +82,8 @@ class ScanMonitor:
         return sum(s[1] - self._usual for s in last) / math.sqrt(sum(s[2] for s in last) + 1e-9)
 
     def _last(self) -> list[tuple[float, float, float]]:
-        return [s for s in self._scans if s[0] > self._scans[-1][0] - DURATION]
+        since = self._scans[-1][0] - DURATION if self._scans else 0.0
+        return list(itertools.takewhile(lambda scan: scan[0] > since, reversed(self._scans)))
 
     def _beginning(self) -> float:
         """The change point: from there on the sum of the surprises is largest."""
