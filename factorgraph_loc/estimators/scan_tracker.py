@@ -45,6 +45,7 @@ class ScanTracker:
         self._signals = TagSignals(setup, self._tags)
         self._monitor = ScanMonitor()
         self._silence = Silence()
+        self._heard = -np.inf
         self._finder: ScanFinder | None = None
         if finds and self._tags.likelihood is not None:
             motion.keep(KEPT)
@@ -93,7 +94,12 @@ class ScanTracker:
         mean, covariance = cloud.moments
         update = tags.update(likelihood, looks, mean, se2.world_to_body(mean, covariance), iterations=1)
         self._diagnostics.innovation("rfid", m.t, update.nis, update.dof)
-        if self._silence.add(int(looks.hits.sum()), update.evidence):
+        reads = int(looks.hits.sum())
+        # a scan without reads that comes again, as the filter went back, counts once
+        if reads or m.t > self._heard:
+            self._silence.add(reads, update.evidence)
+            self._heard = max(self._heard, m.t)
+        if self._silence.lasts:
             self._diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
             return False
         # the finder's evidence is of what was read and not read, and so is the track's

@@ -36,8 +36,8 @@ def position_errors(result, log):
     return np.linalg.norm(result.poses[:, :2] - log.reference.at(result.t)[:, :2], axis=1)
 
 
-def events(result):
-    return [what.partition(":")[0] for _, what in result.diagnostics.events]
+def events(source):
+    return [what.partition(":")[0] for _, what in source.diagnostics.events]
 
 
 def scan(t, *reads, antennas=("ahead",)):
@@ -187,6 +187,19 @@ def test_antenna_that_the_rig_lacks_and_late_scans():
     assert particles.diagnostics.ignored == {"antenna that the rig lacks": 1}
     assert particles.diagnostics.late == {"rfid": 1}
     assert {t for t, _, _ in particles.diagnostics.nis["rfid"]} == {1.7, 1.8, 1.9}
+
+
+def test_scans_that_come_again_make_no_silence():
+    # not to read a tag a metre ahead has a log-probability of -2.3: three times are no silence yet, six would be
+    world = World(tags={"a": Tag(x=1.0, y=0.0)})
+    particles = alone(world, RfidSettings(antennas={"ahead": AntennaSettings()}), 500)
+    particles.initialize(PosePrior(0.0, np.zeros(3), 1e-4 * np.eye(3)))
+    for t in (0.3, 0.2, 0.1):
+        particles.process(scan(t))
+    assert particles.diagnostics.events == []
+    for t in (0.4, 0.5, 0.6):
+        particles.process(scan(t))
+    assert events(particles) == ["no tag is read where some should be"]
 
 
 def test_tags_with_landmarks():
