@@ -33,7 +33,7 @@ def reliability_figure(found: RfidKnowledge) -> bytes:
         predicted,
         observed,
         yerr=(observed - low, high - observed),
-        fmt="o-",
+        fmt=".-",
         color=COLOURS[0],
         capsize=3,
         label="held-out reads, Wilson's 95 % interval",
