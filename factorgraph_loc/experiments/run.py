@@ -274,7 +274,12 @@ def _never_localized(log: Log, estimates: Sequence[PoseEstimate], final: Traject
     found = {e.status for e in estimates}
     if "localized" in found or ("ambiguous" not in found and len(final)):  # or it says nothing before the end
         return ()
-    why = "its landmarks leave several places possible" if "ambiguous" in found else "no landmark of the map was seen"
+    several, nothing = (
+        ("its landmarks leave several places possible", "no landmark of the map was seen")
+        if log.world.landmarks or not log.world.tags
+        else ("its tags leave several places possible", "no tag of the map was read")
+    )
+    why = several if "ambiguous" in found else nothing
     return (f"{log.name}: never localized: {why}",)
 
 

@@ -9,6 +9,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import RfidStream
+from factorgraph_loc.rfid_settings import RfidSettings
 from factorgraph_loc.world import Tag
 
 ALL = ("odometry", "rfid", "rssi", "phase")
@@ -82,3 +83,15 @@ def test_compare_takes_the_same_sensors(reading, tmp_path):
     assert not list((tmp_path / "out").rglob("error.txt"))
     with pytest.raises(InputError, match="no log has a sensor 'phse': did you mean phase"):
         compare([reading], [RunConfig("dead_reckoning", sensors=("odometry", "phse"))], tmp_path / "none")
+
+
+def test_a_log_of_tags_alone_that_never_tells_the_place_says_so_of_tags(reading):
+    """One read of one tag, and only reads of others: once several places are left, once nothing is told."""
+    world = reading.world.model_copy(update={"landmarks": {}})
+    rig = reading.rig.model_copy(update={"rfid": RfidSettings(preset="rackham")})
+    alone = replace(reading, rig=rig, world=world)
+    config = RunConfig("particle_filter", sensors=ALL[:2], prior="unknown")
+    assert run(alone, config).warnings[-1] == "straight: never localized: its tags leave several places possible"
+    stream = replace(reading.streams["rfid"], epc=["x", "x"])
+    unread = run(replace(alone, streams=dict(reading.streams) | {"rfid": stream}), config)
+    assert unread.warnings[-1] == "straight: never localized: no tag of the map was read"
