@@ -7,8 +7,9 @@ factor for reads that go together and for what the model of detection does not k
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -33,7 +34,7 @@ MIN_TAGS = 5  # below which a median says nothing
 @dataclass(frozen=True)
 class TagDoubt:
     """A tag that seems to lie ``shift`` (2,) [m, in the world] from where the survey has it; ``p``: probability of so large a
-    ratio for any of the tags in a map that is right."""
+    ratio for any of the tags in a map that is right. ``name``: with that of a log, where logs have it at several places."""
 
     name: str
     shift: tuple[float, float]
@@ -53,26 +54,38 @@ def misplaced(
     floor: Floor,
 ) -> tuple[TagDoubt, ...]:
     """The tags of all logs that are elsewhere, the most certain first."""
-    names = list(dict.fromkeys(name for log in logs for name in log.names))
-    if len(names) < MIN_TAGS:
+    tags = _tags(logs)
+    if len(tags) < MIN_TAGS:
         return ()
-    found = [_moved(_reads(logs, name, settings, survey), models, which, floor) for name in names]
+    found = [_moved(_reads(*tag, settings, survey), models, which, floor) for tag in tags.values()]
     ratios = np.array([ratio for ratio, _ in found])
     scale = max(1.0, float(np.median(ratios)) / float(chi2.ppf(0.5, 2)))
-    p = np.minimum(1.0, len(names) * chi2.sf(ratios / scale, 2))
+    p = np.minimum(1.0, len(tags) * chi2.sf(ratios / scale, 2))
     doubts = [
         TagDoubt(name, (float(shift[0]), float(shift[1])), float(one))
-        for name, (_, shift), one in zip(names, found, p, strict=True)
+        for name, (_, shift), one in zip(tags, found, p, strict=True)
         if one < FAMILY and np.hypot(*shift) > LEAST_SHIFT
     ]
     return tuple(sorted(doubts, key=lambda d: d.p))
 
 
+def _tags(logs: Sequence[Rounds]) -> dict[str, tuple[list[Rounds], str]]:
+    """The logs and the name of each tag, by what it is called here: in two buildings two tags may have one name."""
+    found: dict[tuple[str, tuple[float, ...]], list[Rounds]] = {}
+    for log in logs:
+        for name, point in zip(log.names, log.tags.points.tolist(), strict=True):
+            found.setdefault((name, tuple(point)), []).append(log)
+    places = Counter(name for name, _ in found)
+    return {
+        name if places[name] == 1 else f"{name} ({its_logs[0].log})": (its_logs, name)
+        for (name, _), its_logs in found.items()
+    }
+
+
 @dataclass(frozen=True, eq=False)
 class _Reads:
     """Of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height`` (K,) of
-    the tag above it and ``pitch`` (K,); ``place`` (K, 2) of the tag in the map of the round's log, and the direction (K, 2) that it
-    faces, zero if not known."""
+    the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if not known."""
 
     hits: Array
     count: Array
@@ -91,7 +104,7 @@ class _Reads:
         away = self.place + shift - self.poses[:, :2]
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
         along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
-        facing = -np.sum(away * self.normal, axis=1) / np.sqrt(np.sum(away**2, axis=1) + 1e-9)
+        facing = -(away @ self.normal) / np.sqrt(np.sum(away**2, axis=1) + 1e-9)
         cp, sp = np.cos(self.pitch), np.sin(self.pitch)
         points = np.column_stack((cp * along + sp * self.height, across, cp * self.height - sp * along))
         mine = np.asarray(which)[self.antenna]
@@ -106,8 +119,6 @@ def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: Su
     transform = survey.transform()
     parts = []
     for log in logs:
-        if name not in log.names:
-            continue
         column = log.names.index(name)
         place = se2.transform_from(transform, log.tags.points[column, :2])
         mounted = antennas[log.antenna]
@@ -117,13 +128,11 @@ def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: Su
         normal = np.array((np.cos(angle), np.sin(angle))) if np.isfinite(angle) else np.zeros(2)
         height = log.tags.points[column, 2] - mounted[:, 3]
         hits, pitch = log.hits[near, column], mounted[near, 4]
-        # each log has its own map: tags of two buildings may have one name
-        there, faced = (np.tile(value, (len(hits), 1)) for value in (place, normal))
-        parts.append(_Reads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, there, faced))
-    return _Reads(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
+        parts.append(_Reads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal))
+    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS})
 
 
-_COLUMNS = tuple(field.name for field in fields(_Reads))
+_COLUMNS = ("hits", "count", "poses", "antenna", "height", "pitch")
 
 
 def _moved(reads: _Reads, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor) -> tuple[float, Array]:

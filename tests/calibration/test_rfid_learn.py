@@ -68,6 +68,16 @@ def test_misplaced_tags_are_named(read_tags):
     assert all(distance == pytest.approx(1.0, abs=0.4) for distance in named.values())
 
 
+def test_tags_of_two_maps_are_different_ones_whatever_their_names(read_tags):
+    """Of the tags of two buildings that share their names, those are named that are 1 m off in one of them."""
+    logs = [read_tags(seconds=200.0, seed=1, misplaced=3), read_tags(seconds=200.0, seed=2)]
+    settings, rounds = logs[0].rig.rfid, [rounds_of(log, logs[0].rig.rfid) for log in logs]
+    found = misplaced(rounds, settings, SurveySettings(), *model_of(rounds, settings, SurveySettings()), FLOOR)
+    assert {doubt.name for doubt in found} <= {f"tag{i} (reads-1)" for i in range(3)}
+    assert found
+    assert all(doubt.distance == pytest.approx(1.0, abs=0.4) for doubt in found)
+
+
 @pytest.mark.parametrize("seeds", [(1,), (1, 2)], ids=["one map", "two maps that name other tags alike"])
 def test_in_a_right_map_no_tag_is_named(read_tags, seeds):
     """One map in 100 would have one."""
