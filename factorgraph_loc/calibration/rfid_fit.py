@@ -21,7 +21,7 @@ FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
 RIDGE = 1.0  # of coefficients of features with a standard deviation of 1, in nats
 EDGE = 5.0  # rounds, all around at the reach, in which nothing was read: what no log shows must not grow with distance
 ITERATIONS = 50
-CONVERGED = 1e-5  # of the cost, as a share
+CONVERGED = 1e-4  # of the cost, as a share: gained by the last step, after which Newton would gain far less
 
 
 @dataclass(frozen=True)
