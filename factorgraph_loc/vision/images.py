@@ -1,0 +1,74 @@
+"""Images as :mod:`factorgraph_loc.vision` takes them: checked once, then ``uint8``, grey or BGR as OpenCV has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.uint8]
+
+MIN_SIDE = 16  # px: below it no patch around a point fits, and an image has no features
+
+
+def as_image(array: object, source: object = "image") -> Image:
+    """``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA as ``uint8``, (H, W) or (H, W, 3), rows contiguous.
+
+    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. ``source`` is named in the
+    InputError if it is no image: empty, of another shape or type, with values that are not finite or out of range.
+    """
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{source}: is {type(array).__name__}, expected an array of pixels")
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (1, 3, 4)):
+        raise InputError(f"{source}: has shape {array.shape}, expected (H, W), or (H, W, C) with 1, 3 or 4 channels")
+    if array.size == 0:
+        raise InputError(f"{source}: is empty, of shape {array.shape}, expected at least one pixel")
+    if array.ndim == 3:
+        array = array[:, :, 0] if array.shape[2] == 1 else array[:, :, :3]
+    if array.dtype == np.uint8:
+        return np.ascontiguousarray(array)
+    if array.dtype == np.uint16:
+        return np.ascontiguousarray((array.astype(np.uint32) + 128) // 257, dtype=np.uint8)
+    if array.dtype.kind != "f":
+        raise InputError(f"{source}: has pixels of type {array.dtype}, expected uint8, uint16 or floating point")
+    if not np.isfinite(array).all():
+        raise InputError(f"{source}: has {np.count_nonzero(~np.isfinite(array))} values that are not finite numbers")
+    low, high = float(array.min()), float(array.max())
+    if low < 0.0 or high > 1.0:
+        raise InputError(f"{source}: has floating-point values from {low:g} to {high:g}, expected 0 to 1")
+    return np.ascontiguousarray(np.rint(array * 255.0), dtype=np.uint8)
+
+
+def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
+    """``mask`` (H, W) of truth values or ``uint8`` as ``uint8``, not 0 where features are wanted; None is everywhere. InputError if
+    it is of another type, or of another size than ``image``."""
+    if mask is None:
+        return None
+    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
+        kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise InputError(f"{source}: is of {kind}, expected an array of bool or uint8")
+    if mask.shape != image.shape[:2]:
+        raise InputError(f"{source}: has shape {mask.shape}, expected that of the image, {image.shape[:2]}")
+    return np.ascontiguousarray(mask != 0, dtype=np.uint8)
+
+
+def is_blank(image: Image) -> bool:
+    """Whether an image can have no feature: a side is below :data:`MIN_SIDE`, or all its pixels are equal."""
+    return min(image.shape[:2]) < MIN_SIDE or bool((image == image[0, 0]).all())
+
+
+def read_image(path: Path) -> Image:
+    """The image in a file, (H, W) or (H, W, 3) BGR; InputError if it is missing or does not decode."""
+    try:
+        content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if image is None:
+        raise InputError(f"{path}: is not an image that can be decoded, expected PNG, JPEG, PPM or the like")
+    return as_image(image, path)

@@ -1,0 +1,176 @@
+"""Features by name: one interface, and what it makes of bad input."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.vision.features import EXTRACTORS, Keypoints, extractor
+from factorgraph_loc.vision.images import as_image, as_mask, read_image
+
+NAMES = sorted(EXTRACTORS)
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    """Coloured blobs of several sizes, (240, 320, 3)."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(240, 320, 3))
+    layers = [cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0, 6.0)]
+    return np.clip(128 + 45 * sum(layers), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", NAMES)
+class TestEveryExtractor:
+    def test_gives_the_strongest_with_a_descriptor_each(self, name: str, picture: np.ndarray) -> None:
+        features = extractor(name, 100)
+        keypoints, descriptors = features.detectAndCompute(picture)
+        assert features.name == name
+        assert 80 <= len(keypoints) <= 100
+        assert len(descriptors) == len(keypoints)
+        assert descriptors.dtype == (np.uint8 if features.binary else np.float32)
+        assert np.all((keypoints.points >= 0) & (keypoints.points <= (319, 239)))
+        assert np.all(np.diff(keypoints.responses) <= 0)
+
+    def test_detect_then_compute_is_detect_and_compute(self, name: str, picture: np.ndarray) -> None:
+        features = extractor(name, 100)
+        both, descriptors = features.detectAndCompute(picture)
+        found = features.detect(picture)
+        described, again = features.compute(picture, found)
+        assert np.allclose(np.sort(both.points, axis=0), np.sort(described.points, axis=0))
+        if name == "colour":  # OpenCV's take the angle as float32 degrees on the second way: bits flip
+            assert np.array_equal(descriptors, again)
+
+    def test_gives_the_same_twice(self, name: str, picture: np.ndarray) -> None:
+        first, second = (extractor(name, 50).detectAndCompute(picture) for _ in range(2))
+        assert np.array_equal(first[0].points, second[0].points)
+        assert np.array_equal(first[1], second[1])
+
+    def test_stays_inside_the_mask(self, name: str, picture: np.ndarray) -> None:
+        mask = np.zeros(picture.shape[:2], dtype=bool)
+        mask[60:200, 100:260] = True
+        keypoints = extractor(name, 200).detect(picture, mask)
+        assert len(keypoints) > 20
+        x, y = np.rint(keypoints.points).astype(int).T
+        assert np.all(mask[y, x])
+
+    def test_a_mask_of_nothing_gives_nothing(self, name: str, picture: np.ndarray) -> None:
+        keypoints, descriptors = extractor(name).detectAndCompute(picture, np.zeros(picture.shape[:2], dtype=bool))
+        assert len(keypoints) == 0
+        assert len(descriptors) == 0
+
+    def test_more_than_there_are_gives_what_there_is(self, name: str, picture: np.ndarray) -> None:
+        keypoints, descriptors = extractor(name, 10**6).detectAndCompute(picture)
+        assert 0 < len(keypoints) == len(descriptors) < 10**5
+
+    @pytest.mark.parametrize("shape", [(15, 200), (200, 15, 3), (1, 1), (3, 3, 3)])
+    def test_a_tiny_image_has_no_features(self, name: str, shape: tuple[int, ...]) -> None:
+        image = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
+        keypoints, descriptors = extractor(name).detectAndCompute(image)
+        assert len(extractor(name).detect(image)) == len(keypoints) == len(descriptors) == 0
+        assert descriptors.ndim == 2
+
+    @pytest.mark.parametrize("shape", [(16, 16), (16, 16, 3), (17, 40, 3), (33, 16)])
+    def test_the_smallest_images_do_not_fail(self, name: str, shape: tuple[int, ...]) -> None:
+        image = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
+        keypoints, descriptors = extractor(name).detectAndCompute(image)
+        assert len(keypoints) == len(descriptors)
+
+    @pytest.mark.parametrize("value", [0, 77, 255])
+    def test_a_constant_image_has_no_features(self, name: str, value: int) -> None:
+        keypoints, descriptors = extractor(name).detectAndCompute(np.full((90, 120, 3), value, dtype=np.uint8))
+        assert len(keypoints) == len(descriptors) == 0
+
+    def test_other_kinds_of_pixels_give_the_same_features(self, name: str, picture: np.ndarray) -> None:
+        features = extractor(name, 100)
+        expected = features.detect(picture).points
+        alpha = np.dstack([picture, np.full(picture.shape[:2], 9, dtype=np.uint8)])
+        for same in (picture.astype(np.uint16) * 257, picture / 255.0, (picture / 255.0).astype(np.float32), alpha):
+            assert np.array_equal(features.detect(same).points, expected)
+
+    def test_grey_images_work(self, name: str, picture: np.ndarray) -> None:
+        grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        keypoints, descriptors = extractor(name, 100).detectAndCompute(grey)
+        assert 80 <= len(keypoints) == len(descriptors)
+        assert np.array_equal(keypoints.points, extractor(name, 100).detect(grey[:, :, None]).points)
+
+    def test_computing_nothing_gives_nothing(self, name: str, picture: np.ndarray) -> None:
+        keypoints, descriptors = extractor(name).compute(picture, Keypoints.empty())
+        assert len(keypoints) == len(descriptors) == 0
+        assert descriptors.shape[1] > 0
+
+    def test_a_mask_of_another_size_is_an_error(self, name: str, picture: np.ndarray) -> None:
+        with pytest.raises(InputError, match=r"mask: has shape \(10, 10\), expected that of the image, \(240, 320\)"):
+            extractor(name).detect(picture, np.ones((10, 10), dtype=bool))
+
+
+def test_an_unknown_name_is_an_error_with_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"feature 'shift' is not known: did you mean sift\?"):
+        extractor("shift")
+    with pytest.raises(InputError, match="count is 0, expected at least 1"):
+        extractor("sift", 0)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.empty((0, 0), dtype=np.uint8), "is empty"),
+        (np.empty((0, 5, 3), dtype=np.uint8), "is empty"),
+        (None, "is NoneType, expected an array"),
+        ([[1, 2]], "is list, expected an array"),
+        (np.zeros((8, 8, 2), dtype=np.uint8), r"has shape \(8, 8, 2\)"),
+        (np.zeros(8, dtype=np.uint8), r"has shape \(8,\)"),
+        (np.zeros((8, 8), dtype=np.int32), "has pixels of type int32"),
+        (np.zeros((8, 8), dtype=complex), "has pixels of type complex128"),
+        (np.full((8, 8), np.nan), "has 64 values that are not finite"),
+        (np.full((8, 8), np.inf), "has 64 values that are not finite"),
+        (np.full((8, 8), 200.0), "has floating-point values from 200 to 200, expected 0 to 1"),
+        (np.full((8, 8), -0.5), "has floating-point values from -0.5"),
+    ],
+)
+def test_what_is_no_image_is_an_error(array: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_image(array)
+
+
+def test_a_mask_is_of_truth_values() -> None:
+    image = np.zeros((4, 5), dtype=np.uint8)
+    assert np.array_equal(as_mask(np.eye(4, 5, dtype=bool), image), np.eye(4, 5))
+    with pytest.raises(InputError, match="mask: is of float64, expected an array of bool or uint8"):
+        as_mask(np.ones((4, 5)), image)
+
+
+def test_files_that_are_no_images_are_errors(tmp_path: Path) -> None:
+    for name, content in (("empty.png", b""), ("text.png", b"no picture")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=rf"{name}: is not an image that can be decoded"):
+            read_image(tmp_path / name)
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        read_image(tmp_path / "missing.png")
+
+
+def test_an_image_is_read_as_it_was_written(tmp_path: Path) -> None:
+    image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    assert np.array_equal(read_image(tmp_path / "a.png"), image)
+
+
+def test_keypoints_go_to_opencv_and_back() -> None:
+    rng = np.random.default_rng(2)
+    keypoints = Keypoints(
+        rng.uniform(0, 100, (5, 2)).astype(np.float32).astype(float),
+        rng.uniform(1, 9, 5),
+        np.array([0.1, -2.0, 3.1, np.nan, 0.0]),
+        rng.uniform(0, 1, 5),
+        np.arange(5),
+    )
+    back = Keypoints.from_cv2(keypoints.to_cv2())
+    assert np.array_equal(back.points, keypoints.points)
+    assert np.allclose(back.sizes, keypoints.sizes)
+    assert np.allclose(np.exp(1j * back.angles), np.exp(1j * keypoints.angles), atol=1e-5, equal_nan=True)
+    assert np.allclose(back.responses, keypoints.responses)
+    assert np.array_equal(back.levels, keypoints.levels)
+    assert [k.class_id for k in keypoints.to_cv2()] == list(range(5))
+    assert len(Keypoints.from_cv2([])) == 0
