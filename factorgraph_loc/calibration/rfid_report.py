@@ -55,7 +55,7 @@ def tempering_text(found: RfidKnowledge, rig: Rig) -> str:
     assert rig.rfid is not None
     return (
         f"By their scatter along the reference, {1.0 / found.share:.0f} reads in a row tell as much as one that stands alone. "
-        f"The smoother is consistent with a tempering of {rig.rfid.tempering:.3g}."
+        f"The smoother is not too sure of itself with a tempering of {rig.rfid.tempering:.3g}, which the rig has."
     )
 
 

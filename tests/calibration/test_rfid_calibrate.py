@@ -26,15 +26,32 @@ def logs(read_tags):
 
 
 @pytest.fixture(scope="module")
-def rig(logs):
-    """With a model stated, so that it is worth scoring."""
-    models = {"default": BeamSettings(p0=0.8)}
-    return logs[0].rig.model_copy(update={"rfid": logs[0].rig.rfid.model_copy(update={"models": models})})
+def models():
+    """Those that were evaluated, in their order."""
+    return []
 
 
 @pytest.fixture(scope="module")
-def found(logs, rig, tmp_path_factory):
-    return calibrate(logs, evaluate, rig, grids=tmp_path_factory.mktemp("grids") / "cart")
+def found(logs, models, tmp_path_factory):
+    """From a rig with a model, which is worth scoring."""
+
+    def noted(log):
+        models.append(log.rig.rfid.models)
+        return evaluate(log)
+
+    rfid = logs[0].rig.rfid.model_copy(update={"models": {"default": BeamSettings(p0=0.8)}})
+    rig = logs[0].rig.model_copy(update={"rfid": rfid})
+    return calibrate(logs, noted, rig, grids=tmp_path_factory.mktemp("grids") / "cart")
+
+
+@pytest.fixture(scope="module")
+def found_in_one(logs, tmp_path_factory):
+    """From one log, a rig that was read from a file and has no model, and an estimator that is too careful at any tempering."""
+    folder = tmp_path_factory.mktemp("grids")
+    places = RfidSettings(antennas=logs[0].rig.rfid.antennas)
+    write_rig(logs[0].rig.model_copy(update={"rfid": places}), folder / "places.rig.toml")
+    rig = read_rig(folder / "places.rig.toml")
+    return calibrate(logs[:1], lambda log: scores(log.rig.rfid.tempering, 10.0), rig, grids=folder / "cart")
 
 
 def test_tempering_makes_the_estimator_consistent(found):
@@ -47,36 +64,27 @@ def test_each_log_is_scored_with_a_rig_from_the_others(found):
     assert len(found.after) == 2
 
 
-def test_tempering_is_sought_on_logs_that_the_models_have_not_seen(logs, tmp_path):
-    """The rig that was learnt from all of them is run last, for its scores."""
-    models = []
-
-    def noted(log):
-        models.append(log.rig.rfid.models)
-        return evaluate(log)
-
-    found = calibrate(logs, noted, grids=tmp_path / "cart")
+def test_tempering_is_sought_on_logs_that_the_models_have_not_seen(found, models):
+    """The model of all logs comes last, for their scores."""
     of_all = found.rig.rfid.models
+    assert len(models) > 4
+    assert models[:2] == [found.input_rig.rfid.models] * 2
     assert of_all not in models[:-2]
     assert models[-2:] == [of_all, of_all]
     assert found.held_out == found.rfid_consistency.trial.scores
 
 
-def test_tempering_is_never_above_what_the_scatter_of_reads_says(logs, tmp_path):
+def test_tempering_is_never_above_what_the_scatter_of_reads_says(found_in_one):
     """Even if an estimator would bear it, and that is no reason to doubt the rig."""
-    found = calibrate(logs[:1], lambda log: scores(log.rig.rfid.tempering, 10.0), grids=tmp_path / "cart")
-    assert found.rig.rfid.tempering == pytest.approx(found.knowledge.rfid.share)
-    assert found.rfid_consistency.trial.causal < 0.5
-    assert not any("consistent" in doubt for doubt in found.doubts)
-    assert found.after == found.rfid_consistency.trial.scores
+    assert found_in_one.rig.rfid.tempering == pytest.approx(found_in_one.knowledge.rfid.share)
+    assert found_in_one.rfid_consistency.trial.causal < 0.5
+    assert not any("consistent" in doubt for doubt in found_in_one.doubts)
+    assert found_in_one.after == found_in_one.rfid_consistency.trial.scores
 
 
-def test_a_rig_without_a_model_is_not_scored(logs, found, tmp_path):
-    """Read from a file or not: its default model tells nothing."""
+def test_a_rig_without_a_model_is_not_scored(found, found_in_one):
     assert len(found.before) == 2
-    path = tmp_path / "places.rig.toml"
-    write_rig(logs[0].rig.model_copy(update={"rfid": RfidSettings(antennas=logs[0].rig.rfid.antennas)}), path)
-    assert calibrate(logs[:1], evaluate, read_rig(path), grids=tmp_path / "cart").before == ()
+    assert found_in_one.before == ()
 
 
 def test_the_document_holds_plain_numbers(found):
