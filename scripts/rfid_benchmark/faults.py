@@ -16,7 +16,7 @@ from factorgraph_loc.simulation.settings import preset
 from factors import se2
 from rfid_benchmark.report import Options, Report, pooled
 
-SEEDS = 10
+SEEDS = 5
 FIRST = 2000
 DURATION = 300.0  # s
 CONFIGS = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}

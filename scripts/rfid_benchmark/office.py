@@ -10,14 +10,12 @@ from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation.settings import preset
 from rfid_benchmark.report import Options, Report, pooled, ratio_cells, together
 
-SEEDS = 100
-PRESETS = ("office", "sparse", "bursty")
-CONFIGS = {
-    "particle filter": RunConfig("particle_filter"),
-    "smoother": RunConfig("smoother"),
-    "particle filter, constants as noise": RunConfig("particle_filter", {"self_calibration": False}),
-    "smoother, constants as noise": RunConfig("smoother", {"self_calibration": False}),
+NOISE = ", constants as noise"
+STATES = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}
+BOTH = STATES | {
+    label + NOISE: RunConfig(config.estimator, {"self_calibration": False}) for label, config in STATES.items()
 }
+PRESETS = {"office": (24, BOTH), "sparse": (20, BOTH), "bursty": (10, STATES)}  # number of worlds, runs in each
 # causal RMSE m, heading degrees, final RMSE m, heading degrees, final p95 m of a reference implementation
 ANCHORS = {
     ("office", "with the constants as states"): ("0.089", "2.2", "0.052", "1.3", "0.092"),
@@ -29,13 +27,13 @@ Found = dict[str, list[RunErrors]]  # of each configuration, one a seed
 
 def section(options: Options) -> Report:
     report = Report("office", options)
-    count = options.count(SEEDS)
     found: dict[str, Found] = {}
-    for name in PRESETS:
-        jobs = [EnsembleJob(preset(name), seed, CONFIGS) for seed in range(count)]
+    for name, (usual, configs) in PRESETS.items():
+        count = options.count(usual)
+        jobs = [EnsembleJob(preset(name), seed, configs) for seed in range(count)]
         outcomes = report.collect(run_ensemble, jobs, [f"{name} {seed}" for seed in range(count)])
         if outcomes:
-            found[name] = {label: [outcomes[i][label] for i in sorted(outcomes)] for label in CONFIGS}
+            found[name] = {label: [outcomes[i][label] for i in sorted(outcomes)] for label in configs}
             single = [
                 (i, label, *pooled([one.causal]), *pooled([one.final]))
                 for i, outcome in sorted(outcomes.items())
@@ -43,8 +41,9 @@ def section(options: Options) -> Report:
             ]
             heads = ("seed", "estimator", "causal_m", "causal_deg", "final_m", "final_deg")
             report.figures(name, heads, single)
+    worlds = ", ".join(f"{len(runs['smoother'])} worlds of {name}" for name, runs in found.items())
     report.say(
-        f"{count} worlds of each preset, 10 min each, pooled. *Inside*: share of times at which ANEES over runs is in its band"
+        f"{worlds}, 10 min each, pooled. *Inside*: share of times at which ANEES over worlds is in its 95 % band"
     )
     accuracy(report, found)
     report.say("Ratios of position RMSE, pooled, with 95 % interval over worlds, and the largest of a single world")
@@ -71,7 +70,7 @@ def accuracy(report: Report, found: dict[str, Found]) -> None:
 def ratios(report: Report, found: dict[str, Found]) -> None:
     rows = []
     for name, runs in found.items():
-        for suffix in ("", ", constants as noise"):
+        for suffix in ("", NOISE) if f"smoother{NOISE}" in runs else ("",):
             smoother, particles = runs[f"smoother{suffix}"], runs[f"particle filter{suffix}"]
             causal = [[one.causal for one in members] for members in (smoother, particles)]
             final = [[one.final for one in members] for members in (smoother, particles)]

@@ -21,7 +21,7 @@ FILTERS = {
 }
 SMOOTHERS = {
     "smoother": RunConfig("smoother"),
-    "particle smoother": RunConfig("particle_filter", {"smoothing_trajectories": 400, "smoothing_interval": 0.5}),
+    "particle smoother": RunConfig("particle_filter", {"smoothing_trajectories": 200, "smoothing_interval": 0.5}),
 }
 
 
@@ -43,7 +43,7 @@ def section(options: Options) -> Report:
     outcomes = report.collect(run_ensemble, jobs, [f"office {i}" for i in range(offices)])
     report.say(
         f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
-        "and 400 trajectories drawn backwards, with the same states"
+        "and 200 trajectories drawn backwards, with the same states"
     )
     finals = {label: [outcomes[i][label].final for i in sorted(outcomes)] for label in SMOOTHERS}
     table(report, finals, "particle smoother")
