@@ -22,7 +22,7 @@ Array32 = NDArray[np.float32]
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
 STEP = 0.01  # of the logit, in the tables of logarithms
-LEVEL = 0.01  # m: tags at the same height, to so much, share a table
+LEVEL = 0.04  # m: tags at the same height, to so much, share a table
 
 
 class Tables(NamedTuple):
