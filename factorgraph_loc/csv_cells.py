@@ -68,14 +68,15 @@ def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
 
 
 def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
-    """The first of ``shapes`` whose columns are all in ``header``; InputError if there is none."""
+    """The one of ``shapes`` that has most columns in ``header``, of several the first that has all of its columns there.
+
+    InputError if it lacks one: it is what was meant, even if a poorer one is complete.
+    """
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
-    for shape in shapes:
-        if set(shape) <= set(header):
-            return shape
-    # the shape that is meant is the one with most of its columns there
-    meant = max(shapes, key=lambda shape: len(set(shape) & set(header)))
+    meant = max(shapes, key=lambda shape: (len(set(shape) & set(header)), set(shape) <= set(header)))
+    if set(meant) <= set(header):
+        return meant
     missing = next(column for column in meant if column not in header)
     hint = nearest(missing, [column for column in header if column not in meant])
     expected = " or ".join(",".join(shape) for shape in shapes)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from factorgraph_loc.calibration.phase import PhaseFit
 from factorgraph_loc.calibration.rfid_choice import Kind, fit
@@ -156,9 +157,10 @@ def alternated(
 
 
 def _clear(found: Placing) -> tuple[Place, ...]:
-    """The constants that are beyond twice their error, that of a model of detection included."""
+    """The constants that are clearly beyond their error, that of a model of detection included: by chance one of all of them
+    would be in one calibration of twenty."""
     blind = np.array([BLIND[p.name] for p in found.places])
-    clear = np.abs(found.changes) > 2.0 * np.hypot(found.errors, blind)
+    clear = np.abs(found.changes) > norm.isf(0.025 / len(blind)) * np.hypot(found.errors, blind)
     return tuple(p for p, c in zip(found.places, clear, strict=True) if c)
 
 

@@ -23,6 +23,8 @@ COLUMNS = {
     "update [ms]": ("timing.update_ms_median", 2, False),
     "x real time": ("timing.real_time_factor", 0, False),
 }
+# after an unknown start
+SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
 BASELINE = "dead_reckoning"
 ALIKE = 0.01  # share by which errors may differ without one being called the least alone
@@ -35,24 +37,26 @@ def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
     RMSEs are pooled over seeds (root of the mean square), the rest is averaged; with several seeds the standard deviation over them
     follows after ±. The last lines pool each estimator over the logs, each log counted once; ``runs`` says how many of
-    the runs went well, and a pooled line with fewer than all says nothing about the others.
+    the runs went well, and a pooled line with fewer than all says nothing about the others. How long it took to find the place is
+    a column where that took any time.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
+    columns = {**SINCE_THE_START, **COLUMNS} if any(row.get("time_to_localized") for row in rows) else COLUMNS
     lines = []
     for log in logs:
         for name in names:
             runs = [r for r in rows if r["log"] == log and r["estimator"] == name]
             if runs:
-                cells = [_cell([_figure(r, key) for r in runs], digits, rms) for key, digits, rms in COLUMNS.values()]
+                cells = [_cell([_figure(r, key) for r in runs], digits, rms) for key, digits, rms in columns.values()]
                 lines.append([log, name, *cells, _went_well(runs)])
     if len(logs) > 1:
         for name in names:
             runs = [r for r in rows if r["estimator"] == name]
             by_log = [[r for r in runs if r["log"] == log] for log in logs]
-            cells = [_pooled(key, digits, rms, by_log) for key, digits, rms in COLUMNS.values()]
+            cells = [_pooled(key, digits, rms, by_log) for key, digits, rms in columns.values()]
             lines.append([ALL, name, *cells, _went_well(runs)])
-    return ["log", "estimator", *COLUMNS, "runs"], lines
+    return ["log", "estimator", *columns, "runs"], lines
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:

@@ -19,7 +19,7 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate, PosePrior
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
 from factorgraph_loc.files import nearest
@@ -106,7 +106,13 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
         learnt=estimator.learnt(),
         timings=loop.timings(final_seconds),
         versions=versions,
-        warnings=(*log.warnings, *_doubts(log, sensors), *unread, *_never_localized(log, loop.estimates, final)),
+        warnings=(
+            *log.warnings,
+            *_doubts(log, sensors),
+            *unread,
+            *_without_tags(log, config.estimator, estimator.diagnostics),
+            *_never_localized(log, loop.estimates, final),
+        ),
     )
 
 
@@ -268,6 +274,13 @@ def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     if "odometry" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
+
+
+def _without_tags(log: Log, estimator: str, diagnostics: Diagnostics) -> tuple[str, ...]:
+    rounds = diagnostics.ignored.get("rfid", 0)
+    if not rounds or estimator == "dead_reckoning":  # which says so by its name
+        return ()
+    return (f"{log.name}: {estimator} takes no tags: all {rounds} inventory rounds are ignored",)
 
 
 def _never_localized(log: Log, estimates: Sequence[PoseEstimate], final: Trajectory) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from factorgraph_loc.log import (
 )
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.manifests import StartSettings
-from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, READS_IN_INVENTORIES, read_rounds, tables_of
+from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, read_rounds, tables_of
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rfid_settings import RfidSettings
@@ -43,7 +43,7 @@ SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
     "odometry": (VELOCITIES, INCREMENTS),
     "imu": (("t_ns", "w"),),
     "bearing_range": (("t_ns", "landmark", "range", "bearing"),),
-    "rfid": (READS_IN_INVENTORIES, READS),
+    "rfid": READS,
     "inventories": (INVENTORIES,),  # of the sensor rfid too
 }
 ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default

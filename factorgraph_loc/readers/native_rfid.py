@@ -25,8 +25,9 @@ from factorgraph_loc.readers.tables import Table
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
-READS = ("t_ns", "antenna", "epc", "rssi", "phase", "frequency")
-READS_IN_INVENTORIES = (*READS, "inventory")
+_READ = ("t_ns", "antenna", "epc")
+_SIGNALS = (("rssi", "phase", "frequency"), ("rssi",), ())  # what readers tell of a read
+READS = tuple((*_READ, *signals, *told) for signals in _SIGNALS for told in (("inventory",), ()))
 INVENTORIES = ("t_ns", "antenna", "duration")
 MAX_DURATION = 3600.0  # s
 FREQUENCIES = (1e8, 1e10)  # Hz
@@ -113,11 +114,14 @@ def _told(reads: Table, end_ns: Integers, antenna: list[str]) -> Integers:
 
 def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
     epc = [reads.names["epc"][i] for i in rows.tolist()]
-    rssi, phase, frequency = (reads.numbers[name][rows] for name in ("rssi", "phase", "frequency"))
+    unknown = np.full(len(reads.t_ns), np.nan)
+    rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
     return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
 def _check_reads(reads: Table) -> None:
+    if "phase" not in reads.numbers:
+        return
     phase, frequency = reads.numbers["phase"], reads.numbers["frequency"]
     low, high = FREQUENCIES
     for name, values, bad, expected in (

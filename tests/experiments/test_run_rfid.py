@@ -10,6 +10,7 @@ from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import RfidStream
 from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.world import Tag
 
 ALL = ("odometry", "rfid", "rssi", "phase")
@@ -95,3 +96,9 @@ def test_a_log_of_tags_alone_that_never_tells_the_place_says_so_of_tags(reading)
     stream = replace(reading.streams["rfid"], epc=["x", "x"])
     unread = run(replace(alone, streams=dict(reading.streams) | {"rfid": stream}), config)
     assert unread.warnings[-1] == "straight: never localized: no tag of the map was read"
+
+
+def test_an_estimator_without_tags_says_so():
+    log = simulate(preset("office", {"drive": {"duration": 60.0}}), 0)
+    (warning,) = set(run(log, RunConfig("ekf")).warnings) - set(run(log, RunConfig("dead_reckoning")).warnings)
+    assert warning == f"{log.name}: ekf takes no tags: all 960 inventory rounds are ignored"
