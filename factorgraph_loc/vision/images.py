@@ -19,9 +19,9 @@ MIN_SIDE = 16  # px: below it no patch around a point fits, and an image has no 
 def as_image(array: object, source: object = "image") -> Image:
     """``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA as ``uint8``, (H, W) or (H, W, 3), rows contiguous.
 
-    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. ``source`` is named in the
-    InputError if it is no image: empty, of another shape or type, with values that are not finite or out of range.
-    """
+    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. ``source``
+    is named in the InputError if it is no image: empty, of another shape or type, with values that are not finite or
+    out of range."""
     if not isinstance(array, np.ndarray):
         raise InputError(f"{source}: is {type(array).__name__}, expected an array of pixels")
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (1, 3, 4)):
@@ -45,8 +45,8 @@ def as_image(array: object, source: object = "image") -> Image:
 
 
 def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
-    """``mask`` (H, W) of truth values or ``uint8`` as ``uint8``, not 0 where features are wanted; None is everywhere. InputError if
-    it is of another type, or of another size than ``image``."""
+    """``mask`` (H, W) of truth values or ``uint8`` as ``uint8``, not 0 where features are wanted; None is everywhere.
+    InputError if it is of another type, or of another size than ``image``."""
     if mask is None:
         return None
     if not isinstance(mask, np.ndarray) or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):

@@ -1,0 +1,126 @@
+"""What the colour features look like: the paper's 2 space, 21 scale, 5 orientation and 9 texture values.
+
+All is measured on E in a point's own frame and in units of its own scale: on a lattice of 24 x 24 samples, by one
+product with a matrix of filters. The paper's neighbours are a cross of four places around the point; each of the four
+scales has a cross of its own size, as coarse structure is seen farther out. Algorithm 1 and figure 2 of Raoui,
+Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor's wavelets: Daugman, J.
+Opt. Soc. Am. A 2(7), 1985."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.vision.colour import Float
+from factorgraph_loc.vision.keypoints import Keypoints
+from factorgraph_loc.vision.scale_space import ScaleSpace
+from factors.se2 import Array
+
+# the first place is the point, the others are a cross; all but position and scale are without units
+RECORD = np.dtype(
+    [
+        ("position", np.float32, 2),  # x, y [px]
+        ("scale_responses", np.float32, (5, 4)),  # Laplacian of Gaussian at each place and scale
+        ("scale", np.float32),  # [px]
+        ("orientation", np.float32, 5),  # of the gradient at each place, from the point's direction [rad], in (-pi, pi]
+        ("texture", np.float32, (3, 3)),  # magnitude of the Gabor wavelet of each wavelength and direction
+    ]
+)
+VALUES = 35  # of the distance: all but the position
+
+# in units of a point's scale
+SIDE = 24
+LOG_SCALES = (1.6, 1.8, 4.5, 4.7)
+LOG_ARMS = (2.5, 3.7, 4.0, 9.6)
+GRADIENT_SCALE = 3.2
+GRADIENT_ARM = 6.0
+WAVELENGTHS = (4.0, 7.0, 12.0)
+ENVELOPE = 0.4  # standard deviation over wavelength
+
+_FLAT = 1e-6  # grey levels: norm of a patch's responses below which it has none
+
+
+def records(space: ScaleSpace, keypoints: Keypoints) -> NDArray[np.void]:
+    """The values of :data:`RECORD` (N,) of points with directions in the image that ``space`` is filled with."""
+    sigmas = keypoints.sizes / 2.0
+    answers = space.patches(keypoints.points, sigmas, keypoints.angles, _LATTICE) @ _FILTERS
+    result = np.empty(len(keypoints), dtype=RECORD)
+    result["position"] = keypoints.points
+    result["scale"] = sigmas
+    result["scale_responses"] = answers[:, :20].reshape(-1, 5, 4)
+    gradients = answers[:, 20:30].reshape(-1, 5, 2)
+    result["orientation"] = np.arctan2(gradients[:, :, 1], gradients[:, :, 0])
+    wavelets = answers[:, 30:].reshape(-1, 3, 3, 2)
+    result["texture"] = np.hypot(wavelets[..., 0], wavelets[..., 1])
+    return result
+
+
+def values(record: NDArray[np.void]) -> Float:
+    """The 35 values (N, 35) of records (N,), each block without units: responses and textures divided by their norm,
+    which takes out contrast; scale in octaves; the sine of the orientations, which has no seam where an angle
+    wraps."""
+    responses = record["scale_responses"].reshape(-1, 20)
+    texture = record["texture"].reshape(-1, 9)
+    return np.hstack(
+        [_unit(responses), np.log2(record["scale"])[:, None], np.sin(record["orientation"]), _unit(texture)]
+    ).astype(np.float32)
+
+
+def _unit(block: Float) -> Float:
+    return np.asarray(block / np.maximum(np.linalg.norm(block, axis=1, keepdims=True), _FLAT), dtype=np.float32)
+
+
+def _cross(arm: float) -> Array:
+    """The point and its four neighbours (5, 2), on the diagonals of its frame."""
+    angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4.0)
+    return np.vstack([np.zeros(2), arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)])
+
+
+def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
+    """The blur (M,) that makes the plane of a point one of ``scale``, around ``centre`` (2,); places from there (M,
+    2); its variance."""
+    variance = scale**2 - 1.0
+    away = _LATTICE - centre
+    return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance
+
+
+def _laplacian(scale: float, centre: Array) -> Array:
+    window, away, variance = _gaussian(scale, centre)
+    response = scale**2 * ((away**2).sum(axis=1) / variance - 2.0) / variance * window
+    # on a lattice, and cut at its border, the sum is not zero: brightness would count
+    return np.asarray(response - window * (response.sum() / window.sum()))
+
+
+def _gradient(scale: float, centre: Array) -> list[Array]:
+    window, away, variance = _gaussian(scale, centre)
+    slopes = [scale * away[:, axis] / variance * window for axis in (0, 1)]
+    return [slope - window * (slope.sum() / window.sum()) for slope in slopes]
+
+
+def _gabor(wavelength: float, angle: float) -> list[Array]:
+    """Real and imaginary part of a wavelet, the real one without mean."""
+    x, y = _LATTICE.T
+    window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
+    window /= window.sum()
+    phase = 2.0 * np.pi / wavelength * (x * np.cos(angle) + y * np.sin(angle))
+    even = window * np.cos(phase)
+    return [even - window * even.sum(), window * np.sin(phase)]
+
+
+def _filters() -> Float:
+    columns = [
+        _laplacian(scale, _cross(arm)[place])
+        for place in range(5)
+        for scale, arm in zip(LOG_SCALES, LOG_ARMS, strict=True)
+    ]
+    for centre in _cross(GRADIENT_ARM):
+        columns += _gradient(GRADIENT_SCALE, centre)
+    for wavelength in WAVELENGTHS:
+        for turn in range(3):
+            columns += _gabor(wavelength, turn * np.pi / 3.0)
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+_arm = np.arange(SIDE) - (SIDE - 1) / 2.0
+_LATTICE: Float = np.stack(np.meshgrid(_arm, _arm), axis=-1).reshape(-1, 2).astype(np.float32)
+_FILTERS = _filters()

@@ -1,0 +1,121 @@
+"""Where the colour features are: corners of colour at their characteristic scales, with a direction.
+
+Colour Harris: the second moment matrix of Harris and Stephens ("A combined corner and edge detector", 1988) summed
+over the channels of the Gaussian colour model, with a derivative and an integration scale (Mikolajczyk, Schmid,
+"Scale & affine invariant interest point detectors", IJCV 60, 2004, eq. 1); a corner stays at the scale where the
+normalised Laplacian of Gaussian is largest (ibid., section 2.1). Direction: the peak of a histogram of gradients
+(Lowe, "Distinctive image features", IJCV 60, 2004, section 5). Spread: a weaker corner near a stronger one of its
+scale waits (Brown, Szeliski, Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section
+2.1)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.vision.colour import Float
+from factorgraph_loc.vision.images import Mask
+from factorgraph_loc.vision.kernels import (
+    Int32,
+    corner_strength,
+    orientation_histograms,
+    refined_peaks,
+    spread,
+    structure_tensor,
+)
+from factorgraph_loc.vision.keypoints import Keypoints
+from factorgraph_loc.vision.scale_space import CAMERA_BLUR, SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
+from factors.se2 import Array
+
+INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken at the scale below
+WEAKEST = 1.0  # squared grey levels: a weaker corner is noise of the camera
+BORDER = 4  # pixels of an octave: nearer to the border half of a corner is made up
+CLEARANCE = 2.0  # in units of a point's scale: nearer to a stronger one it waits
+
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+
+ORIENTATION_SIDE = 17
+ORIENTATION_SPACING = 0.65  # in units of a point's scale
+ORIENTATION_WINDOW = 2.25  # standard deviation of the weight, in the same
+ORIENTATION_BINS = 36
+
+_arm = ORIENTATION_SPACING * (np.arange(ORIENTATION_SIDE) - ORIENTATION_SIDE // 2)
+_grid = np.stack(np.meshgrid(_arm, _arm), axis=-1)
+_OFFSETS: Float = _grid.reshape(-1, 2).astype(np.float32)
+_WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTATION_WINDOW**2)).astype(np.float32)
+
+
+def detect(space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int) -> Keypoints:
+    """At most ``count`` points, by falling strength, of the image that ``space`` is filled with, where ``mask`` (H,
+    W) is not 0; ``colours``: its channels (H, W) beside E."""
+    corners = np.vstack(_corners(space, colours))
+    if mask is not None:
+        x, y = np.rint(corners[:, :2]).astype(np.int64).T
+        corners = corners[mask[y, x] > 0]
+    corners = corners[np.argsort(-corners[:, 3], kind="stable")]
+    places, scales = corners[:, :2].astype(np.float32), corners[:, 2].astype(np.float32)
+    corners = corners[spread(places, scales, CLEARANCE, STEP, count)]
+    points, sigmas = corners[:, :2], corners[:, 2]
+    angles = orientations(space, points, sigmas)
+    return Keypoints(points, 2.0 * sigmas, angles, corners[:, 3], space.levels(sigmas))
+
+
+def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
+    """The dominant direction (N,) [rad], in (-pi, pi], of E around ``points`` (N, 2) at scales ``sigmas`` (N,), both
+    in px."""
+    patches = space.patches(points, sigmas, np.zeros(len(points)), _OFFSETS)
+    histograms = np.zeros((len(points), ORIENTATION_BINS), dtype=np.float32)
+    orientation_histograms(patches, ORIENTATION_SIDE, _WEIGHTS, histograms)
+    for _ in range(2):
+        histograms = 0.25 * np.roll(histograms, 1, axis=1) + 0.5 * histograms + 0.25 * np.roll(histograms, -1, axis=1)
+    best = histograms.argmax(axis=1)
+    before, peak, after = (
+        np.take_along_axis(histograms, ((best + i) % ORIENTATION_BINS)[:, None], axis=1)[:, 0].astype(float)
+        for i in (-1, 0, 1)
+    )
+    bend = before - 2.0 * peak + after
+    shift = np.divide(0.5 * (before - after), bend, out=np.zeros(len(points)), where=bend < 0.0)
+    turns = (best + shift) / ORIENTATION_BINS
+    return np.asarray(2.0 * np.pi * (turns - np.ceil(turns - 0.5)), dtype=float)
+
+
+def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
+    """Of each characteristic scale its corners (N, 4): x and y [px], scale [px], strength."""
+    found = []
+    for o, octave in enumerate(space.octaves):
+        if o > 0:
+            octave.colours[:] = space.octaves[o - 1].colours[:, ::2, ::2]
+        else:
+            for source, plane in zip(colours, octave.colours, strict=True):
+                blur(source, plane, more_blur(CAMERA_BLUR, SIGMAS[0]))
+        for i in range(1, SCALES + 1):
+            _strengths(octave, i)
+            found.append(_peaks(octave, i))
+            for plane in octave.colours:
+                blur(plane, plane, more_blur(SIGMAS[i - 1], SIGMAS[i]))
+    return found
+
+
+def _strengths(octave: Octave, i: int) -> None:
+    """Harris' measure at scale ``i`` of an octave whose colours are at scale ``i - 1``."""
+    structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
+    for product in octave.products:
+        blur(product, product, INTEGRATION * SIGMAS[i])
+    corner_strength(octave.products, np.float32(SIGMAS[i - 1] ** 2), octave.strength)
+
+
+def _peaks(octave: Octave, i: int) -> Array:
+    """The corners (N, 4) of scale ``i`` of an octave, as of :func:`_corners`."""
+    inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+    cv2.dilate(octave.strength, _NEIGHBOURS, dst=octave.largest)
+    found = cv2.findNonZero(cv2.compare(octave.strength[inner], octave.largest[inner], cv2.CMP_EQ))
+    pixels: Int32 = np.empty((0, 2), dtype=np.int32)
+    if found is not None:
+        pixels = (found.reshape(-1, 2) + BORDER).astype(np.int32)
+    peaks = np.empty((len(pixels), 4))
+    around = slice(i - 1, i + 2)
+    count = refined_peaks(octave.strength, WEAKEST, octave.planes[around], SIGMAS[around] ** 2, pixels, peaks)
+    peaks = peaks[:count]
+    peaks[:, :2] *= octave.step
+    peaks[:, 2] = SIGMAS[i] * octave.step * STEP ** peaks[:, 2]
+    return peaks

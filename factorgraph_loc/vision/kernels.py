@@ -1,0 +1,195 @@
+"""Compiled loops of the colour features: where numpy would write many images to memory, one pass reads and writes
+each once.
+
+Everything is ``float32``, as half the memory is half the time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.vision.colour import Float
+from factors.se2 import Array
+
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+HALF = np.float32(0.5)
+TINY = np.float32(1e-6)  # keeps a quotient finite where an image is flat
+MAX_SHIFT = 0.7  # px: a peak that is farther from the pixel that is largest is not a paraboloid's
+FAST = {"contract", "reassoc"}
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
+    """Sums over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to
+    ``products`` (3, H, W): xx, xy, yy.
+
+    Derivatives are central differences, halved in the first and last row, 0 in the first and last column.
+    """
+    height, width = intensity.shape
+    xx, xy, yy = products[0], products[1], products[2]
+    for y in range(height):
+        up, down = max(y - 1, 0), min(y + 1, height - 1)
+        row, above, below = intensity[y], intensity[up], intensity[down]
+        xx[y, 0] = xy[y, 0] = xx[y, width - 1] = xy[y, width - 1] = 0.0
+        yy[y, 0] = yy[y, width - 1] = 0.0
+        for x in range(1, width - 1):
+            dx, dy = HALF * (row[x + 1] - row[x - 1]), HALF * (below[x] - above[x])
+            xx[y, x], xy[y, x], yy[y, x] = dx * dx, dx * dy, dy * dy
+        for c in range(len(colours)):
+            row, above, below = colours[c, y], colours[c, up], colours[c, down]
+            for x in range(1, width - 1):
+                dx, dy = HALF * (row[x + 1] - row[x - 1]), HALF * (below[x] - above[x])
+                xx[y, x] += dx * dx
+                xy[y, x] += dx * dy
+                yy[y, x] += dy * dy
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
+    """Half the harmonic mean of the eigenvalues of the second moment matrix, times ``scale``: determinant over trace.
+
+    ``products`` (3, H, W): its elements xx, xy, yy; written to ``strength`` (H, W).
+    """
+    xx, xy, yy = products[0], products[1], products[2]
+    height, width = strength.shape
+    for y in range(height):
+        for x in range(width):
+            a, b, c = xx[y, x], xy[y, x], yy[y, x]
+            strength[y, x] = scale * (a * c - b * b) / (a + c + TINY)
+
+
+@numba.njit(cache=True)
+def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
+    """The largest magnitude of the Laplacian, times ``weight``, at a pixel and its eight neighbours."""
+    largest = 0.0
+    for v in range(y - 1, y + 2):
+        for u in range(x - 1, x + 2):
+            value = plane[v, u - 1] + plane[v, u + 1] + plane[v - 1, u] + plane[v + 1, u] - 4.0 * plane[v, u]
+            largest = max(largest, abs(value))
+    return largest * weight
+
+
+@numba.njit(cache=True)
+def refined_peaks(
+    strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
+) -> int:
+    """Which of ``pixels`` (N, 2), x and y of local maxima of ``strength`` (H, W), are maxima over scale too, and
+    where exactly.
+
+    A pixel stays if its strength is above ``threshold`` and the normalised Laplacian of the middle one of ``planes``
+    (3, H, W), of ``variances`` (3,), is the largest of the three; a neighbouring pixel may stand in for it. Written
+    to ``peaks`` (N, 4): x and y, by a paraboloid through the 3x3 strengths; steps of scale from the middle plane, by
+    a parabola; strength. Returns their number."""
+    count = 0
+    for n in range(len(pixels)):
+        x, y = pixels[n]
+        value = strength[y, x]
+        if value <= threshold:
+            continue
+        middle = _laplacian_near(planes[1], y, x, variances[1])
+        below = _laplacian_near(planes[0], y, x, variances[0])
+        if below > middle:
+            continue
+        above = _laplacian_near(planes[2], y, x, variances[2])
+        if above > middle:
+            continue
+        dx, dy = 0.5 * (strength[y, x + 1] - strength[y, x - 1]), 0.5 * (strength[y + 1, x] - strength[y - 1, x])
+        dxx = strength[y, x + 1] + strength[y, x - 1] - 2.0 * value
+        dyy = strength[y + 1, x] + strength[y - 1, x] - 2.0 * value
+        dxy = 0.25 * (strength[y + 1, x + 1] + strength[y - 1, x - 1] - strength[y + 1, x - 1] - strength[y - 1, x + 1])
+        determinant = dxx * dyy - dxy * dxy
+        shift_x = shift_y = 0.0
+        if determinant > 0.0:
+            shift_x = (dxy * dy - dyy * dx) / determinant
+            shift_y = (dxy * dx - dxx * dy) / determinant
+        bend = below - 2.0 * middle + above
+        peaks[count, 0] = x + min(max(shift_x, -MAX_SHIFT), MAX_SHIFT)
+        peaks[count, 1] = y + min(max(shift_y, -MAX_SHIFT), MAX_SHIFT)
+        peaks[count, 2] = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
+        peaks[count, 3] = value
+        count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def spread(points: Float, scales: Float, reach: float, alike: float, count: int) -> Int64:
+    """Indices of ``count`` of the points (N, 2), which come by falling strength, that have no stronger one near by.
+
+    Near by: nearer than ``reach`` times their own of the ``scales`` (N,), and with a scale that differs by a factor
+    of at most ``alike``. If they are too few, the strongest of the others fill up."""
+    total = len(points)
+    first = np.empty(min(count, total), dtype=np.int64)
+    crowded = np.empty(total, dtype=np.int64)
+    free = others = 0
+    for n in range(total):
+        if free == len(first):
+            break
+        radius = (reach * scales[n]) ** 2
+        alone = True
+        for m in range(n):
+            ratio = scales[m] / scales[n]
+            if ratio <= alike and ratio * alike >= 1.0:
+                dx, dy = points[m, 0] - points[n, 0], points[m, 1] - points[n, 1]
+                if dx * dx + dy * dy < radius:
+                    alone = False
+                    break
+        if alone:
+            first[free] = n
+            free += 1
+        else:
+            crowded[others] = n
+            others += 1
+    missing = min(len(first) - free, others)
+    first[free : free + missing] = crowded[:missing]
+    return np.sort(first[: free + missing])
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
+    """Bilinear samples of patches around points, each in its own frame, of its own plane.
+
+    ``planes`` (T,): all planes one behind the other, row by row; ``starts`` (N,), ``shapes`` (N, 2): where the plane
+    of a point begins, its height and width. ``frames`` (N, 4): x and y of a point in its plane [px], and the vector
+    (a, b) [px] that its frame's x axis has there. ``offsets`` (M, 2): sampled places in the frame. Beyond the border
+    the nearest pixel counts. Written to ``patches`` (N, M)."""
+    for n in range(len(frames)):
+        start, height, width = starts[n], shapes[n, 0], shapes[n, 1]
+        px, py, a, b = frames[n, 0], frames[n, 1], frames[n, 2], frames[n, 3]
+        right, bottom = np.float32(width - 1), np.float32(height - 1)
+        for m in range(len(offsets)):
+            u, v = offsets[m, 0], offsets[m, 1]
+            x = min(max(px + a * u - b * v, np.float32(0.0)), right)
+            y = min(max(py + b * u + a * v, np.float32(0.0)), bottom)
+            column, row = min(int(x), width - 2), min(int(y), height - 2)
+            fx, fy = x - np.float32(column), y - np.float32(row)
+            at = start + row * width + column
+            top = planes[at] + fx * (planes[at + 1] - planes[at])
+            low = planes[at + width] + fx * (planes[at + width + 1] - planes[at + width])
+            patches[n, m] = top + fy * (low - top)
+
+
+@numba.njit(cache=True)
+def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
+    """Histograms of the gradient's direction in patches (N, side * side): each gradient counts with its length times
+    ``weights`` (side - 2, side - 2), shared between the two nearest bins. Added to ``histograms`` (N, bins), bin 0 at
+    direction 0."""
+    bins = histograms.shape[1]
+    per_radian = np.float32(bins / (2.0 * math.pi))
+    for n in range(len(patches)):
+        for y in range(1, side - 1):
+            for x in range(1, side - 1):
+                at = y * side + x
+                dx = patches[n, at + 1] - patches[n, at - 1]
+                dy = patches[n, at + side] - patches[n, at - side]
+                length = math.sqrt(dx * dx + dy * dy) * weights[y - 1, x - 1]
+                place = (math.atan2(dy, dx) * per_radian + bins) % bins
+                low = int(place)
+                share = (place - low) * length
+                histograms[n, low % bins] += length - share
+                histograms[n, (low + 1) % bins] += share

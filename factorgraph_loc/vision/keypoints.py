@@ -1,0 +1,88 @@
+"""What every kind of feature has in common: points as arrays, and the interface that finds and describes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.se2 import Array
+
+Integers = NDArray[np.int64]
+Descriptors = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """N points of an image, as arrays.
+
+    ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for
+    SIFT and the colour features twice the standard deviation of the Gaussian scale at which a point was found, for
+    ORB its patch; within one feature the region that a point stands for is a fixed multiple of it. ``angles`` (N,)
+    [rad]: direction ``atan2(dy, dx)`` with y down; NaN where a point has none. ``responses`` (N,): strength,
+    comparable within one image and one extractor. ``levels`` (N,): the level of the scale that a point was found at;
+    for OpenCV's features its packed octave."""
+
+    points: Array
+    sizes: Array
+    angles: Array
+    responses: Array
+    levels: Integers
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: Any) -> Keypoints:
+        """The points of an index array, a truth array or a slice."""
+        return Keypoints(
+            self.points[index], self.sizes[index], self.angles[index], self.responses[index], self.levels[index]
+        )
+
+    @classmethod
+    def empty(cls) -> Keypoints:
+        return cls(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+
+    @classmethod
+    def from_cv2(cls, keypoints: Sequence[cv2.KeyPoint]) -> Keypoints:
+        """OpenCV's points, degrees as radians; its angle of -1 means none."""
+        if not keypoints:
+            return cls.empty()
+        rows = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], dtype=float)
+        angles = np.where(rows[:, 3] < 0.0, np.nan, np.radians(rows[:, 3]))
+        levels = np.array([k.octave for k in keypoints], dtype=np.int64)
+        return cls(rows[:, :2], rows[:, 2], angles, rows[:, 4], levels)
+
+    def to_cv2(self) -> list[cv2.KeyPoint]:
+        """The same points as OpenCV has them; ``class_id`` is the index of a point."""
+        degrees = np.where(np.isnan(self.angles), -1.0, np.degrees(self.angles) % 360.0)
+        columns = (*self.points.T, self.sizes, degrees, self.responses, self.levels, np.arange(len(self)))
+        return list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
+
+
+class Extractor(Protocol):
+    """Detector and descriptor of one kind of feature.
+
+    Images and masks are what :func:`~factorgraph_loc.vision.images.as_image` and ``as_mask`` take, which raise
+    InputError on others; an image that is blank or below 16 px has no features. At most ``count`` of them are given,
+    the strongest first."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def binary(self) -> bool:
+        """Whether descriptors are bits, (N, bytes) ``uint8``, compared by Hamming distance, and not (N, D)
+        ``float32`` by the Euclidean one."""
+
+    def detect(self, image: object, mask: object = None) -> Keypoints:
+        """The points of ``image`` where ``mask`` (H, W) is not 0."""
+
+    def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
+        """Those of ``keypoints`` that can be described, and the descriptors of each."""
+
+    def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
+        """:meth:`detect` and :meth:`compute` in one."""
