@@ -1,0 +1,120 @@
+"""Matching, against its definition in plain loops, and on descriptors of which the answer is known."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.vision.matching import Matches, distance_matrix, gates, match, match_guided
+
+
+def by_definition(distances: np.ndarray, ratio: float, mutual: bool) -> list[tuple[int, int]]:
+    found = []
+    for i, row in enumerate(distances):
+        j = int(np.argmin(row))
+        second = min((d for k, d in enumerate(row) if k != j), default=np.inf)
+        if row[j] < ratio * second and (not mutual or np.argmin(distances[:, j]) == i):
+            found.append((i, j))
+    return found
+
+
+def pairs(matches: Matches) -> list[tuple[int, int]]:
+    return [tuple(row) for row in matches.indices.tolist()]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 20),
+    m=st.integers(1, 20),
+    ratio=st.sampled_from([0.2, 0.8, 1.0, 5.0]),
+    mutual=st.booleans(),
+)
+def test_matches_are_those_of_the_definition(seed: int, n: int, m: int, ratio: float, mutual: bool) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(n, 3)).astype(np.float32), rng.normal(size=(m, 3)).astype(np.float32)
+    distances = np.linalg.norm(a[:, None].astype(float) - b, axis=2)
+    found = match(a, b, binary=False, ratio=ratio, mutual=mutual)
+    assert pairs(found) == by_definition(distances, ratio, mutual)
+    assert np.allclose(found.distances, distances[tuple(found.indices.T)], atol=2e-3)
+
+
+def test_bits_are_compared_by_how_many_differ() -> None:
+    rng = np.random.default_rng(1)
+    a, b = (rng.integers(0, 256, (n, 32), dtype=np.uint8) for n in (30, 40))
+    expected = np.array([[np.unpackbits(x ^ y).sum() for y in b] for x in a])
+    assert np.array_equal(distance_matrix(a, b, binary=True), expected)
+
+
+def test_noisy_copies_find_their_originals() -> None:
+    rng = np.random.default_rng(2)
+    a = rng.normal(size=(500, 35)).astype(np.float32)
+    order = rng.permutation(500)
+    found = match(a, a[order] + rng.normal(scale=0.1, size=a.shape).astype(np.float32), binary=False)
+    assert len(found) == 500
+    assert np.array_equal(order[found.indices[:, 1]], found.indices[:, 0])
+
+
+def test_two_alike_are_no_match() -> None:
+    a, b = np.zeros((1, 4), dtype=np.float32), np.zeros((2, 4), dtype=np.float32)
+    assert len(match(a, b, binary=False)) == 0
+    assert len(match(a, b[:1], binary=False)) == 1
+
+
+def test_the_papers_ratio_accepts_every_nearest_neighbour() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(50, 5)).astype(np.float32), rng.normal(size=(60, 5)).astype(np.float32)
+    literal = match(a, b, binary=False, paper_literal=True)
+    assert literal.indices[:, 0].tolist() == list(range(50))
+    assert len(match(a, b, binary=False, ratio=0.2, mutual=False)) < len(match(a, b, binary=False)) < len(literal)
+
+
+def test_a_gate_holds_its_probability() -> None:
+    rng = np.random.default_rng(4)
+    mean, covariance = np.array([30.0, 40.0]), np.array([[9.0, 3.0], [3.0, 4.0]])
+    points = rng.multivariate_normal(mean, covariance, 20_000)
+    inside = gates(mean[None], covariance[None], points, 0.9)
+    # five standard deviations of a binomial: wrong once in two million runs
+    assert abs(inside.mean() - 0.9) < 5.0 * np.sqrt(0.9 * 0.1 / 20_000)
+
+
+def test_guided_matching_looks_only_inside_the_gates() -> None:
+    descriptors = np.eye(3, 4, dtype=np.float32)
+    predicted = np.array([[10.0, 10.0], [50.0, 50.0], [np.nan, np.nan]])
+    covariances = np.tile(4.0 * np.eye(2), (3, 1, 1))
+    # the point that looks like the first is far from where the first should be, and one like the second near by
+    points = np.array([[90.0, 90.0], [11.0, 9.0], [49.0, 50.0], [10.0, 12.0]])
+    seen = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0.9, 0, 0], [0.7, 0, 0.5, 0]], dtype=np.float32)
+    free = match(descriptors, seen, binary=False, ratio=1.0)
+    assert pairs(free) == [(0, 0), (1, 1)]
+    guided = match_guided(descriptors, seen, predicted, covariances, points, binary=False)
+    assert pairs(guided) == [(0, 3), (1, 2)]
+
+
+@pytest.mark.parametrize("n", [0, 4])
+def test_nothing_matches_nothing(n: int) -> None:
+    some, none = np.ones((4, 35), dtype=np.float32), np.empty((0, 35), dtype=np.float32)
+    for a, b in ((some[:n], none), (none, some[:n])):
+        found = match(a, b, binary=False)
+        assert len(found) == 0
+        assert found.indices.shape == (0, 2)
+    no_points = np.empty((0, 2))
+    assert len(match_guided(none, none, no_points, np.empty((0, 2, 2)), no_points, binary=False)) == 0
+
+
+def test_bad_input_is_an_error() -> None:
+    floats, bits = np.ones((2, 35), dtype=np.float32), np.ones((2, 32), dtype=np.uint8)
+    with pytest.raises(InputError, match="descriptors have 35 and 128 columns"):
+        match(floats, np.ones((2, 128), dtype=np.float32), binary=False)
+    with pytest.raises(InputError, match=r"first descriptors are float32 of shape \(2, 35\), expected uint8 of"):
+        match(floats, bits, binary=True)
+    with pytest.raises(InputError, match="second descriptors have values that are not finite"):
+        match(floats, np.full((1, 35), np.nan, dtype=np.float32), binary=False)
+    with pytest.raises(InputError, match=r"ratio is 0.0, expected more than 0"):
+        match(floats, floats, binary=False, ratio=0.0)
+    with pytest.raises(InputError, match=r"allowed pairs have shape \(1, 2\), expected \(2, 2\)"):
+        match(floats, floats, binary=False, allowed=np.ones((1, 2), dtype=bool))
+    with pytest.raises(InputError, match=r"covariance 1 is .* expected positive definite"):
+        gates(np.zeros((2, 2)), np.array([np.eye(2), -np.eye(2)]), np.zeros((1, 2)))
+    with pytest.raises(InputError, match=r"probability of a gate is 1.0"):
+        gates(np.zeros((1, 2)), np.eye(2)[None], np.zeros((1, 2)), 1.0)
