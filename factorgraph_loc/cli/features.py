@@ -1,0 +1,51 @@
+"""``fgloc features``: how well point features of images repeat and match."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
+
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images, and how good they are.")
+ALL = "colour,sift,orb,fast_hessian,harris_laplace,hessian_laplace"
+
+
+@app.command()
+def evaluate(
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGES...",
+            help="Folders with img1, img2, ... and H1to2p, ... (or with such folders); photographs, which are warped.",
+        ),
+    ],
+    out: Out,
+    features: Annotated[str, typer.Option(metavar="A,B", help="Features and detectors to compare.")] = ALL,
+    count: Annotated[int, typer.Option(min=1, help="Points an image, the strongest of each feature.")] = 1000,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Compare features on images of flat scenes: repeatability, matching, the homography found, time."""
+    from factorgraph_loc.errors import InputError
+    from factorgraph_loc.evaluation import features as evaluation
+    from factorgraph_loc.vision.feature_evaluation import feature
+    from factorgraph_loc.vision.sequences import find_sequences
+
+    names = list(dict.fromkeys(parse_list(features)))
+    if not names:
+        raise InputError(f"--features is {features!r}, expected names such as {ALL}")
+    chosen = [feature(name, count) for name in names]
+    evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
+    sequences = find_sequences(images)
+    with show.progress("evaluating", counted=True) as progress:
+        scores = evaluation.evaluate_all(sequences, chosen, progress)
+    evaluation.write_scores(scores, out)
+    if json:
+        show.document(scores.rows)
+        return
+    show.table(*evaluation.summary(scores))
+    typer.echo(f"\nresults are in {out}: {', '.join(evaluation.FILES)}")

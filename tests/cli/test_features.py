@@ -1,0 +1,131 @@
+"""`fgloc features evaluate`, from the arguments to the files, on small images."""
+
+import json
+
+import cv2
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+NAMES = "sift,orb,fast_hessian"
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """Smooth spots of several sizes, (150, 200)."""
+    rng = np.random.default_rng(1)
+    layers = [
+        cv2.GaussianBlur(rng.random((150, 200)).astype(np.float32), (0, 0), sigma) * sigma for sigma in (1.5, 3.0, 6.0)
+    ]
+    return np.asarray(cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX), dtype=np.uint8)
+
+
+@pytest.fixture
+def images(tmp_path, picture):
+    """A folder of one sequence, and a photograph beside it."""
+    folder = tmp_path / "images" / "spots"
+    folder.mkdir(parents=True)
+    matrix = np.array(((0.8, 0.1, 12.0), (-0.1, 0.8, 20.0), (0.0, 0.0, 1.0)))
+    cv2.imwrite(str(folder / "img1.png"), picture)
+    cv2.imwrite(
+        str(folder / "img2.pgm"), cv2.warpPerspective(picture, matrix, (200, 150), borderMode=cv2.BORDER_REFLECT)
+    )
+    np.savetxt(folder / "H1to2p", matrix)
+    cv2.imwrite(str(tmp_path / "photograph.jpg"), picture)
+    return folder.parent
+
+
+def test_results_are_written_and_named(fgloc, images, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc(
+        "features", "evaluate", images, tmp_path / "photograph.jpg", "-o", out, "--features", NAMES, "--count", 100
+    )
+    assert result.exit_code == 0, result.output
+    assert f"results are in {out}: table.md, pairs.parquet, matches.parquet, figure3.png, matching.png" in result.stdout
+    assert [line.split()[0] for line in result.stdout.splitlines()[1:4]] == NAMES.split(",")
+
+    pairs = pl.read_parquet(out / "pairs.parquet")
+    assert set(pairs["sequence"]) == {
+        "spots",
+        f"{tmp_path.name}/photograph zoomed",
+        f"{tmp_path.name}/photograph rotated",
+    }
+    assert pairs.height == 3 * (1 + 6 + 6)
+    assert pairs["features"].max() == 100
+    detector = pairs.filter(pl.col("feature") == "fast_hessian")
+    assert detector["matching_score"].null_count() == detector.height
+    assert detector["repeatability"].mean() > 0.5
+    sift = pairs.filter((pl.col("feature") == "sift") & (pl.col("sequence") == "spots"))
+    assert sift["accuracy"].item() > 0.8
+
+    matches = pl.read_parquet(out / "matches.parquet")
+    assert set(matches["feature"]) == {"sift", "orb"}
+    of_sift = matches.filter((pl.col("feature") == "sift") & (pl.col("sequence") == "spots"))
+    assert of_sift.filter(pl.col("ratio") < 0.8)["right"].mean() == pytest.approx(sift["precision"].item())
+
+    table = (out / "table.md").read_text()
+    assert "Mean over 13 pairs of images" in table
+    assert "spots, scale change" not in table  # by 1.24: below what is called one
+    for name in ("figure3.png", "matching.png"):
+        with Image.open(out / name) as shown:
+            assert shown.width == 1600
+
+
+def test_json_is_all_there_is(fgloc, images, tmp_path):
+    result = fgloc(
+        "features", "evaluate", images / "spots", "-o", tmp_path / "out", "--features", "orb", "--count", 50, "--json"
+    )
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(result.stdout)
+    assert (row["feature"], row["sequence"], row["image"]) == ("orb", "spots", 2)
+    assert 0.0 < row["repeatability"] <= 1.0
+
+
+def test_results_are_not_overwritten_unasked(fgloc, images, tmp_path):
+    out = tmp_path / "out"
+    command = ("features", "evaluate", images, "-o", out, "--features", "orb", "--count", 20)
+    assert fgloc(*command).exit_code == 0
+    result = fgloc(*command)
+    assert result.exit_code == 2
+    assert "has table.md already; choose another folder or give --overwrite" in result.stderr
+    assert fgloc(*command, "--overwrite").exit_code == 0
+
+
+def test_blank_images_have_no_features_and_that_is_no_error(fgloc, images, tmp_path):
+    cv2.imwrite(str(images / "spots" / "img2.pgm"), np.full((150, 200), 90, dtype=np.uint8))
+    result = fgloc("features", "evaluate", images, "-o", tmp_path / "out", "--features", NAMES, "--json")
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)
+    assert [row["features"] for row in rows] == [0, 0, 0]
+    assert [row["repeatability"] for row in rows] == [0.0, 0.0, 0.0]
+    assert rows[0]["homography_error"] is None
+
+
+@pytest.mark.parametrize(
+    ("damage", "options", "message"),
+    [
+        (lambda f: (f / "spots" / "H1to2p").unlink(), (), "spots: has no homography H1to2p"),
+        (lambda f: (f / "spots" / "H1to2p").write_text("1 2 3 2 4 6 0 0 1"), (), "H1to2p: is singular"),
+        (lambda f: (f / "spots" / "img2.pgm").write_bytes(b"P5"), (), "img2.pgm: is not an image that can be decoded"),
+        (lambda f: [p.unlink() for p in (f / "spots").glob("img*")], (), "images: has no images"),
+        (None, ("--features", "surf"), "feature 'surf' is not known"),
+        (None, ("--features", ","), "--features is ',', expected names such as"),
+        (None, ("--count", "0"), "--count"),
+    ],
+)
+def test_bad_input_is_one_line(fgloc, images, tmp_path, damage, options, message):
+    if damage:
+        damage(images)
+    options = options if "--features" in options else ("--features", "orb", *options)
+    result = fgloc("features", "evaluate", images, "-o", tmp_path / "out", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_out_must_be_a_folder(fgloc, images, tmp_path):
+    (tmp_path / "out").write_text("")
+    result = fgloc("features", "evaluate", images, "-o", tmp_path / "out", "--features", "orb")
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {tmp_path / 'out'}: is not a folder\n"

@@ -1,0 +1,136 @@
+"""The competing detectors: blobs and corners of known place and size, box filters against sums of pixels, odd images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.vision.competitors import BOX_SIGMA, BOX_XY, DETECTORS, OCTAVES, box_hessian, hessian
+from factorgraph_loc.vision.repeatability import repeatability
+from factorgraph_loc.vision.sequences import find_sequences
+
+NAMES = sorted(DETECTORS)
+
+
+def blob(x, y, sigma, shape=(160, 200)):
+    """A bright Gaussian spot on grey, 8 bits."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.uint8(60.0 + 180.0 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * sigma**2)))
+
+
+@pytest.mark.parametrize("name", ["hessian_laplace", "fast_hessian"])
+@pytest.mark.parametrize("sigma", [4.0, 6.0, 9.0])
+def test_a_blob_is_found_with_its_size(name, sigma):
+    found = DETECTORS[name](10).detect(blob(90.4, 71.7, sigma))
+    assert found.points[0] == pytest.approx((90.4, 71.7), abs=0.4)
+    # normalised derivatives of a Gaussian blob are extreme at its own scale; boxes have lobes of a larger one than they are called
+    ratio, tolerance = (1.0, 0.1) if name == "hessian_laplace" else (6.0 * BOX_SIGMA, 0.15)
+    assert found.sizes[0] == pytest.approx(2.0 * sigma * ratio, rel=tolerance)
+
+
+def test_corners_of_a_square_are_found_by_harris():
+    image = np.full((160, 200), 40, dtype=np.uint8)
+    image[50:100, 60:130] = 210
+    found = DETECTORS["harris_laplace"](100).detect(image)
+    found = found[found.sizes < 20.0]  # the square itself is found too
+    corners = np.array(((59.5, 49.5), (129.5, 49.5), (59.5, 99.5), (129.5, 99.5)))
+    to_corner = np.linalg.norm(found.points[:, None] - corners, axis=2)
+    # smoothing moves a corner inwards, in proportion to its scale
+    assert np.all(to_corner.min(axis=1) < 1.4 * found.sizes / 2.0)
+    assert set(to_corner.argmin(axis=1).tolist()) == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("side", [9, 27])
+def test_box_hessian_is_that_of_kernels(side):
+    image = np.random.default_rng(1).random((60, 70)).astype(np.float32)
+    lobe, reach = side // 3, side // 2
+    yy, xy = np.zeros((side, side)), np.zeros((side, side))
+    yy[:, reach - lobe + 1 : reach + lobe] = 1.0
+    yy[lobe : 2 * lobe, reach - lobe + 1 : reach + lobe] = -2.0
+    xy[reach - lobe : reach, reach + 1 : reach + 1 + lobe] = xy[reach + 1 : reach + 1 + lobe, reach - lobe : reach] = (
+        1.0
+    )
+    xy[reach - lobe : reach, reach - lobe : reach] = xy[
+        reach + 1 : reach + 1 + lobe, reach + 1 : reach + 1 + lobe
+    ] = -1.0
+    dyy, dxx, dxy = (cv2.filter2D(image, cv2.CV_64F, kernel) for kernel in (yy, yy.T, xy))
+    expected = (dxx * dyy - (BOX_XY * dxy) ** 2) / side**4
+    inner = np.s_[reach:-reach, reach:-reach]
+    found = box_hessian(cv2.integral(image, sdepth=cv2.CV_64F), side)
+    assert found[inner] == pytest.approx(expected[inner], rel=1e-4, abs=1e-7)
+    assert not found[:reach].any()
+
+
+def test_boxes_look_like_the_gaussians_they_stand_for():
+    """Correlation of the two responses to smooth noise."""
+    noise = np.random.default_rng(2).random((120, 120)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    integral = cv2.integral(smooth, sdepth=cv2.CV_64F)
+    for octave in OCTAVES[:2]:
+        side = octave[1]
+        inner = np.s_[side:-side, side:-side]
+        boxes, gauss = box_hessian(integral, side)[inner], hessian(smooth, side / 6.0)[inner]
+        assert np.corrcoef(boxes.ravel(), gauss.ravel())[0, 1] > 0.85
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_interface(name):
+    image = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 255, (120, 160, 3)).astype(np.uint8), (0, 0), 2.0)
+    every, few = DETECTORS[name](10_000).detect(image), DETECTORS[name](7).detect(image)
+    assert len(few) == 7 < len(every)
+    assert few.points == pytest.approx(every.points[:7])
+    assert np.all(np.diff(every.responses) <= 0.0)
+    assert np.all((every.points >= 0.0) & (every.points <= (159.0, 119.0)))
+    left = np.zeros((120, 160), dtype=np.uint8)
+    left[:, :80] = 255
+    masked = DETECTORS[name](10_000).detect(image, left)
+    assert len(masked) > 0
+    assert np.all(masked.points[:, 0] < 80.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_turning_the_image_turns_the_points(name, turns):
+    image = cv2.GaussianBlur(np.random.default_rng(4).integers(0, 255, (128, 128)).astype(np.uint8), (0, 0), 2.0)
+    straight, turned = DETECTORS[name](60).detect(image), DETECTORS[name](80).detect(np.rot90(image, turns).copy())
+    x, y = turned.points.T
+    for _ in range(turns):
+        x, y = 127.0 - y, x
+    distance = np.linalg.norm(straight.points[:, None] - np.column_stack((x, y)), axis=2)
+    assert np.mean(distance.min(axis=1) < 0.1) > 0.9
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("image", [np.zeros((15, 300)), np.full((64, 64), 0.4), np.zeros((64, 64, 4))], ids=str)
+def test_images_without_features(name, image):
+    assert len(DETECTORS[name](10).detect(image)) == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_small_images_do_not_break_large_filters(name):
+    image = np.random.default_rng(5).random((17, 40))
+    assert len(DETECTORS[name](1000).detect(image)) < 200
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_images_that_are_none(name):
+    with pytest.raises(InputError, match="not finite"):
+        DETECTORS[name](10).detect(np.full((64, 64), np.nan))
+    with pytest.raises(InputError, match="expected that of the image"):
+        DETECTORS[name](10).detect(np.random.default_rng(6).random((64, 64)), np.ones((64, 60), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("name", "bark", "boat"),
+    [("hessian_laplace", 0.80, 0.48), ("fast_hessian", 0.75, 0.45), ("harris_laplace", 0.66, 0.39)],
+)
+def test_they_repeat_as_well_as_when_they_were_written(data_root, name, bark, boat):
+    sequences = find_sequences([data_root / "oxford_affine" / n for n in ("bark", "boat")])
+    for sequence, expected in zip(sequences, (bark, boat), strict=True):
+        images = (sequence.first, *sequence.others[::2])
+        first, *others = (DETECTORS[name](1000).detect(image) for image in images)
+        found = [
+            repeatability(first, other, h, (sequence.first.shape, image.shape)).repeatability
+            for other, h, image in zip(others, sequence.homographies[::2], sequence.others[::2], strict=True)
+        ]
+        assert np.mean(found) == pytest.approx(expected, abs=0.08)

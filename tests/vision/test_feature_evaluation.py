@@ -1,0 +1,175 @@
+"""The scores of features: hand-made matches, features that match by construction, homographies of known error."""
+
+import cv2
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.vision.competitors import DETECTORS
+from factorgraph_loc.vision.feature_evaluation import (
+    Feature,
+    RankedMatches,
+    evaluate,
+    feature,
+    homography_error,
+    mutual_matches,
+    rank,
+)
+from factorgraph_loc.vision.features import Keypoints, extractor
+from factorgraph_loc.vision.homography import project
+from factorgraph_loc.vision.sequences import SCALE, Sequence, find_sequences
+
+SHAPE = (480, 640)
+HALF = np.array(((0.5, 0.0, 80.0), (0.0, 0.5, 60.0), (0.0, 0.0, 1.0)))
+IMAGE = np.zeros(SHAPE, dtype=np.uint8)
+
+
+def keypoints(points, sizes=6.0):
+    n = len(points)
+    return Keypoints(
+        np.array(points, dtype=float), np.full(n, sizes), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
+    )
+
+
+def pair(homography=HALF, image=IMAGE):
+    return Sequence("made", IMAGE, (image,), (homography,), SCALE, (2.0,))
+
+
+def made(points, descriptors, seen, seen_descriptors):
+    """A feature that finds ``points`` first (twice: once to warm up) and ``seen`` then."""
+    answers = iter([(points, descriptors)] * 2 + [(seen, seen_descriptors)])
+    return Feature("made", lambda _: next(answers))
+
+
+def test_curve_and_average_precision_of_known_matches():
+    ranked = RankedMatches(np.array((0.1, 0.2, 0.3, 0.4)), np.array((True, False, True, False)), possible=4)
+    recall, false = ranked.curve()
+    assert recall == pytest.approx((0.25, 0.25, 0.5, 0.5))
+    assert false == pytest.approx((0.0, 0.5, 1 / 3, 0.5))
+    assert ranked.average_precision() == pytest.approx((1.0 + 2.0 / 3.0) / 4.0)
+    nothing = RankedMatches(np.empty(0), np.empty(0, dtype=bool), possible=0)
+    assert nothing.average_precision() == 0.0
+
+
+def test_mutual_matches_of_known_vectors():
+    first = np.array(((0.0, 0.0), (10.0, 0.0), (11.0, 0.0)), dtype=np.float32)
+    second = np.array(((10.0, 1.0), (0.0, 3.0), (0.0, 50.0)), dtype=np.float32)
+    i, j, ratio = mutual_matches(first, second)
+    # the third vector's nearest is the first of the others, which is nearer to the second
+    assert (i.tolist(), j.tolist()) == ([0, 1], [1, 0])
+    assert ratio == pytest.approx((3.0 / np.hypot(10.0, 1.0), 1.0 / np.hypot(10.0, 3.0)))
+
+
+def test_mutual_matches_of_bits_and_of_too_few():
+    first = np.array(((0b1111,), (0b0000,)), dtype=np.uint8)
+    second = np.array(((0b0001,), (0b1110,)), dtype=np.uint8)
+    i, j, ratio = mutual_matches(first, second)
+    assert (i.tolist(), j.tolist()) == ([0, 1], [1, 0])
+    assert ratio == pytest.approx((1 / 3, 1 / 3))
+    assert mutual_matches(first[:1], second[:1])[2].tolist() == [1.0]
+    assert len(mutual_matches(first[:0], second)[0]) == len(mutual_matches(first, second[:0])[0]) == 0
+
+
+def test_equal_descriptors_have_no_clear_match():
+    same = np.ones((3, 4), dtype=np.float32)
+    assert mutual_matches(same, same)[2].tolist() == [1.0]
+
+
+def test_a_perfect_feature_scores_one():
+    rng = np.random.default_rng(1)
+    points = keypoints(rng.uniform((30.0, 30.0), (600.0, 450.0), (60, 2)))
+    seen = keypoints(project(HALF, points.points), 3.0)
+    vectors = rng.normal(size=(60, 16)).astype(np.float32)
+    ((scores, ranked),) = evaluate(pair(), made(points, vectors, seen, vectors))
+    row = scores.row()
+    perfect = ("repeatability", "strict", "near", "matching_score", "precision", "average_precision", "accuracy")
+    assert {name: row[name] for name in perfect} == pytest.approx(dict.fromkeys(perfect, 1.0))
+    assert (row["features"], row["regions"], row["matches"], row["image"], row["amount"]) == (60, 60, 60, 2, 2.0)
+    assert row["homography_error"] < 1e-3
+    assert ranked.possible == 60
+
+
+def test_wrong_matches_cost_precision_and_recall():
+    rng = np.random.default_rng(2)
+    grid = [(x, y) for x in range(60, 600, 90) for y in range(60, 450, 90)]
+    points, n = keypoints(grid), len(grid)
+    seen = keypoints(project(HALF, points.points), 3.0)
+    vectors = rng.normal(size=(n, 16)).astype(np.float32)
+    swapped = np.arange(n)
+    swapped[:6] = np.roll(swapped[:6], 1)
+    ((scores, ranked),) = evaluate(pair(), made(points, vectors, seen, vectors[swapped]))
+    assert scores.matched.precision == scores.matched.matching_score == pytest.approx(1.0 - 6.0 / n)
+    assert scores.matched.homography_error < 1.0
+    assert ranked.possible == n
+    assert np.count_nonzero(ranked.right) == n - 6
+
+
+def test_matches_out_of_the_common_part_are_wrong():
+    first, second = keypoints([(100.0, 100.0), (320.0, 240.0)]), keypoints([(5.0, 5.0), (240.0, 180.0)], 3.0)
+    both = np.array((0, 1))
+    ranked = rank(first, second, (both, both, np.array((0.1, 0.2))), HALF, (SHAPE, SHAPE))
+    assert ranked.right.tolist() == [False, True]
+    assert ranked.possible == 1
+
+
+def test_a_feature_that_finds_nothing_scores_zero():
+    points = keypoints([(100.0, 100.0)])
+    vectors = np.ones((1, 4), dtype=np.float32)
+    ((scores, _),) = evaluate(pair(), made(points, vectors, Keypoints.empty(), vectors[:0]))
+    row = scores.row()
+    assert row["homography_error"] == np.inf
+    assert not any(
+        row[name] for name in ("features", "repeatability", "matching_score", "precision", "accuracy", "matches")
+    )
+
+
+def test_detectors_have_no_matching_scores():
+    image = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 255, SHAPE).astype(np.uint8), (0, 0), 2.0)
+    sequence = Sequence("same", image, (image,), (np.eye(3),), SCALE, (1.0,))
+    steps = []
+    ((scores, ranked),) = evaluate(sequence, feature("fast_hessian", 50), lambda: steps.append(1))
+    assert len(steps) == 2
+    assert ranked is None
+    assert np.isnan(scores.matched.matching_score)
+    assert scores.found.repeatability == 1.0
+    assert scores.milliseconds > 0.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_homography_error_despite_outliers(noise):
+    rng = np.random.default_rng(4)
+    points = rng.uniform((0.0, 0.0), (639.0, 479.0), (200, 2))
+    seen = project(HALF, points) + rng.normal(0.0, noise, (200, 2))
+    seen[:80] = rng.uniform((0.0, 0.0), (639.0, 479.0), (80, 2))
+    assert homography_error(points, seen, HALF, SHAPE) < 0.001 + 1.5 * noise
+    assert homography_error(points[:3], seen[:3], HALF, SHAPE) == np.inf
+
+
+def test_features_by_name():
+    assert feature("orb", 10).name == "orb"
+    with pytest.raises(InputError, match="'harris_laplac' is not known: did you mean harris_laplace"):
+        feature("harris_laplac", 10)
+    for name in ("sift", "hessian_laplace"):
+        with pytest.raises(InputError, match="count is 0, expected at least 1"):
+            feature(name, 0)
+
+
+def test_opencv_threads_are_as_before():
+    threads = cv2.getNumThreads()
+    points = keypoints([(100.0, 100.0)])
+    list(evaluate(pair(), made(points, None, points, None)))
+    assert cv2.getNumThreads() == threads
+
+
+@pytest.mark.parametrize(("name", "score", "precision"), [("sift", 0.58, 0.92), ("orb", 0.41, 0.90)])
+def test_opencv_features_match_as_well_as_they_are_known_to(data_root, name, score, precision):
+    (graf,) = find_sequences([data_root / "oxford_affine" / "graf"])
+    two = Sequence(graf.name, graf.first, graf.others[:2], graf.homographies[:2], graf.change, graf.amounts[:2])
+    found = [scores.matched for scores, _ in evaluate(two, Feature(name, extractor(name, 1000).detectAndCompute))]
+    assert np.mean([s.matching_score for s in found]) == pytest.approx(score, abs=0.1)
+    assert np.mean([s.precision for s in found]) == pytest.approx(precision, abs=0.05)
+    assert all(s.homography_error < 7.0 for s in found)
+
+
+def test_no_name_is_both_a_feature_and_a_detector():
+    assert not {"sift", "orb"} & set(DETECTORS)

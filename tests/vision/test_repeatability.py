@@ -1,0 +1,197 @@
+"""Repeatability: areas against closed forms and pixels, scores of points that are moved by known amounts, the level of chance."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.vision.features import Keypoints, extractor
+from factorgraph_loc.vision.homography import project
+from factorgraph_loc.vision.repeatability import (
+    OVERLAP_ERROR,
+    RADIUS,
+    SCALE_RATIO,
+    distinct_count,
+    one_to_one,
+    overlaps,
+    pair_errors,
+    repeatability,
+    shared_area,
+)
+from factorgraph_loc.vision.sequences import find_sequences
+
+SHAPE = (480, 640)
+SHAPES = (SHAPE, SHAPE)
+ZOOM = np.array(((0.5, 0.0, 80.0), (0.0, 0.5, 60.0), (0.0, 0.0, 1.0)))
+
+
+def points_at(points, sizes):
+    n = len(points)
+    nothing = np.zeros(n)
+    return Keypoints(
+        np.array(points, dtype=float), np.broadcast_to(sizes, n).astype(float), nothing, nothing, nothing.astype(int)
+    )
+
+
+def scattered(count, rng, low=4.0, high=5.0):
+    return points_at(rng.uniform((20.0, 20.0), (620.0, 460.0), (count, 2)), rng.uniform(low, high, count))
+
+
+def lens(distance):
+    """The area that two unit discs share."""
+    half = distance / 2.0
+    return 2.0 * np.arccos(half) - distance * np.sqrt(1.0 - half**2)
+
+
+@given(distance=st.floats(0.0, 2.0), direction=st.floats(0.0, 6.3))
+def test_shared_area_of_discs(distance, direction):
+    centre = distance * np.array(((np.cos(direction), np.sin(direction)),))
+    assert shared_area(centre, np.eye(2)[None]) == pytest.approx(lens(distance), abs=0.006)
+
+
+@given(st.integers(0, 10_000))
+def test_shared_area_of_ellipses_is_that_of_pixels(seed):
+    rng = np.random.default_rng(seed)
+    axes = np.diag(rng.uniform(0.4, 2.0, 2))
+    angle = rng.uniform(0.0, np.pi)
+    turn = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))))
+    shape, centre = turn @ axes**2 @ turn.T, rng.uniform(-1.0, 1.0, 2)
+    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 400)])
+    grid = np.stack((x, y), axis=-1)
+    to_centre = grid - centre
+    both = ((grid**2).sum(-1) <= 1.0) & (np.einsum("...i,ij,...j", to_centre, np.linalg.inv(shape), to_centre) <= 1.0)
+    assert shared_area(centre[None], shape[None]) == pytest.approx(both.mean() * 4.0, abs=0.02)
+
+
+def test_overlap_error_is_that_of_magnified_discs():
+    first, second = points_at([(100.0, 100.0)], 4.0), points_at([(109.0, 100.0)], 4.0)
+    shared = lens(9.0 / RADIUS)
+    assert pair_errors(first, second, np.eye(3)) == pytest.approx(1.0 - shared / (2.0 * np.pi - shared), abs=0.003)
+    # three times the radius of 2 px: discs of 6 px that are 9 px apart
+    shared = lens(9.0 / 6.0)
+    assert pair_errors(first, second, np.eye(3), magnified=False) == pytest.approx(
+        1.0 - shared / (2.0 * np.pi - shared), abs=0.003
+    )
+
+
+@given(zoom=st.floats(0.3, 3.0), angle=st.floats(-3.0, 3.0), ratio=st.floats(0.8, 1.25))
+def test_a_region_that_is_seen_by_another_camera_is_the_same_region(zoom, angle, ratio):
+    c, s = zoom * np.cos(angle), zoom * np.sin(angle)
+    homography = np.array(((c, -s, 7.0), (s, c, -3.0), (0.0, 0.0, 1.0)))
+    first = points_at([(50.0, 60.0)], 5.0)
+    second = points_at(project(homography, first.points), 5.0 * zoom * ratio)
+    expected = 1.0 - min(ratio, 1.0 / ratio) ** 2
+    assert pair_errors(first, second, homography) == pytest.approx(expected, abs=0.003)
+
+
+def test_no_pair_is_missed():
+    """The search by distance and size finds all pairs below the limit that comparing each with each does."""
+    rng = np.random.default_rng(2)
+    tilted = np.array(((0.9, -0.2, 60.0), (0.1, 0.8, 20.0), (2e-4, 1e-4, 1.0)))
+    places = rng.uniform(100.0, 200.0, (2, 150, 2))
+    first, second = points_at(places[0], rng.uniform(2, 9, 150)), points_at(places[1], rng.uniform(2, 9, 150))
+    for magnified in (True, False):
+        i, j = (index.ravel() for index in np.mgrid[:150, :150])
+        error = pair_errors(first[i], second[j], tilted, magnified=magnified)
+        every = set(zip(i[error < OVERLAP_ERROR].tolist(), j[error < OVERLAP_ERROR].tolist(), strict=True))
+        pairs = overlaps(first, second, tilted, magnified=magnified)
+        close = pairs.error < OVERLAP_ERROR
+        assert set(zip(pairs.first[close].tolist(), pairs.second[close].tolist(), strict=True)) == every
+        assert every
+
+
+def test_the_same_points_repeat_fully():
+    points = scattered(100, np.random.default_rng(3))
+    found = repeatability(points, points, np.eye(3), SHAPES)
+    assert (found.regions, found.repeatability, found.strict, found.near) == (100, 1.0, 1.0, 1.0)
+    assert found.non_redundant > 0.8
+
+
+def test_only_the_common_part_counts():
+    first = points_at([(100.0, 100.0), (300.0, 200.0), (500.0, 400.0)], 8.0)
+    seen = points_at(project(ZOOM, first.points), 4.0)
+    # two more where only the second image looks
+    second = points_at([*seen.points, (5.0, 5.0), (600.0, 470.0)], 4.0)
+    found = repeatability(first, second, ZOOM, SHAPES)
+    assert (found.regions, found.repeatability, found.strict, found.near) == (3, 1.0, 1.0, 1.0)
+
+
+def test_each_score_is_lenient_about_its_own_thing():
+    grid = [(x, y) for x in range(100, 600, 100) for y in range(100, 400, 100)]
+    first = points_at(grid, 4.0)
+    moved = points_at([(x + 7.0, y) for x, y in grid], 4.0)
+    found = repeatability(first, moved, np.eye(3), SHAPES)
+    assert (found.repeatability, found.strict, found.near) == (1.0, 0.0, 0.0)
+    grown = points_at(grid, 4.0 * (SCALE_RATIO + 0.04))
+    found = repeatability(first, grown, np.eye(3), SHAPES)
+    assert (found.repeatability, found.strict, found.near) == (1.0, 0.0, 1.0)
+    larger = points_at(grid, 4.0 * 1.4)
+    found = repeatability(first, larger, np.eye(3), SHAPES)
+    assert (found.repeatability, found.strict, found.near) == (0.0, 0.0, 1.0)
+
+
+def test_redundant_points_repeat_but_cover_little():
+    rng = np.random.default_rng(5)
+    spread = scattered(40, rng)
+    heap = points_at(rng.normal((300.0, 200.0), 1.0, (40, 2)), 4.5)
+    for points, low, high in ((spread, 0.8, 1.0), (heap, 0.02, 0.15)):
+        found = repeatability(points, points, np.eye(3), SHAPES)
+        assert found.repeatability == 1.0
+        assert low < found.non_redundant < high
+
+
+def test_several_orientations_are_one_region():
+    once = scattered(30, np.random.default_rng(6))
+    twice = once[np.repeat(np.arange(30), 2)]
+    assert repeatability(once, twice, np.eye(3), SHAPES) == repeatability(once, once, np.eye(3), SHAPES)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_without_points_there_is_nothing(which):
+    both = [scattered(5, np.random.default_rng(7))] * 2
+    both[which] = Keypoints.empty()
+    found = repeatability(*both, np.eye(3), SHAPES)
+    assert found == type(found)(0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_one_to_one_takes_the_best_first():
+    first, second = np.array((0, 0, 1, 2, 2)), np.array((0, 1, 0, 2, 2))
+    error = np.array((0.2, 0.1, 0.3, 0.4, 0.3))
+    assert one_to_one(first, second, error).tolist() == [1, 2, 4]
+
+
+def test_distinct_count_of_known_sets():
+    far = np.array(((0.0, 0.0), (1e4, 0.0), (0.0, 1e4)))
+    assert distinct_count(far, np.array((1.0, 2.0, 3.0))) == pytest.approx(3.0)
+    assert distinct_count(np.zeros((7, 2)), np.full(7, 2.5)) == pytest.approx(1.0)
+    # two Gaussians 2 sigma apart: each is the highest on its side, Phi(1) of its volume
+    near = np.array(((0.0, 0.0), (2.0, 0.0)))
+    assert distinct_count(near, np.ones(2)) == pytest.approx(2.0 * 0.8413, abs=0.05)
+
+
+def test_the_level_of_chance():
+    """1,000 random points with the sizes of real ones: what every score has to be read against."""
+    rng = np.random.default_rng(8)
+    sizes = 3.5 * rng.exponential(0.7, (2, 1000)) + 3.0
+    first, second = (points_at(rng.uniform((0.0, 0.0), (799.0, 639.0), (1000, 2)), row) for row in sizes)
+    found = repeatability(first, second, np.eye(3), ((640, 800), (640, 800)))
+    assert 0.15 < found.repeatability < 0.35
+    assert found.strict < 0.1
+    assert found.near < 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "anchors"),
+    [("bark", (0.73, 0.74, 0.84, 0.76, 0.79)), ("boat", (0.71, 0.61, 0.32, 0.25, 0.13))],
+)
+def test_sift_repeats_as_it_is_known_to(data_root, name, anchors):
+    """Another evaluation of the same images, with its own one-to-one rule; pairs of bark share fewer than 100 regions."""
+    (sequence,) = find_sequences([data_root / "oxford_affine" / name])
+    sift = extractor("sift", 1000)
+    first, *others = (sift.detect(image) for image in (sequence.first, *sequence.others))
+    found = [
+        repeatability(first, other, homography, (sequence.first.shape, image.shape)).repeatability
+        for other, homography, image in zip(others, sequence.homographies, sequence.others, strict=True)
+    ]
+    assert found == pytest.approx(anchors, abs=0.11)
+    assert np.mean(found) == pytest.approx(np.mean(anchors), abs=0.04)
