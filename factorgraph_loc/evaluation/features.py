@@ -15,7 +15,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import COLOURS, grid, legend, save
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files import replacing, write_text
-from factorgraph_loc.vision.feature_evaluation import RATIO, Feature, RankedMatches, evaluate
+from factorgraph_loc.vision.feature_evaluation import Feature, RankedMatches, evaluate
+from factorgraph_loc.vision.matching import RATIO
 from factorgraph_loc.vision.sequences import OTHER, Sequence
 
 if TYPE_CHECKING:
@@ -179,7 +180,9 @@ def recall_curves(scores: FeatureScores) -> Any:
     groups = _groups(scores)
     columns = min(_PANELS, len(groups))
     rows = -(-len(groups) // columns)
-    figure, axes = grid(rows, columns, 5.0 * rows + 1.2, "Mutual nearest neighbours, by a threshold on the ratio of distances")
+    figure, axes = grid(
+        rows, columns, 5.0 * rows + 1.2, "Mutual nearest neighbours, by a threshold on the ratio of distances"
+    )
     for axis, (title, members) in zip(axes.flat, groups.items(), strict=False):
         axis.set_title(title)
         axis.set_xlim(0.0, 1.0)

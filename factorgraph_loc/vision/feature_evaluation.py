@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
-from scipy.spatial.distance import cdist
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import nearest
@@ -26,6 +25,7 @@ from factorgraph_loc.vision.competitors import DETECTORS
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
 from factorgraph_loc.vision.homography import corner_error
 from factorgraph_loc.vision.images import Image
+from factorgraph_loc.vision.matching import RATIO, distance_matrix
 from factorgraph_loc.vision.repeatability import (
     OVERLAP_ERROR,
     Repeatability,
@@ -39,7 +39,6 @@ from factorgraph_loc.vision.repeatability import (
 from factorgraph_loc.vision.sequences import Sequence
 from factors.se2 import Array
 
-RATIO = 0.8  # of the distances to the nearest and the second nearest
 THRESHOLDS = np.arange(1.0, 11.0)  # px, of the homography's error
 FEATURES = ("colour", "sift", "orb", "fast_hessian", "harris_laplace", "hessian_laplace")
 
@@ -161,23 +160,19 @@ def evaluate(
 def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     """Mutual nearest neighbours of two sets of descriptors, bits (``uint8``) or vectors.
 
-    Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 1 where
-    there is no second.
+    Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 0 where
+    there is no second. Those with a ratio below r are what :func:`~factorgraph_loc.vision.matching.match` gives for r.
     """
     none = np.empty(0, dtype=np.int64)
     if len(first) == 0 or len(second) == 0:
         return none, none, np.empty(0)
-    if first.dtype == np.uint8:
-        distances = cdist(np.unpackbits(first, axis=1), np.unpackbits(second, axis=1), "cityblock")
-    else:
-        distances = cdist(first, second)
+    distances = distance_matrix(first, second, binary=first.dtype == np.uint8)
     j = distances.argmin(axis=1)
     i = np.flatnonzero(distances.argmin(axis=0)[j] == np.arange(len(first)))
     j = j[i]
-    best = distances[i, j]
-    if len(second) < 2:
-        return i, j, np.ones(len(i))
-    runner_up = np.partition(distances[i], 1, axis=1)[:, 1]
+    best = distances[i, j].astype(float)
+    distances[i, j] = np.inf
+    runner_up = distances[i].min(axis=1).astype(float)
     return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=runner_up > 0.0)
 
 

@@ -7,8 +7,9 @@ a pair are magnified until the one in the first image has a radius of 30 px: els
 are placed.
 
 What this is lenient about, the other scores ask: the size of a region, and its place in units of the size (``strict``); the
-place in pixels (``near``); how much of the image the regions that are found again cover (``non_redundant``: Rey-Otero, Delbracio,
-Morel, "Comparing Feature Detectors: A Bias in the Repeatability Criteria", ICIP 2015).
+place in pixels of the first image (``near``); how much of the image the regions that are found again cover, each being a Gaussian
+whose standard deviation is the size of its point (``non_redundant``: Rey-Otero, Delbracio, Morel, "Comparing Feature Detectors:
+A Bias in the Repeatability Criteria", ICIP 2015).
 """
 
 from __future__ import annotations
@@ -71,11 +72,12 @@ class Candidates:
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
     """The scores of points found in two images of ``shapes`` (height, width, ...); ``homography`` maps the first to the second.
 
-    Points with several orientations are one region.
+    Points with several orientations are one region, except where redundancy is asked for: there each of them counts as found.
     """
-    first, second = _distinct(first), _distinct(second)
     in_first, in_second = common(first, second, homography, shapes)
     first, second = first[in_first], second[in_second]
+    points = min(len(first), len(second))
+    first, second = _distinct(first), _distinct(second)
     count = min(len(first), len(second))
     if count == 0:
         return Repeatability(0, 0.0, 0.0, 0.0, 0.0)
@@ -85,9 +87,9 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
     alike = np.maximum(own.ratio, 1.0 / own.ratio) < SCALE_RATIO
     strict = own.best((own.error < OVERLAP_ERROR) & alike)
     found = first[again.first]
-    covered = distinct_count(found.points, MEASUREMENT * found.sizes / 2.0)
+    covered = distinct_count(found.points, found.sizes)
     near = _near(first, second, homography)
-    return Repeatability(count, len(again.first) / count, len(strict.first) / count, covered / count, near / count)
+    return Repeatability(count, len(again.first) / count, len(strict.first) / count, covered / points, near / count)
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
@@ -204,9 +206,9 @@ def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
 
 
 def _near(first: Keypoints, second: Keypoints, homography: Array) -> int:
-    """One-to-one pairs that lie within :data:`NEAR` of each other in the second image, whatever their sizes."""
-    mapped = project(homography, first.points)
-    near = cKDTree(second.points).query_ball_point(mapped, NEAR)
+    """One-to-one pairs that lie within :data:`NEAR` of each other in the first image, whatever their sizes."""
+    mapped = project(invert(homography), second.points)
+    near = cKDTree(mapped).query_ball_point(first.points, NEAR)
     i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
     j = np.concatenate([np.asarray(row, dtype=np.int64) for row in near])
-    return len(one_to_one(i, j, np.linalg.norm(mapped[i] - second.points[j], axis=1)))
+    return len(one_to_one(i, j, np.linalg.norm(first.points[i] - mapped[j], axis=1)))

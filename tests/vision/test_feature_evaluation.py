@@ -17,6 +17,7 @@ from factorgraph_loc.vision.feature_evaluation import (
 )
 from factorgraph_loc.vision.features import Keypoints, extractor
 from factorgraph_loc.vision.homography import project
+from factorgraph_loc.vision.matching import RATIO, match
 from factorgraph_loc.vision.sequences import SCALE, Sequence, find_sequences
 
 SHAPE = (480, 640)
@@ -66,8 +67,25 @@ def test_mutual_matches_of_bits_and_of_too_few():
     i, j, ratio = mutual_matches(first, second)
     assert (i.tolist(), j.tolist()) == ([0, 1], [1, 0])
     assert ratio == pytest.approx((1 / 3, 1 / 3))
-    assert mutual_matches(first[:1], second[:1])[2].tolist() == [1.0]
+    assert mutual_matches(first[:1], second[:1])[2].tolist() == [0.0]
     assert len(mutual_matches(first[:0], second)[0]) == len(mutual_matches(first, second[:0])[0]) == 0
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_clear_matches_are_those_of_the_product(binary):
+    rng = np.random.default_rng(6)
+    if binary:
+        first = rng.integers(0, 255, (80, 8)).astype(np.uint8)
+        flipped = rng.random((50, 8, 8)) < rng.uniform(0.05, 0.5, (50, 1, 1))
+        second = first[:50] ^ np.packbits(flipped, axis=2)[:, :, 0]
+    else:
+        first = rng.normal(size=(80, 8)).astype(np.float32)
+        second = first[:50] + rng.normal(0.0, 0.4, (50, 8)).astype(np.float32)
+    i, j, ratio = mutual_matches(first, second)
+    for limit in (0.6, RATIO):
+        expected = match(first, second, binary=binary, ratio=limit)
+        assert np.column_stack((i, j))[ratio < limit].tolist() == expected.indices.tolist()
+        assert 0 < len(expected) < 50
 
 
 def test_equal_descriptors_have_no_clear_match():

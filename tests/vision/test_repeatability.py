@@ -143,7 +143,10 @@ def test_redundant_points_repeat_but_cover_little():
 def test_several_orientations_are_one_region():
     once = scattered(30, np.random.default_rng(6))
     twice = once[np.repeat(np.arange(30), 2)]
-    assert repeatability(once, twice, np.eye(3), SHAPES) == repeatability(once, once, np.eye(3), SHAPES)
+    single, double = (repeatability(points, points, np.eye(3), SHAPES) for points in (once, twice))
+    assert (double.regions, double.repeatability, double.strict, double.near) == (30, 1.0, 1.0, 1.0)
+    # but they are redundant
+    assert double.non_redundant == pytest.approx(0.5 * single.non_redundant)
 
 
 @pytest.mark.parametrize("which", [0, 1])
