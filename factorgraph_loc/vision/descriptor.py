@@ -30,11 +30,11 @@ VALUES = 35  # of the distance: all but the position
 
 # in units of a point's scale
 SIDE = 24
-LOG_SCALES = (1.6, 1.8, 4.5, 4.7)
-LOG_ARMS = (2.5, 3.7, 4.0, 9.6)
-GRADIENT_SCALE = 3.2
+LOG_SCALES = (1.6, 2.4, 3.6, 5.4)
+LOG_ARMS = (2.0, 4.0, 6.0, 8.0)
+GRADIENT_SCALE = 3.3
 GRADIENT_ARM = 6.0
-WAVELENGTHS = (4.0, 7.0, 12.0)
+WAVELENGTHS = (3.5, 7.0, 14.0)
 ENVELOPE = 0.4  # standard deviation over wavelength
 
 _FLAT = 1e-6  # grey levels: norm of a patch's responses below which it has none

@@ -24,13 +24,16 @@ from factorgraph_loc.vision.kernels import (
     structure_tensor,
 )
 from factorgraph_loc.vision.keypoints import Keypoints
-from factorgraph_loc.vision.scale_space import CAMERA_BLUR, SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
+from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
 from factors.se2 import Array
 
 INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken at the scale below
 WEAKEST = 1.0  # squared grey levels: a weaker corner is noise of the camera
+# The response that points are ranked by is a product of powers. Where the Laplacian is strong the scale is well defined, and
+# what is coarse is still there when the camera moves away.
+BY_STRENGTH, BY_LAPLACIAN, BY_SCALE = 0.7, 0.6, 0.2
 BORDER = 4  # pixels of an octave: nearer to the border half of a corner is made up
-CLEARANCE = 2.0  # in units of a point's scale: nearer to a stronger one it waits
+CLEARANCE = 1.2  # in units of a point's scale: nearer to a stronger one it waits
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
@@ -80,14 +83,14 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
-    """Of each characteristic scale its corners (N, 4): x and y [px], scale [px], strength."""
+    """Of each characteristic scale its corners (N, 4): x and y [px], scale [px], response."""
     found = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
             octave.colours[:] = space.octaves[o - 1].colours[:, ::2, ::2]
         else:
             for source, plane in zip(colours, octave.colours, strict=True):
-                blur(source, plane, more_blur(CAMERA_BLUR, SIGMAS[0]))
+                blur(source, plane, SIGMAS[0])
         for i in range(1, SCALES + 1):
             _strengths(octave, i)
             found.append(_peaks(octave, i))
@@ -112,10 +115,10 @@ def _peaks(octave: Octave, i: int) -> Array:
     pixels: Int32 = np.empty((0, 2), dtype=np.int32)
     if found is not None:
         pixels = (found.reshape(-1, 2) + BORDER).astype(np.int32)
-    peaks = np.empty((len(pixels), 4))
+    peaks = np.empty((len(pixels), 5))
     around = slice(i - 1, i + 2)
     count = refined_peaks(octave.strength, WEAKEST, octave.planes[around], SIGMAS[around] ** 2, pixels, peaks)
-    peaks = peaks[:count]
-    peaks[:, :2] *= octave.step
-    peaks[:, 2] = SIGMAS[i] * octave.step * STEP ** peaks[:, 2]
-    return peaks
+    x, y, steps, strength, laplacian = peaks[:count].T
+    sigma = SIGMAS[i] * octave.step * STEP**steps
+    response = strength**BY_STRENGTH * laplacian**BY_LAPLACIAN * sigma**BY_SCALE
+    return np.stack([x * octave.step, y * octave.step, sigma, response], axis=1)

@@ -83,9 +83,10 @@ def refined_peaks(
     where exactly.
 
     A pixel stays if its strength is above ``threshold`` and the normalised Laplacian of the middle one of ``planes``
-    (3, H, W), of ``variances`` (3,), is the largest of the three; a neighbouring pixel may stand in for it. Written
-    to ``peaks`` (N, 4): x and y, by a paraboloid through the 3x3 strengths; steps of scale from the middle plane, by
-    a parabola; strength. Returns their number."""
+    (3, H, W), of ``variances`` (3,), is the largest of the three; a neighbouring pixel may stand in for it. Written to
+    ``peaks`` (N, 5): x and y, by a paraboloid through the 3x3 strengths; steps of scale from the middle plane, by a
+    parabola; strength; the Laplacian's magnitude. Returns their number.
+    """
     count = 0
     for n in range(len(pixels)):
         x, y = pixels[n]
@@ -112,7 +113,7 @@ def refined_peaks(
         peaks[count, 0] = x + min(max(shift_x, -MAX_SHIFT), MAX_SHIFT)
         peaks[count, 1] = y + min(max(shift_y, -MAX_SHIFT), MAX_SHIFT)
         peaks[count, 2] = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
-        peaks[count, 3] = value
+        peaks[count, 3], peaks[count, 4] = value, middle
         count += 1
     return count
 

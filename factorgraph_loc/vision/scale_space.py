@@ -20,7 +20,6 @@ from factors.se2 import Array
 SCALES = 4  # characteristic scales of an octave
 STEP = 2.0 ** (1.0 / SCALES)
 FINEST = 1.3  # px: standard deviation of the first characteristic scale
-CAMERA_BLUR = 0.5  # px: of the image as it comes
 
 # of each octave, in its own pixels: the four scales, one below them and one above
 SIGMAS: Array = FINEST * STEP ** np.arange(-1.0, SCALES + 1.0)
@@ -69,7 +68,7 @@ class ScaleSpace:
 
     def fill(self, intensity: Float) -> None:
         """The planes of all octaves from E (H, W) of an image."""
-        blur(intensity, self.octaves[0].planes[0], more_blur(CAMERA_BLUR, SIGMAS[0]))
+        blur(intensity, self.octaves[0].planes[0], SIGMAS[0])
         for o, octave in enumerate(self.octaves):
             if o > 0:
                 octave.planes[0] = self.octaves[o - 1].planes[SCALES, ::2, ::2]

@@ -19,7 +19,7 @@ from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.descriptor import VALUES
 from factors.se2 import Array
 
-SHARE = 0.05  # of the mean variance, that is added to all: what few pairs say of a direction is not certain
+SHARE = 0.04  # of the mean variance, that is added to all: what few pairs say of a direction is not certain
 OWN_SCALE = 20  # which of the values is the point's own scale: it has no weight, as a zoom changes it
 
 
