@@ -87,9 +87,9 @@ def read_sequence(folder: Path) -> Sequence:
 def warped(photograph: Image, source: Path) -> list[Sequence]:
     """A photograph made smaller by :data:`ZOOMS`, and turned by :data:`ROTATIONS`.
 
-    What is made smaller, by means over areas, lies in the middle of its own reflections: as a camera farther away sees more of the
-    surroundings, the same number of points falls on less of the scene. Of turned images the square is kept that has no border in
-    any of them; the first image is the same square. InputError, naming ``source``, if the photograph is too small.
+    What is made smaller, by means over areas, lies in the middle of the mirrored photograph: a camera farther away sees more of
+    the surroundings, so that the same number of points falls on less of the scene. Of turned images the square is kept that has
+    no border in any of them; the first image is the same square. InputError, naming ``source``, if the photograph is too small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
@@ -106,8 +106,9 @@ def _zoomed(photograph: Image, name: str) -> Sequence:
         size = (round(width / zoom), round(height / zoom))
         small = np.asarray(cv2.resize(photograph, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         left, top = (width - size[0]) // 2, (height - size[1]) // 2
-        around = (top, height - size[1] - top, left, width - size[0] - left)
-        others.append(np.asarray(cv2.copyMakeBorder(small, *around, cv2.BORDER_REFLECT), dtype=np.uint8))
+        whole = photograph[:, ::-1].copy()
+        whole[top : top + size[1], left : left + size[0]] = small
+        others.append(whole)
         # (0, 0) is the centre of a pixel, not its corner
         x, y = size[0] / width, size[1] / height
         shift = (0.5 * (x - 1.0) + left, 0.5 * (y - 1.0) + top)
