@@ -37,8 +37,8 @@ CLEARANCE = 1.2  # in units of a point's scale: nearer to a stronger one it wait
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
-ORIENTATION_SIDE = 17
-ORIENTATION_SPACING = 0.65  # in units of a point's scale
+ORIENTATION_SIDE = 13
+ORIENTATION_SPACING = 0.85  # in units of a point's scale
 ORIENTATION_WINDOW = 2.25  # standard deviation of the weight, in the same
 ORIENTATION_BINS = 36
 

@@ -59,7 +59,8 @@ def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
 
 def is_blank(image: Image) -> bool:
     """Whether an image can have no feature: a side is below :data:`MIN_SIDE`, or all its pixels are equal."""
-    return min(image.shape[:2]) < MIN_SIDE or bool((image == image[0, 0]).all())
+    # row by row: the first one mostly decides
+    return min(image.shape[:2]) < MIN_SIDE or all(bool((row == image[0, 0]).all()) for row in image)
 
 
 def read_image(path: Path) -> Image:

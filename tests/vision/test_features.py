@@ -13,15 +13,6 @@ from factorgraph_loc.vision.images import as_image, as_mask, read_image
 NAMES = sorted(EXTRACTORS)
 
 
-@pytest.fixture(scope="module")
-def picture() -> np.ndarray:
-    """Coloured blobs of several sizes, (240, 320, 3)."""
-    rng = np.random.default_rng(3)
-    noise = rng.normal(size=(240, 320, 3))
-    layers = [cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0, 6.0)]
-    return np.clip(128 + 45 * sum(layers), 0, 255).astype(np.uint8)
-
-
 @pytest.mark.parametrize("name", NAMES)
 class TestEveryExtractor:
     def test_gives_the_strongest_with_a_descriptor_each(self, name: str, picture: np.ndarray) -> None:
