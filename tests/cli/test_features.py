@@ -8,6 +8,11 @@ import polars as pl
 import pytest
 from PIL import Image
 
+from factorgraph_loc.cli.features import ALL
+from factorgraph_loc.vision.competitors import DETECTORS
+from factorgraph_loc.vision.feature_evaluation import FEATURES
+from factorgraph_loc.vision.features import EXTRACTORS
+
 NAMES = "sift,orb,fast_hessian"
 
 
@@ -122,6 +127,11 @@ def test_bad_input_is_one_line(fgloc, images, tmp_path, damage, options, message
     assert result.exit_code == 2
     assert message in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_the_default_is_all_there_are():
+    assert tuple(ALL.split(",")) == FEATURES
+    assert set(FEATURES) == set(EXTRACTORS) | set(DETECTORS)
 
 
 def test_out_must_be_a_folder(fgloc, images, tmp_path):
