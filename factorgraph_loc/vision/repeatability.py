@@ -77,7 +77,7 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
     in_first, in_second = common(first, second, homography, shapes)
     first, second = first[in_first], second[in_second]
     points = min(len(first), len(second))
-    first, second = _distinct(first), _distinct(second)
+    first, second = distinct(first), distinct(second)
     count = min(len(first), len(second))
     if count == 0:
         return Repeatability(0, 0.0, 0.0, 0.0, 0.0)
@@ -192,7 +192,7 @@ def distinct_count(points: Array, sigmas: Array) -> float:
     return total / _SAMPLES
 
 
-def _distinct(keypoints: Keypoints) -> Keypoints:
+def distinct(keypoints: Keypoints) -> Keypoints:
     """Each place and size once, in the order of the points."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
     _, index = np.unique(rows, axis=0, return_index=True)
