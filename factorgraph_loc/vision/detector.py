@@ -31,7 +31,7 @@ INTEGRATION = 0.8  # integration over characteristic scale; derivatives are take
 WEAKEST = 1.0  # squared grey levels: a weaker corner is noise of the camera
 # The response that points are ranked by is a product of powers. Where the Laplacian is strong the scale is well defined, and
 # what is coarse is still there when the camera moves away.
-BY_STRENGTH, BY_LAPLACIAN, BY_SCALE = 0.7, 0.6, 0.2
+BY_STRENGTH, BY_LAPLACIAN, BY_SCALE = 0.7, 0.6, 0.3
 BORDER = 4  # pixels of an octave: nearer to the border half of a corner is made up
 CLEARANCE = 1.2  # in units of a point's scale: nearer to a stronger one it waits
 
