@@ -13,17 +13,19 @@ from factorgraph_loc.vision.scale_space import ScaleSpace
 
 
 class ColourExtractor:
-    """Colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`): descriptors are (N, 35) ``float32`` of
-    length one.
+    """Colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`), of any image at most ``count``; descriptors
+    are (N, 35) ``float32`` of length one.
 
-    Its memory is that of the last image's size and is used for the next: an extractor serves one thread.
+    ``paper_literal``: for comparison, neighbours as the paper has them (:func:`~factorgraph_loc.vision.descriptor.records`).
+    The memory for an image is kept and used for the next one of its size: an extractor serves one thread.
     """
 
     name = "colour"
     binary = False
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, *, paper_literal: bool = False) -> None:
         self._count = count
+        self._paper_literal = paper_literal
         self._space: ScaleSpace | None = None
 
     def detect(self, image: object, mask: object = None) -> Keypoints:
@@ -36,7 +38,7 @@ class ColourExtractor:
 
     def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
         space, keypoints = self._found(image, mask)
-        return keypoints, weights.shipped()(descriptor.values(_records(space, keypoints)))
+        return keypoints, weights.shipped()(descriptor.values(self._records(space, keypoints)))
 
     def record(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.void]]:
         """What :meth:`compute` describes, with the raw values, :data:`~factorgraph_loc.vision.descriptor.RECORD`
@@ -51,7 +53,7 @@ class ColourExtractor:
         angles = detector.orientations(space, kept.points, kept.sizes / 2.0)
         angles = np.where(np.isnan(kept.angles), angles, kept.angles)
         kept = Keypoints(kept.points, kept.sizes, angles, kept.responses, kept.levels)
-        return kept, _records(space, kept)
+        return kept, self._records(space, kept)
 
     def _found(self, image: object, mask: object) -> tuple[ScaleSpace | None, Keypoints]:
         pixels = as_image(image)
@@ -69,8 +71,7 @@ class ColourExtractor:
         self._space.fill(channels[0])
         return self._space
 
-
-def _records(space: ScaleSpace | None, keypoints: Keypoints) -> NDArray[np.void]:
-    if space is None:
-        return np.empty(0, dtype=descriptor.RECORD)
-    return descriptor.records(space, keypoints)
+    def _records(self, space: ScaleSpace | None, keypoints: Keypoints) -> NDArray[np.void]:
+        if space is None:
+            return np.empty(0, dtype=descriptor.RECORD)
+        return descriptor.records(space, keypoints, paper_literal=self._paper_literal)

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from factorgraph_loc.vision.colour import Float
-from factorgraph_loc.vision.keypoints import Keypoints
+from factorgraph_loc.vision.keypoints import Integers, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 from factors.se2 import Array
 
@@ -40,8 +41,11 @@ ENVELOPE = 0.4  # standard deviation over wavelength
 _FLAT = 1e-6  # grey levels: norm of a patch's responses below which it has none
 
 
-def records(space: ScaleSpace, keypoints: Keypoints) -> NDArray[np.void]:
-    """The values of :data:`RECORD` (N,) of points with directions in the image that ``space`` is filled with."""
+def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
+    """The values of :data:`RECORD` (N,) of points with directions in the image that ``space`` is filled with.
+
+    ``paper_literal``: the neighbours are the four nearest of the other points, which are seldom the same in another
+    image."""
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, _LATTICE) @ _FILTERS
     result = np.empty(len(keypoints), dtype=RECORD)
@@ -50,6 +54,11 @@ def records(space: ScaleSpace, keypoints: Keypoints) -> NDArray[np.void]:
     result["scale_responses"] = answers[:, :20].reshape(-1, 5, 4)
     gradients = answers[:, 20:30].reshape(-1, 5, 2)
     result["orientation"] = np.arctan2(gradients[:, :, 1], gradients[:, :, 0])
+    if paper_literal:
+        near = _nearest(keypoints.points)
+        result["scale_responses"][:, 1:] = result["scale_responses"][near, 0]
+        relative = keypoints.angles[near] - keypoints.angles[:, None]
+        result["orientation"][:, 1:] = np.angle(np.exp(1j * relative))
     wavelets = answers[:, 30:].reshape(-1, 3, 3, 2)
     result["texture"] = np.hypot(wavelets[..., 0], wavelets[..., 1])
     return result
@@ -64,6 +73,13 @@ def values(record: NDArray[np.void]) -> Float:
     return np.hstack(
         [_unit(responses), np.log2(record["scale"])[:, None], np.sin(record["orientation"]), _unit(texture)]
     ).astype(np.float32)
+
+
+def _nearest(points: Array) -> Integers:
+    """The four others (N, 4) that are nearest to each of ``points`` (N, 2), the nearest first; itself where there are
+    too few."""
+    found = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
+    return np.where(found < len(points), found, np.arange(len(points))[:, None]).astype(np.int64)
 
 
 def _unit(block: Float) -> Float:

@@ -106,3 +106,25 @@ def test_the_own_scale_is_where_the_weights_expect_it() -> None:
     found = np.zeros(2, dtype=RECORD)
     found["scale"] = 1.0, 4.0
     assert np.allclose(np.diff(values(found), axis=0)[0], 2.0 * (np.arange(VALUES) == OWN_SCALE))
+
+
+def test_literal_neighbours_are_the_nearest_points(
+    picture: np.ndarray, described: tuple[Keypoints, np.ndarray]
+) -> None:
+    keypoints, found = described
+    _, literal = ColourExtractor(80, paper_literal=True).record(picture, keypoints)
+    away = np.linalg.norm(keypoints.points[:, None] - keypoints.points, axis=2)
+    near = np.argsort(away, axis=1)[:, 1:5]
+    assert np.array_equal(literal["scale_responses"][:, 0], found["scale_responses"][:, 0])
+    assert np.array_equal(literal["scale_responses"][:, 1:], found["scale_responses"][near, 0])
+    turned = np.exp(1j * (keypoints.angles[near] - keypoints.angles[:, None]))
+    assert np.allclose(np.exp(1j * literal["orientation"][:, 1:]), turned, atol=1e-5)
+    assert np.array_equal(literal["texture"], found["texture"])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_literal_neighbours_that_are_too_few(picture: np.ndarray, count: int) -> None:
+    keypoints = ColourExtractor(5).detect(picture)[:count]
+    _, literal = ColourExtractor(5, paper_literal=True).record(picture, keypoints)
+    assert len(literal) == count
+    assert np.array_equal(literal["scale_responses"][:, 4], literal["scale_responses"][:, 0])
