@@ -17,7 +17,7 @@ from factorgraph_loc.vision.keypoints import Integers, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 from factors.se2 import Array
 
-# the first place is the point, the others are a cross; all but position and scale are without units
+# the first place is the point, the others are a cross; responses and texture are in grey levels
 RECORD = np.dtype(
     [
         ("position", np.float32, 2),  # x, y [px]
@@ -29,7 +29,7 @@ RECORD = np.dtype(
 )
 VALUES = 35  # of the distance: all but the position
 
-# in units of a point's scale
+# in units of a point's scale; the patch cuts the coarsest of the filters short
 SIDE = 24
 LOG_SCALES = (1.6, 2.4, 3.6, 5.4)
 LOG_ARMS = (2.0, 4.0, 6.0, 8.0)
