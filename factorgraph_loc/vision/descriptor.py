@@ -47,7 +47,7 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
     ``paper_literal``: the neighbours are the four nearest of the other points, which are seldom the same in another
     image."""
     sigmas = keypoints.sizes / 2.0
-    answers = space.patches(keypoints.points, sigmas, keypoints.angles, _LATTICE) @ _FILTERS
+    answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
     result = np.empty(len(keypoints), dtype=RECORD)
     result["position"] = keypoints.points
     result["scale"] = sigmas
@@ -86,7 +86,7 @@ def _unit(block: Float) -> Float:
     return np.asarray(block / np.maximum(np.linalg.norm(block, axis=1, keepdims=True), _FLAT), dtype=np.float32)
 
 
-def _cross(arm: float) -> Array:
+def cross(arm: float) -> Array:
     """The point and its four neighbours (5, 2), on the diagonals of its frame."""
     angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4.0)
     return np.vstack([np.zeros(2), arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)])
@@ -96,7 +96,7 @@ def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
     """The blur (M,) that makes the plane of a point one of ``scale``, around ``centre`` (2,); places from there (M,
     2); its variance."""
     variance = scale**2 - 1.0
-    away = _LATTICE - centre
+    away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance
 
 
@@ -115,7 +115,7 @@ def _gradient(scale: float, centre: Array) -> list[Array]:
 
 def _gabor(wavelength: float, angle: float) -> list[Array]:
     """Real and imaginary part of a wavelet, the real one without mean."""
-    x, y = _LATTICE.T
+    x, y = LATTICE.T
     window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
     window /= window.sum()
     phase = 2.0 * np.pi / wavelength * (x * np.cos(angle) + y * np.sin(angle))
@@ -125,11 +125,11 @@ def _gabor(wavelength: float, angle: float) -> list[Array]:
 
 def _filters() -> Float:
     columns = [
-        _laplacian(scale, _cross(arm)[place])
+        _laplacian(scale, cross(arm)[place])
         for place in range(5)
         for scale, arm in zip(LOG_SCALES, LOG_ARMS, strict=True)
     ]
-    for centre in _cross(GRADIENT_ARM):
+    for centre in cross(GRADIENT_ARM):
         columns += _gradient(GRADIENT_SCALE, centre)
     for wavelength in WAVELENGTHS:
         for turn in range(3):
@@ -138,5 +138,5 @@ def _filters() -> Float:
 
 
 _arm = np.arange(SIDE) - (SIDE - 1) / 2.0
-_LATTICE: Float = np.stack(np.meshgrid(_arm, _arm), axis=-1).reshape(-1, 2).astype(np.float32)
-_FILTERS = _filters()
+LATTICE: Float = np.stack(np.meshgrid(_arm, _arm), axis=-1).reshape(-1, 2).astype(np.float32)
+FILTERS = _filters()

@@ -92,14 +92,14 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
             for source, plane in zip(colours, octave.colours, strict=True):
                 blur(source, plane, SIGMAS[0])
         for i in range(1, SCALES + 1):
-            _strengths(octave, i)
+            fill_strength(octave, i)
             found.append(_peaks(octave, i))
             for plane in octave.colours:
                 blur(plane, plane, more_blur(SIGMAS[i - 1], SIGMAS[i]))
     return found
 
 
-def _strengths(octave: Octave, i: int) -> None:
+def fill_strength(octave: Octave, i: int) -> None:
     """Harris' measure at scale ``i`` of an octave whose colours are at scale ``i - 1``."""
     structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
     for product in octave.products:
