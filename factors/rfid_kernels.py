@@ -131,7 +131,11 @@ def score(
                 aa += f * by_a * by_a
         nll[n], expected[n], variance[n] = tempering * e_sum, tempering * mean_sum, tempering * spread_sum
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = tempering * g_x, tempering * g_y, tempering * g_a
-        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = tempering * xx, tempering * yy, tempering * aa
+        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = (
+            tempering * xx,
+            tempering * yy,
+            tempering * aa,
+        )
         information[n, 0, 1] = information[n, 1, 0] = tempering * xy
         information[n, 0, 2] = information[n, 2, 0] = tempering * xa
         information[n, 1, 2] = information[n, 2, 1] = tempering * ya
