@@ -18,8 +18,8 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
-from factorgraph_loc.estimators.keyframes import GraphEstimator
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
+from factorgraph_loc.estimators.measuring import MeasuringGraph
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
 from factorgraph_loc.estimators.scan_finder import ScanFinder
@@ -39,7 +39,7 @@ UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
 SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 
 
-class RelocatingGraph(GraphEstimator):
+class RelocatingGraph(MeasuringGraph):
     """A graph estimator that finds its place; see the module."""
 
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
