@@ -251,13 +251,20 @@ def _beam(parameters: Array, x: float, y: float, z: float) -> tuple[float, float
     return value, by_log_p * (by_r * x - by_phi * y), by_log_p * (by_r * y + by_phi * x), by_log_p * by_r * z, 0.0
 
 
+@numba.njit(cache=True, inline="always")
+def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> float:
+    """Logit of a logistic model with coefficients ``b`` of :data:`FEATURES`, at range r, one minus the cosine of the bearing w,
+    height, and facing c."""
+    value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(height)
+    return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
+
+
 @numba.njit(cache=True)
 def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, float, float, float, float]:
     r = math.sqrt(x * x + y * y + NEAR * NEAR)
     cosine = x / r
     w = 1.0 - cosine
-    value = b[0] + b[1] * r + b[2] * r * r + b[3] * w + b[4] * w * w + b[5] * r * w + b[6] * abs(z)
-    value += b[7] * c + b[8] * c * c + b[9] * r * c + b[10] * w * c
+    value = logistic_value(b, r, w, z, c)
     by_r = b[1] + 2.0 * b[2] * r + b[5] * w + b[9] * c
     by_w = b[3] + 2.0 * b[4] * w + b[5] * r + b[10] * c
     by_c = b[7] + 2.0 * b[8] * c + b[9] * r + b[10] * w

@@ -77,14 +77,14 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of an antenna model with a map of tags."""
+    """The likelihood of an antenna model with a map of tags; ``packed``: the model as compiled code takes it."""
 
     model: RfidModel
     tags: TagArray
-    _packed: Packed = field(init=False, repr=False)
+    packed: Packed = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_packed", self.model.packed())
+        object.__setattr__(self, "packed", self.model.packed())
 
     def score(self, poses: Array, looks: Looks) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
@@ -93,7 +93,7 @@ class RfidLikelihood:
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
         tags = (self.tags.points, self.tags.normals)
         where, seen = (looks.offsets, looks.antennas), (looks.rounds, looks.hits)
-        rfid_kernels.score(self._packed, poses, *tags, *where, *seen, self.model.tempering, *out)
+        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, self.model.tempering, *out)
         return out
 
     def log_likelihood(self, poses: Array, looks: Looks) -> Array:
@@ -103,12 +103,12 @@ class RfidLikelihood:
         for i in range(len(looks.antennas)):
             at = poses if not looks.offsets[i].any() else se2.compose(poses, looks.offsets[i])
             tags = (self.tags.points, self.tags.normals, looks.hits[i], int(looks.rounds[i]))
-            add_log_likelihood(self._packed, self._tables, int(looks.antennas[i]), at, *tags, out)
+            add_log_likelihood(self.packed, self._tables, int(looks.antennas[i]), at, *tags, out)
         return self.model.tempering * out
 
     @cached_property
     def _tables(self) -> Tables:
-        return make_tables(self.model, self._packed, self.tags.points[:, 2])
+        return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def by_tag(self, pose: Array, looks: Looks) -> tuple[Array, Array, Array]:
         """What each tag says on its own, at one pose (3,): tempered negative log-likelihood (T,), its gradient (T, 2) by the tag's
@@ -117,9 +117,7 @@ class RfidLikelihood:
         nll, gradient, information = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
         arrays = (looks.offsets, looks.antennas, looks.rounds, looks.hits)
         pose = np.asarray(pose, dtype=float)
-        rfid_kernels.by_tag(
-            self._packed, pose, self.tags.points, self.tags.normals, *arrays, nll, gradient, information
-        )
+        rfid_kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays, nll, gradient, information)
         alpha = self.model.tempering
         return alpha * nll, alpha * gradient, alpha * information
 
@@ -127,5 +125,5 @@ class RfidLikelihood:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""
         out = np.empty((len(poses), len(self.tags.points)))
         poses = np.ascontiguousarray(poses, dtype=float)
-        rfid_kernels.probabilities(self._packed, antenna, poses, self.tags.points, self.tags.normals, out)
+        rfid_kernels.probabilities(self.packed, antenna, poses, self.tags.points, self.tags.normals, out)
         return out

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid import LOGISTIC, NEGLIGIBLE_LOGIT, Packed, RfidModel
+from factors.rfid import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidModel, logistic_value
 from factors.rfid_kernels import seen
 from factors.se2 import Array
 
@@ -288,11 +288,9 @@ def _add_direct(
             height = points[t, 2] - az
             along, across = cosine * ex + sine * ey, cosine * ey - sine * ex
             u, z = cp * along + sp * height, cp * height - sp * along
-            r = math.sqrt(u * u + across * across + 1e-4)
+            r = math.sqrt(u * u + across * across + NEAR * NEAR)
             c = -(normals[t, 0] * ex + normals[t, 1] * ey) / math.sqrt(distance2 + 1e-9)
             w = 1.0 - u / r
-            value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(z)
-            value += c * (b[7] + b[8] * c + b[9] * r + b[10] * w)
-            row = _index(value)
+            row = _index(logistic_value(b, r, w, z, c))
             total += hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1]
         out[n] += total

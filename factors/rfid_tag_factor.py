@@ -51,7 +51,7 @@ class RfidTagFactor:
         arrays = (looks.offsets, looks.antennas, looks.rounds, looks.hits)
         pose = np.asarray(values[0], dtype=float)
         normal = tags.normals[self.tag]
-        packed = self.likelihood._packed
+        packed = self.likelihood.packed
         nll = _joint(packed, pose, point, normal, *arrays, self.tag, gradient, information)
         alpha = self.likelihood.model.tempering
         return alpha * nll, alpha * gradient, alpha * information

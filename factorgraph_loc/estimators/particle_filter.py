@@ -27,6 +27,7 @@ from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.scan_monitor import Silence
 from factorgraph_loc.estimators.scan_tracker import ScanTracker
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
@@ -186,7 +187,7 @@ class ParticleFilter(Filter):
         silent = self._scans.silent
         taken = self._scans.track(m, self._odometry, self._state, self._weigh)
         if self._scans.silent and not silent:
-            self._event("no tag is read where some should be")
+            self._event(Silence.EVENT)
         if not taken:
             return
         if self._state.localized:

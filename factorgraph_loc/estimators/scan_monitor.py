@@ -19,6 +19,9 @@ class Silence:
     """Whether no tag is read where tags should be: then the reader or the tags have failed, and not to read them tells nothing
     of the place, while it would drive an estimate to wherever no tags are."""
 
+    EVENT = "no tag is read where some should be"
+    REJECTED = "rfid: no tag read where some should be"
+
     def __init__(self) -> None:
         self._evidence = 0.0
 

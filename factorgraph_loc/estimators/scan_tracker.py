@@ -100,7 +100,7 @@ class ScanTracker:
             self._silence.add(reads, update.evidence)
             self._heard = max(self._heard, m.t)
         if self._silence.lasts:
-            self._diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
+            self._diagnostics.reject(Silence.REJECTED, len(m.antennas))
             return False
         # the finder's evidence is of what was read and not read, and so is the track's
         evidence = weigh(lambda cloud: likelihood.log_likelihood(cloud.poses, looks))

@@ -48,9 +48,9 @@ class WaitingScans:
         self._diagnostics.innovation("rfid", m.t, update.nis, update.dof)
         lasted = self._silence.lasts
         if self._silence.add(int(looks.hits.sum()), update.evidence):
-            self._diagnostics.reject("rfid: no tag read where some should be", len(m.antennas))
+            self._diagnostics.reject(Silence.REJECTED, len(m.antennas))
             if not lasted:
-                self._diagnostics.events.append((m.t, "no tag is read where some should be"))
+                self._diagnostics.events.append((m.t, Silence.EVENT))
             return None
         self._waiting += factors
         return update

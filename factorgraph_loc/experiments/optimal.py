@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from factorgraph_loc.rig import OdometryUncertainty
 from factorgraph_loc.tag_map import extent
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
+from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.se2 import Array
 
 SENSORS = ("odometry", "rfid")
 
@@ -67,9 +70,14 @@ def optimal_filter(log: Log) -> Trajectory:
             state = motion.state(m.t)
             grid.predict(motion.relative(before, state))
             before = state
-            grid.update(lambda poses, looks=looks: -likelihood.score(poses, looks).nll)  # type: ignore[misc]
+            grid.update(partial(_log_likelihood, likelihood, looks))
             mean, covariance = grid.moments()
             t.append(m.t)
             means.append(mean)
             covariances.append(covariance)
     return Trajectory(np.array(t), np.array(means).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))
+
+
+def _log_likelihood(likelihood: RfidLikelihood, looks: Looks, poses: Array) -> Array:
+    # exact, not from tables: what is optimal must not have their error
+    return -likelihood.score(poses, looks).nll
