@@ -84,15 +84,16 @@ def test_scans_that_come_late_are_put_in_at_their_time() -> None:
 @pytest.mark.parametrize(
     ("faults", "bound"),
     [
-        ({"false_reads": 0.2}, 0.3),
-        ({"misplaced": 0.1}, 0.5),
-        ({"dead": 0.2}, 0.3),
-        ({"antenna_stop": {"antenna": "1", "time": 20.0, "rounds_go_on": True}}, 0.4),
-        ({"antenna_stop": {"antenna": "1", "time": 20.0}}, 0.3),
-        ({"clock_jump": {"time": 30.0, "jump": -3.0}}, 4.0),
+        ({"false_reads": 0.2}, 0.2),
+        ({"misplaced": 0.1}, 0.3),
+        ({"dead": 0.2}, 0.2),
+        ({"antenna_stop": {"antenna": "1", "time": 20.0, "rounds_go_on": True}}, 0.3),
+        ({"antenna_stop": {"antenna": "1", "time": 20.0}}, 0.2),
+        ({"clock_jump": {"time": 30.0, "jump": -3.0}}, 2.0),
     ],
 )
 def test_faults_degrade(faults: Mapping[str, Any], bound: float) -> None:
+    """Bounds at about twice what this log has; a clock that is 3 s late costs 3 s of the way for as long as it lasts."""
     log = office(faults)
     result = run(log, RunConfig("smoother"))
     assert np.all(np.isfinite(result.poses))
