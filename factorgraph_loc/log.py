@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import compress, pairwise
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -14,14 +15,17 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.measurements import (
     BearingRange,
+    CameraFrame,
     IncrementOdometry,
     Measurement,
+    PixelSightings,
     RfidScan,
     VelocityOdometry,
     YawRate,
 )
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
@@ -133,6 +137,45 @@ class RfidStream:
 
 
 @dataclass(frozen=True)
+class SightingStream:
+    """One row an identified point in an image: its name and pixel (``u``, ``v``) [px]. Rows of one stamp belong together."""
+
+    t: Array
+    point: Sequence[str]
+    u: Array
+    v: Array
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
+        for i, j in pairwise(bounds):
+            pixels = np.column_stack((self.u[i:j], self.v[i:j]))
+            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels)
+
+
+@dataclass(frozen=True)
+class ImageStream:
+    """Images that were taken: files (N) by their paths. :mod:`factorgraph_loc.vision.frontend` turns them into features."""
+
+    t: Array
+    file: Sequence[Path]
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        raise InputError("images are no measurements before their features are found")
+
+
+@dataclass(frozen=True)
+class FeatureStream:
+    """What was found in images: ``frame`` (N), whose own stamps do not count."""
+
+    t: Array
+    frame: Sequence[CameraFrame]
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        for t, frame in zip((self.t + offset).tolist(), self.frame, strict=True):
+            yield replace(frame, t=t)
+
+
+@dataclass(frozen=True)
 class StartPose:
     """A known start: ``t`` [s], ``pose`` (3,) and standard deviations (3,) of x, y, heading."""
 
@@ -143,9 +186,11 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Log:
-    """A run. ``streams`` by sensor name (odometry, imu, bearing_range, rfid); ``t0_ns``: absolute time of t = 0 in nanoseconds.
+    """A run. ``streams`` by sensor name (odometry, imu, bearing_range, rfid, camera, sightings); ``t0_ns``: absolute time of t = 0
+    in nanoseconds.
 
-    ``warnings``: what the reader mended or left out, one line each. ``metadata``: licence, origin and the like.
+    ``reference3``: the true robot in space, of a log that was not recorded on a floor. ``warnings``: what the reader mended or
+    left out, one line each. ``metadata``: licence, origin and the like.
     """
 
     name: str
@@ -157,6 +202,7 @@ class Log:
     t0_ns: int = 0
     warnings: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
+    reference3: Trajectory3 | None = None
 
     def span(self) -> tuple[float, float]:
         """First and last stamp of all streams [s]."""

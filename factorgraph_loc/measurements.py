@@ -4,6 +4,7 @@ Stamps are those of the event, with the known offsets between clocks already app
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,31 @@ class RfidScan:
 
 
 @dataclass(frozen=True, slots=True)
+class PixelSightings:
+    """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down."""
+
+    t: float
+    points: tuple[str, ...]
+    pixels: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """The features of one image, none where it could not be read.
+
+    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left one; ``sizes`` (K,) [px] and ``descriptors``
+    (K, D), of the kind ``feature``. ``tracks`` (K,): numbers that stay with what is followed from image to image.
+    """
+
+    t: float
+    feature: str
+    pixels: Array
+    sizes: Array
+    descriptors: NDArray[Any]
+    tracks: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """No measurement: time has passed, and an estimate is wanted."""
 
@@ -79,5 +105,5 @@ class Tick:
 
 
 Odometry = VelocityOdometry | IncrementOdometry | YawRate
-Exteroceptive = BearingRange | RfidScan  # what tells of the world around the robot
+Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # what tells of the world around the robot
 Measurement = Odometry | Exteroceptive | Tick

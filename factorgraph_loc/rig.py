@@ -14,10 +14,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.files import FileModel, parse_model, read_toml, write_toml
 from factorgraph_loc.grids import write_grid
 from factorgraph_loc.rfid_settings import GridSettings, RfidSettings, SurveySettings
-from factors import bearing_range, odometry
+from factors import bearing_range, odometry, reprojection
 from factors.bearing_range import BearingRangeModel
 from factors.odometry import Growth, OdometryModel
 from factors.se2 import Array
@@ -179,6 +180,7 @@ class Rig(FileModel):
     imu: ImuSettings | None = None
     bearing_range: BearingRangeSettings | None = None
     rfid: RfidSettings | None = None
+    camera: CameraSettings | None = None
     survey: SurveySettings = SurveySettings()
 
     def odometry_model(self, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
@@ -228,9 +230,13 @@ class Rig(FileModel):
         """Which of ``factors.bearing_range.PARAMETERS`` are estimated on the way."""
         return Estimated.of(bearing_range.PARAMETERS, self.bearing_range and self.bearing_range.uncertainty)
 
+    def estimated_camera(self) -> Estimated:
+        """Which of ``factors.reprojection.PARAMETERS`` are estimated on the way."""
+        return Estimated.of(reprojection.PARAMETERS, self.camera and self.camera.uncertainty)
+
     def time_offset(self, sensor: str) -> float:
-        """Seconds to add to the stamps of a sensor's stream."""
-        settings = getattr(self, sensor, None)
+        """Seconds to add to the stamps of a sensor's stream; those of identified pixels are the camera's."""
+        settings = getattr(self, "camera" if sensor == "sightings" else sensor, None)
         return 0.0 if settings is None else float(settings.time_offset)
 
 

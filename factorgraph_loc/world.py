@@ -1,6 +1,6 @@
 """What is around the robot: landmarks and tags with their positions, read from and written to ``NAME.world.toml``.
 
-Many tags are better kept in a table beside it, ``NAME.tags.csv``.
+Many tags are better kept in a table beside it, ``NAME.tags.csv``; points that a camera sees always are, as ``NAME.points.parquet``.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
 from factorgraph_loc.csv_cells import read_cells
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
+from factorgraph_loc.points import POINTS_SUFFIX, PointMap, read_points, write_points
 from factors.se2 import Array
 
 TAGS_SUFFIX = ".tags.csv"
@@ -73,11 +74,15 @@ class Tag(FileModel):
 
 class World(FileModel):
     """A map. ``landmarks``: by name, as measurements name them. ``tags``: RFID tags by EPC, as they were surveyed: what a rig
-    knows of the survey's errors is applied where they are used. ``walls``: segments (x1, y1, x2, y2) [m]."""
+    knows of the survey's errors is applied where they are used. ``points``: what a camera sees. ``walls``: segments (x1, y1, x2,
+    y2) [m]."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     name: str = "world"
     landmarks: dict[str, Landmark] = Field(default_factory=dict)
     tags: dict[str, Tag] = Field(default_factory=dict)
+    points: PointMap | None = None
     walls: tuple[tuple[float, float, float, float], ...] = ()
 
     def position(self, landmark: str) -> Array | None:
@@ -100,6 +105,11 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
     tags = content.get("tags")
     if isinstance(tags, str):
         content = {**content, "tags": read_tags(inside(folder, tags, source))}
+    points = content.get("points")
+    if points is not None:
+        if not isinstance(points, str):
+            raise InputError(f"{source}: points is {points!r}, expected the name of a file")
+        content = {**content, "points": read_points(inside(folder, points, source))}
     return parse_model(World, content, source)
 
 
@@ -124,11 +134,16 @@ def read_tags(path: Path) -> dict[str, Tag]:
 
 
 def write_world(world: World, path: Path) -> None:
-    """Write ``NAME.world.toml``, and the tags beside it as ``NAME.tags.csv``; in the same file where one has a covariance."""
-    content = world.model_dump(mode="json", exclude_none=True)
+    """Write ``NAME.world.toml``, the tags beside it as ``NAME.tags.csv``, or in the same file where one has a covariance, and the
+    points as ``NAME.points.parquet``."""
+    content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
+    base = path.name.removesuffix(".toml").removesuffix(".world")
     if world.tags and all(tag.covariance is None for tag in world.tags.values()):
-        content["tags"] = path.name.removesuffix(".toml").removesuffix(".world") + TAGS_SUFFIX
+        content["tags"] = base + TAGS_SUFFIX
         _write_tags(world.tags, path.parent / content["tags"])
+    if world.points is not None:
+        content["points"] = base + POINTS_SUFFIX
+        write_points(world.points, path.parent / content["points"])
     write_toml(path, content)
 
 

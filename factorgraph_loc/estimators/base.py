@@ -25,13 +25,25 @@ class PosePrior:
 
 
 @dataclass(frozen=True)
+class SpacePose:
+    """A robot in space: ``position`` (3,) [m] and ``rotation`` (3, 3) in the world's frame, with the ``covariance`` (6, 6) of its
+    perturbation in its own frame, turn first, then shift, as ``gtsam.Pose3`` has them."""
+
+    position: Array
+    rotation: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
-    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame."""
+    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame; ``space``: of
+    an estimator that knows the robot's pose in space."""
 
     t: float
     pose: Array
     covariance: Array
     status: Status
+    space: SpacePose | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,16 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEst
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import (
+    BearingRange,
+    CameraFrame,
+    Exteroceptive,
+    Measurement,
+    Odometry,
+    PixelSightings,
+    RfidScan,
+    Tick,
+)
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.odometry import ChainState, Increment
@@ -65,6 +74,8 @@ class Filter(ABC):
             self._motion.add(measurement)
         elif isinstance(measurement, RfidScan) and not self.takes_scans:
             self.diagnostics.ignore("rfid", len(measurement.antennas))
+        elif isinstance(measurement, PixelSightings | CameraFrame):
+            self.diagnostics.ignore("camera", len(measurement.pixels))
         elif self._state is None:
             self._begin(measurement)
         elif measurement.t >= self._t:
@@ -143,7 +154,7 @@ class Filter(ABC):
             self._ticks.append(m.t)
         elif isinstance(m, RfidScan):
             self._scan(m)
-        else:
+        elif isinstance(m, BearingRange):
             self._update(m)
         self._records.append(self._record())
 

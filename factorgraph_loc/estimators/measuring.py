@@ -57,8 +57,10 @@ class MeasuringGraph(KeyframeGraph):
         self._t = max(self._t, m.t)
         if isinstance(m, RfidScan):
             self._scan(m)
-        else:
+        elif isinstance(m, BearingRange):
             self._see(m)
+        else:
+            self.diagnostics.ignore("camera", len(m.pixels))
 
     def _drop_late(self, m: Exteroceptive | Tick) -> None:
         if isinstance(m, BearingRange):

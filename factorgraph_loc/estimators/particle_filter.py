@@ -117,7 +117,7 @@ class ParticleFilter(Filter):
     def _seek(self, m: Exteroceptive) -> Cloud | None:
         if isinstance(m, RfidScan):
             return self._sought() if self._scans.seek(m, self._odometry) else None
-        seen = self._landmarks.factor(m)
+        seen = self._landmarks.factor(m) if isinstance(m, BearingRange) else None
         if seen is None:
             return None
         self._landmarks.seek(seen, self._odometry)

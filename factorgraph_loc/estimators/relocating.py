@@ -26,7 +26,7 @@ from factorgraph_loc.estimators.scan_finder import ScanFinder
 from factorgraph_loc.estimators.scan_monitor import ScanMonitor
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.tag_map import extent
 from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
@@ -132,7 +132,7 @@ class RelocatingGraph(MeasuringGraph):
                 return False
             self._finder.add(state, looks)
         else:
-            seen = self._sought.factor(m)
+            seen = self._sought.factor(m) if isinstance(m, BearingRange) else None
             if seen is None or self._finder is not None:
                 return False
             self._relocalizer.add(state, seen)

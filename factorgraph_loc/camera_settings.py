@@ -1,0 +1,93 @@
+"""The camera of a rig, as it stands in ``NAME.rig.toml``."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.files import FileModel
+from factors import reprojection
+from factors.reprojection import CameraModel
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Focal = Annotated[float, Field(gt=1.0, le=1e5, description="px")]
+Pixel = Annotated[float, Field(ge=-1e5, le=1e5, description="px")]
+Side = Annotated[int, Field(ge=16, le=100_000, description="px")]
+Metres = Annotated[float, Field(ge=0.0, le=10.0, description="m")]
+Turn = Annotated[float, Field(ge=0.0, le=1.0, description="rad")]
+
+
+class CameraUncertainty(FileModel):
+    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
+
+    ``roll``, ``pitch``, ``yaw``: of turns about the robot's axes; ``focal``: of the focal length, as a share.
+    """
+
+    x: Metres = 0.0
+    y: Metres = 0.0
+    z: Metres = 0.0
+    roll: Turn = 0.0
+    pitch: Turn = 0.0
+    yaw: Turn = 0.0
+    focal: Annotated[float, Field(ge=0.0, le=1.0, description="as a share")] = 0.0
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
+
+
+class FrontendSettings(FileModel):
+    """What is looked for in images: the ``feature`` by its name, and at most how many (``count``) in an image."""
+
+    feature: Literal["colour", "sift", "orb"] = "colour"
+    count: Annotated[int, Field(ge=10, le=20_000)] = 500
+
+
+class CameraSettings(FileModel):
+    """A camera. See :class:`factors.reprojection.CameraModel` for the model.
+
+    Mounted at (x, y, z) it looks along the robot's x axis, then turned by ``roll`` about x, ``pitch`` about y (down where
+    positive) and ``yaw`` about z (to the left). ``time_offset`` [s] is added to the stamps of its images. ``pixel_sigma`` [px] and
+    ``robust``, the scale of Huber's loss in standard deviations: of a feature found and matched, the errors of lens and
+    mounting included.
+    """
+
+    time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
+    width: Side = 640
+    height: Side = 480
+    fx: Focal
+    fy: Focal
+    cx: Pixel
+    cy: Pixel
+    distortion: Annotated[tuple[float, float, float, float], Field(description="k1, k2, p1, p2 as OpenCV has them")] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
+    x: Offset = 0.0
+    y: Offset = 0.0
+    z: Offset = 0.0
+    roll: Angle = 0.0
+    pitch: Angle = 0.0
+    yaw: Angle = 0.0
+    pixel_sigma: Annotated[float, Field(gt=0.0, le=100.0, description="px")] = 1.0
+    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
+    frontend: FrontendSettings = FrontendSettings()
+    uncertainty: CameraUncertainty = CameraUncertainty()
+
+    def model(self) -> CameraModel:
+        return CameraModel(
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            width=self.width,
+            height=self.height,
+            distortion=self.distortion,
+            position=np.array((self.x, self.y, self.z)),
+            rotation=reprojection.mounting(self.roll, self.pitch, self.yaw),
+            sigma=self.pixel_sigma,
+            robust=self.robust,
+        )

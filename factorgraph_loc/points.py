@@ -1,0 +1,152 @@
+"""A map of 3-D points with what they look like, kept as ``NAME.points.parquet`` beside a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import replacing
+from factors.se2 import Array
+
+POINTS_SUFFIX = ".points.parquet"
+COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class PointMap:
+    """P points and V views of them.
+
+    ``names``: P, unique; ``positions`` (P, 3) [m] in the world's frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
+    the views' ``descriptors`` (V, D), empty where points are identified by name alone (V = 0). ``owners`` (V,): which point a view
+    shows; ``seen_from`` (V, 3) [m]: where the camera was; ``sizes`` (V,) [px]: of the feature in that image.
+    """
+
+    names: tuple[str, ...]
+    positions: Array
+    covariances: Array
+    feature: str
+    owners: NDArray[np.int64]
+    descriptors: NDArray[Any]
+    seen_from: Array
+    sizes: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PointMap):
+            return NotImplemented
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """The place of each name."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    @classmethod
+    def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
+        """Points that are known by name alone; exact where no covariances are given."""
+        spread = np.zeros((len(names), 3, 3)) if covariances is None else covariances
+        nothing = np.empty(0)
+        return cls(
+            tuple(names),
+            positions,
+            spread,
+            "",
+            np.empty(0, dtype=np.int64),
+            np.empty((0, 0)),
+            np.empty((0, 3)),
+            nothing,
+        )
+
+
+def write_points(points: PointMap, path: Path) -> None:
+    """Write ``NAME.points.parquet``: one row a view; a point without views has one row without a descriptor."""
+    seen = np.zeros(len(points), dtype=bool)
+    seen[points.owners] = True
+    unseen = np.flatnonzero(~seen)
+    rows = np.concatenate((points.owners, unseen))
+    order = np.argsort(rows, kind="stable")
+    rows, views = rows[order], np.concatenate((np.arange(len(points.owners)), np.full(len(unseen), -1)))[order]
+    columns: dict[str, Any] = {"point": [points.names[i] for i in rows.tolist()]}
+    columns |= {name: points.positions[rows, axis] for axis, name in enumerate("xyz")}
+    columns |= {name: points.covariances[rows, i, j] for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True)}
+    columns["feature"] = [points.feature if v >= 0 else "" for v in views.tolist()]
+    if len(points.owners):
+        shown = views >= 0
+        for axis, name in enumerate(("from_x", "from_y", "from_z")):
+            columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
+        columns["size"] = np.where(shown, points.sizes[views], np.nan)
+        columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
+    with replacing(path) as temporary:
+        pl.DataFrame(columns).write_parquet(temporary)
+
+
+def read_points(path: Path) -> PointMap:
+    """Read ``NAME.points.parquet``; InputError names file and column of what is wrong."""
+    try:
+        table = pl.read_parquet(path)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"{path}: is not a table of points: {str(error).splitlines()[0]}") from error
+    missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
+    if missing:
+        raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
+    numbers = {name: _numbers(table, name, path) for name in COLUMNS[1:]}
+    for name, values in numbers.items():
+        if len(bad := np.flatnonzero(~np.isfinite(values))):
+            raise bad_field(path, name, float(values[bad[0]]), "a finite number", row=int(bad[0]) + 1)
+    rows: dict[str, int] = {}
+    labels = [str(name) for name in table["point"].to_list()]
+    owner = np.array([rows.setdefault(name, len(rows)) for name in labels], dtype=np.int64)
+    _, first = np.unique(owner, return_index=True)
+    positions = np.column_stack([numbers[axis] for axis in "xyz"])
+    covariances = np.empty((len(rows), 3, 3))
+    for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
+        covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
+    features = [str(name) for name in table["feature"].to_list()]
+    kinds = sorted({name for name in features if name})
+    if len(kinds) > 1:
+        raise InputError(f"{path}: has features of the kinds {', '.join(kinds)}, expected one kind")
+    if not kinds:
+        return PointMap.of(tuple(rows), positions[first], covariances)
+    shown = np.flatnonzero([bool(name) for name in features])
+    columns = [_numbers(table, name, path)[shown] for name in ("from_x", "from_y", "from_z", "size")]
+    return PointMap(
+        tuple(rows),
+        positions[first],
+        covariances,
+        kinds[0],
+        owner[shown],
+        _descriptors(table, shown, kinds[0], path),
+        np.column_stack(columns[:3]),
+        columns[3],
+    )
+
+
+def _numbers(table: pl.DataFrame, name: str, path: Path) -> Array:
+    if name not in table.columns or not table[name].dtype.is_numeric():
+        raise InputError(f"{path}: has no column {name} of numbers")
+    return np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)
+
+
+def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, path: Path) -> NDArray[Any]:
+    kind = np.uint8 if feature == "orb" else np.float32
+    if "descriptor" not in table.columns or table["descriptor"].dtype != pl.Binary:
+        raise InputError(f"{path}: has no column descriptor of bytes")
+    content = table["descriptor"].to_list()
+    chosen = [content[i] or b"" for i in rows.tolist()]
+    if len({len(row) for row in chosen}) != 1 or not chosen[0] or len(chosen[0]) % np.dtype(kind).itemsize:
+        raise InputError(f"{path}: descriptors differ in their length, expected one length for feature {feature}")
+    return np.frombuffer(b"".join(chosen), dtype=kind).reshape(len(chosen), -1).copy()

@@ -1,0 +1,121 @@
+"""Points seen by a camera as a factor on a pose, and where they are not known, or constants of the camera are not, on those too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import se2
+from factors.reprojection import (
+    PARAMETERS,
+    TIME_OFFSET,
+    CameraModel,
+    huber_loss,
+    huber_weight,
+    linearize,
+    recalibrated,
+)
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, slots=True)
+class ReprojectionFactor:
+    """K points seen in one image, as a factor on the robot's pose then or a little earlier.
+
+    ``points`` (K, 3): of the world; ``pixels`` (K, 2): where they are seen; ``point_covariances`` (K, 3, 3) of a
+    map that is not exact widen the noise. ``offset`` (3,): the pose at the image's time in the frame of the variable's pose,
+    known from odometry; ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``twist`` (3,): the
+    robot's velocity then.
+
+    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
+    constants (P,); then, where ``free``, the position (3,) of the one point, in place of ``points``.
+    """
+
+    model: CameraModel
+    points: Array
+    pixels: Array
+    offset: Array | None = None
+    offset_covariance: Array | None = None
+    point_covariances: Array | None = None
+    estimated: tuple[int, ...] = ()
+    free: bool = False
+    twist: Array | None = None
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        error, blocks = self.whitened(values)
+        weight = np.sqrt(huber_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
+        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
+        return (weight[:, None] * error).ravel(), weighted
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss."""
+        error, _ = self.whitened(values)
+        return float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
+
+    def widened(self, width: float) -> ReprojectionFactor:
+        """The same with a robust loss that is ``width`` times as wide."""
+        return replace(self, model=replace(self.model, robust=width * self.model.robust))
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+        offset = here.offset
+        at = values[0] if offset is None else se2.compose(values[0], offset)
+        pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
+        error = (pixels - self.pixels) / self.model.sigma
+        scale = 1.0 / self.model.sigma
+        by_pose = scale * by_pose
+        blocks = [by_pose]
+        if self.estimated:
+            by_parameters = scale * by_parameters
+            by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
+            if self.twist is not None:
+                by_parameters[..., TIME_OFFSET] = by_pose @ self.twist
+            blocks.append(by_parameters[..., list(self.estimated)])
+        if self.free:
+            blocks.append(scale * by_point)
+        if self.offset_covariance is not None or self.point_covariances is not None:
+            spread = np.zeros((len(error), 2, 2)) + np.eye(2)
+            if self.offset_covariance is not None:
+                spread += by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
+            if self.point_covariances is not None:
+                spread += scale**2 * by_point @ self.point_covariances @ by_point.transpose(0, 2, 1)
+            whitener = np.linalg.inv(np.linalg.cholesky(spread))
+            error = np.einsum("kij,kj->ki", whitener, error)
+            blocks = [whitener @ block for block in blocks]
+        if offset is not None:
+            blocks[0] = blocks[0] @ se2.adjoint(se2.inverse(offset))
+        return error, blocks
+
+    def fixed(self, parameters: Sequence[Array], point: Array | None) -> ReprojectionFactor:
+        """The factor on the pose alone, at given constants (one array (P,), or none) and position (3,) of a free point."""
+        if not parameters and point is None:
+            return self
+        model, offset = self.model, self.offset
+        if parameters:
+            changes = np.zeros(len(PARAMETERS))
+            changes[list(self.estimated)] = parameters[0]
+            model = recalibrated(model, changes)
+            if self.twist is not None and changes[TIME_OFFSET] != 0.0:
+                later = se2.exp(self.twist * changes[TIME_OFFSET])
+                offset = later if offset is None else se2.compose(offset, later)
+        points = self.points if point is None else point[None]
+        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+
+    def dof(self) -> int:
+        """How many coordinates of pixels are measured."""
+        return 2 * len(self.pixels)
+
+
+def _turns(estimated: tuple[int, ...], changes: Array) -> Array:
+    """How small turns (3, 3) follow from changes of the camera's turn: the left Jacobian of SO(3), which is the right one of
+    the opposite turn."""
+    turn = np.zeros(3)
+    for place, value in zip(estimated, changes.tolist(), strict=True):
+        if place in (3, 4, 5):
+            turn[place - 3] = value
+    return np.asarray(gtsam.Rot3.ExpmapDerivative(-turn))
