@@ -73,8 +73,10 @@ def seconds(t_ns: Integers, t0_ns: int) -> Array:
 
 
 def look_over(log: Log) -> list[str]:
-    """Warnings about a whole log; InputError if it has no odometry."""
+    """Warnings about a whole log; InputError if it has no odometry, which only a camera that is carried by hand may lack."""
     odometry = log.streams.get("odometry")
+    if odometry is None and log.reference3 is not None:
+        return []
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")
     warnings = []

@@ -18,6 +18,7 @@ READERS: dict[str, str] = {
     "mrclam": "factorgraph_loc.readers.mrclam",
     "plaza": "factorgraph_loc.readers.plaza",
     "rf_robot": "factorgraph_loc.readers.rf_robot",
+    "sevenscenes": "factorgraph_loc.readers.sevenscenes",
     "utias_woods": "factorgraph_loc.readers.utias_woods",
 }
 
