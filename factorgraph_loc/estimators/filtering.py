@@ -67,6 +67,7 @@ class Filter(ABC):
         self._t = prior.t
         self._odometry = self._motion.state(prior.t)
         self._state = self._start(prior)
+        self._events.clear()
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""

@@ -20,6 +20,7 @@ ESTIMATORS = {
     "dead_reckoning": ("dead_reckoning", "DeadReckoning", "DeadReckoningSettings"),
     "ekf": ("ekf", "Ekf", "EkfSettings"),
     "particle_filter": ("particle_filter", "ParticleFilter", "ParticleFilterSettings"),
+    "switching": ("switching", "Switching", "SwitchingSettings"),
     "smoother": ("smoother", "Smoother", "SmootherSettings"),
     "batch": ("batch", "Batch", "BatchSettings"),
 }

@@ -1,0 +1,105 @@
+"""The paper's rule: who has the word, what is handed over, and what is made of it afterwards."""
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.measurements import RfidScan, Tick
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation import simulate as simulate_office
+from factors import se2
+
+BOTH = ("odometry", "rfid", "bearing_range")
+SIGHT, TAGS = ("odometry", "bearing_range"), ("odometry", "rfid")
+
+
+@pytest.fixture(scope="module")
+def office():
+    """A minute in an office with few tags, which are read now and then, and landmarks."""
+    changes = {"world": {"tags": 5, "landmarks": 30}, "drive": {"duration": 60}}
+    return simulate_office(preset("office", changes), 3)
+
+
+def position_rmse(log, t, poses):
+    error = poses[:, :2] - log.reference.at(t)[:, :2]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def scan(t, *tags):
+    count = len(tags)
+    nothing = np.full(count, np.nan)
+    return RfidScan(t, ("0",), np.zeros(count, dtype=np.int64), tags, np.zeros(count), nothing, nothing, nothing)
+
+
+def made(log, sensors=BOTH, **settings):
+    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(0))
+    return registry.create("switching", setup, registry.settings_of("switching", settings))
+
+
+def test_without_scans_it_is_the_ekf(office):
+    plain = {"self_calibration": False}
+    alone = run(office, RunConfig("ekf", plain, sensors=SIGHT))
+    switched = run(office, RunConfig("switching", {}, sensors=SIGHT))
+    np.testing.assert_allclose(switched.poses, alone.poses, atol=1e-12)
+    # smoothed apart from each other, by the same equations
+    assert np.abs(switched.final.poses[:, :2] - alone.final.poses[:, :2]).max() < 1e-3
+    np.testing.assert_allclose(switched.final.covariances, alone.final.covariances, rtol=0.05, atol=1e-6)
+
+
+def test_while_tags_are_read_it_is_the_particle_filter(office):
+    plain = {"self_calibration": False, "smooth": False, "particles": 500}
+    alone = run(office, RunConfig("particle_filter", plain, sensors=TAGS))
+    switched = run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
+    scans = list(office.measurements(("rfid",)))
+    silent = next(m.t for m in scans if not m.tags)
+    until = switched.t < silent
+    assert until.sum() > 10
+    np.testing.assert_array_equal(switched.poses[until], alone.poses[until])
+
+
+def test_it_hands_over_mean_and_covariance(office):
+    estimator = made(office)
+    tag = next(iter(office.world.tags))
+    start = PosePrior(0.0, office.reference.poses[0], np.diag((0.1, 0.2, 0.05)) ** 2)
+    estimator.initialize(start)
+    estimator.process(Tick(0.0))
+    before = estimator.estimate()
+    estimator.process(scan(0.0))  # nothing was read: the EKF goes on
+    after = estimator.estimate()
+    np.testing.assert_allclose(after.pose, before.pose, atol=1e-12)
+    np.testing.assert_allclose(after.covariance, before.covariance, atol=1e-6)
+    assert estimator.belief().particles is None
+    estimator.process(scan(0.1, tag))
+    assert estimator.belief().particles is not None
+    estimator.process(scan(0.2, "not in the map"))
+    assert estimator.belief().particles is None
+
+
+def test_what_the_other_filter_would_take_is_counted(office):
+    result = run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
+    ignored = result.diagnostics.ignored
+    assert ignored["landmarks while tags are read"] > 0
+    assert ignored["rfid while no tag is read"] > 0
+    sightings = sum(1 for _ in office.measurements(("bearing_range",)))
+    assert ignored["landmarks while tags are read"] < sightings
+
+
+def test_vision_and_smoothing_help(office):
+    switched = run(office, RunConfig("switching", {"particles": 1000}, sensors=BOTH))
+    odometry = run(office, RunConfig("dead_reckoning"))
+    causal, final = (position_rmse(office, x.t, x.poses) for x in (switched, switched.final))
+    assert final < causal < position_rmse(office, odometry.t, odometry.poses)
+    np.testing.assert_array_equal(switched.t, switched.final.t)
+    off = run(office, RunConfig("switching", {"particles": 1000, "smooth": False}, sensors=BOTH))
+    np.testing.assert_allclose(off.final.poses[:, :2], off.poses[:, :2], atol=1e-9)
+    np.testing.assert_allclose(se2.wrap(off.final.poses[:, 2] - off.poses[:, 2]), 0.0, atol=1e-9)
+
+
+def test_an_unknown_start_needs_tags(office):
+    assert made(office, BOTH).supports_unknown_start
+    assert not made(office, SIGHT).supports_unknown_start
+    result = run(office, RunConfig("switching", {"particles": 2000}, sensors=BOTH, prior="unknown", seed=1))
+    assert result.status[-1] == "localized"
+    assert np.hypot(*(result.poses[-1] - office.reference.at(result.t[-1:])[0])[:2]) < 0.5
