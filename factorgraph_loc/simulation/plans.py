@@ -19,6 +19,7 @@ CORRIDOR_WIDTH = 2.0
 DOOR_WIDTH = 1.0
 SHELF_DEPTH = 1.0
 AISLE_WIDTH = 3.0
+LOWEST_BOX = 1.4  # m: no furniture and no shelf is lower
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,15 @@ class Plan:
     def open(self, points: Array) -> NDArray[np.bool_]:
         """Whether points (N, 2) are in the building and in none of the boxes."""
         x, y = points.T
-        out = (x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth)
+        out = self.indoors(points)
         for x1, y1, x2, y2 in self.boxes:
             out &= (x < x1) | (x > x2) | (y < y1) | (y > y2)
         return np.asarray(out)
+
+    def indoors(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 2) are in the building, in a box or not."""
+        x, y = points.T
+        return np.asarray((x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth))
 
     def _is_inside(self, face: Segment) -> bool:
         """Whether the left side of a face is in the building."""

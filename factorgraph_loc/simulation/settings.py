@@ -24,6 +24,7 @@ class WorldSettings(FileModel):
 
     ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
     ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
+    ``points``: named points on walls and furniture that a camera may see (:class:`PixelSettings`).
     """
 
     plan: Literal["office", "hall", "warehouse"] = "office"
@@ -35,6 +36,7 @@ class WorldSettings(FileModel):
     tag_height: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 1.2
     even: bool = False
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
+    points: Annotated[int, Field(ge=0, le=10_000)] = 0
 
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:
@@ -85,6 +87,16 @@ class SightingSettings(FileModel):
     field_of_view: Annotated[float, Field(gt=0.0, le=6.3, description="rad")] = 6.3
 
 
+class PixelSettings(FileModel):
+    """Which named points the camera identifies: at ``rate`` looks per second at most ``max_points`` of those in sight, chosen at
+    random, that are at most ``max_depth`` ahead. A share ``wrong`` of them is reported anywhere in the image."""
+
+    rate: Hertz = 5.0
+    max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
+    max_depth: Metres = 10.0
+    wrong: Share = 0.0
+
+
 class Fading(FileModel):
     """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
 
@@ -133,15 +145,18 @@ class FaultSettings(FileModel):
 
 class SimulationSettings(FileModel):
     """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rssi``, ``phase``: if given, reads have
-    one. ``rig``: what estimators are told, and what reads and sightings are drawn from."""
+    one. ``rig``: what estimators are told, and what reads and sightings are drawn from. ``world_seed``: of the world, its look and
+    its survey, if several drives are to go through one world; else the seed of the log is theirs too."""
 
     name: str = "office"
     world: WorldSettings
+    world_seed: Annotated[int, Field(ge=0)] | None = None
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
     rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None
     sightings: SightingSettings = SightingSettings()
+    pixels: PixelSettings = PixelSettings()
     faults: FaultSettings = FaultSettings()
     rig: Rig
 
@@ -151,6 +166,8 @@ class SimulationSettings(FileModel):
             raise ValueError("the rig has no rfid, expected antennas")
         if self.world.landmarks and self.rig.bearing_range is None:
             raise ValueError("the world has landmarks, expected a rig with bearing_range")
+        if self.world.points and self.rig.camera is None:
+            raise ValueError("the world has points, expected a rig with a camera")
         stop = self.faults.antenna_stop
         names = list(self.rig.rfid.all_antennas())
         if stop is not None and stop.antenna not in names:
@@ -178,6 +195,17 @@ RACKHAM_RIG: Mapping[str, Any] = {
         "tempering": 1.0,
     },
     "bearing_range": {"range_sigma": 0.05, "range_sigma_relative": 0.02, "bearing_sigma": 0.02},
+    # a little upwards: there is more to see on walls than on floors
+    "camera": {
+        "fx": 410.0,
+        "fy": 411.0,
+        "cx": 322.0,
+        "cy": 238.0,
+        "distortion": [-0.06, 0.012, 4e-4, -3e-4],
+        "x": 0.2,
+        "z": 1.0,
+        "pitch": -0.08,
+    },
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
 # Fades of a share f that last d in the mean make the count of reads in many rounds, dt apart, vary more than independent rounds

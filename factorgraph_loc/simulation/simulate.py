@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from factorgraph_loc.log import Log, StartPose, Stream
 from factorgraph_loc.readers.simulated_odometry import wheel_odometry
 from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.pixels import pixel_stream
 from factorgraph_loc.simulation.recorded import RecordedLooks
 from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
@@ -31,17 +33,19 @@ START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad
 def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | None = None) -> Log:
     """The log of ``settings`` and ``seed``; the same both, the same log, to the last bit.
 
-    Streams: odometry, rfid, and bearing_range where the world has landmarks. The reference is the true trajectory. The stated
-    start is the true pose with an error drawn from the deviations that it states (:data:`START_SIGMAS`), as consistency needs
-    it. World, drive and each sensor draw from generators of their own, so that to change one leaves the others as they are.
+    Streams: odometry, rfid, bearing_range where the world has landmarks, and sightings where it has points. The reference is
+    the true trajectory. The stated start is the true pose with an error drawn from the deviations that it states
+    (:data:`START_SIGMAS`), as consistency needs it. World, drive and each sensor draw from generators of their own, so that to
+    change one leaves the others as they are.
     With ``recorded`` the robot carries the antennas of those recordings, and reads what they read (:mod:`.recorded`).
     InputError if the settings leave no room for tags or for the robot.
     """
-    rngs = np.random.default_rng(seed).spawn(9)
+    rngs = generators(seed)
+    of_world = rngs if settings.world_seed is None else generators(settings.world_seed)
     rig = settings.rig
     if recorded is not None:
         rig = rig.model_copy(update={"rfid": recorded.rfid, "survey": SurveySettings()})
-    world = make_world(settings.world, rngs[0])
+    world = make_world(settings.world, of_world[0])
     truth = drive(world, settings.drive, rngs[1])
     streams: dict[str, Stream] = {
         "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
@@ -51,10 +55,16 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         times = _ticks(settings.sightings.rate, truth)
         model = rig.bearing_range.model()
         streams["bearing_range"] = sighting_stream(model, world, times, truth.at(times), settings.sightings, rngs[4])
-    surveyed, misplaced = _surveyed(world, settings.faults, rngs[5])
+    if world.points is not None and rig.camera is not None:
+        times = _ticks(settings.pixels.rate, truth)
+        seen = pixel_stream(rig.camera.model(), world, times, truth.at(times), settings.pixels, rngs[9])
+        streams["sightings"] = replace(seen, t=seen.t - rig.camera.time_offset)
+    surveyed, misplaced = _surveyed(world, settings.faults, of_world[5])
     start = truth.poses[0] + START_SIGMAS * rngs[6].standard_normal(3)
     start[2] = se2.wrap_scalar(start[2])
     metadata = {"origin": f"simulated by fgloc {__version__}", "preset": settings.name, "seed": str(seed)}
+    if settings.world_seed is not None:
+        metadata["world_seed"] = str(settings.world_seed)
     warnings = []
     if recorded is not None:
         metadata["reads"] = "outcomes of recorded rounds at like range, bearing, height and facing"
@@ -73,6 +83,12 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         warnings=tuple(warnings),
         metadata=metadata,
     )
+
+
+def generators(seed: int) -> list[np.random.Generator]:
+    """Those of: world, drive, odometry, reads, landmarks, survey, start, strengths, phases, points. More of them may follow: the
+    first ones stay what they are."""
+    return np.random.default_rng(seed).spawn(10)
 
 
 def _reads(

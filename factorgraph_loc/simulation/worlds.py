@@ -1,22 +1,25 @@
-"""Worlds with tags and landmarks: what is put where on a floor plan."""
+"""Worlds with tags, landmarks and points: what is put where on a floor plan."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.simulation.plans import Plan, make_plan
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.simulation.plans import LOWEST_BOX, Plan, make_plan
 from factorgraph_loc.simulation.settings import WorldSettings
 from factorgraph_loc.world import Landmark, Tag, World
 from factors.se2 import Array
 
-STANDOFF = 0.02  # m, of a tag from the surface that it is on
+STANDOFF = 0.02  # m, of a tag or point from the surface that it is on
+POINT_HEIGHTS = (0.3, 2.2)  # m, from and to, on walls
 IN_FRONT = 0.3  # m of a tag there is nothing
 CANDIDATES = 10  # places that each tag is chosen from, for the farthest from the others
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """A world with walls (those of furniture and shelves too), tags ``T000``... and landmarks ``L000``....
+    """A world with walls (those of furniture and shelves too), tags ``T000``..., landmarks ``L000``... and points
+    ``P0000``....
 
     Tags on surfaces face away from them; those on the floor lie at height 0 and face nowhere. InputError if the plan lacks the
     surfaces.
@@ -42,6 +45,7 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
         name=settings.plan,
         tags=tags,
         landmarks={f"L{i:03d}": Landmark(x=x, y=y) for i, (x, y) in enumerate(landmarks)},
+        points=_points(plan, walls, boxes, settings.points, rng) if settings.points else None,
         walls=tuple((a, b, c, d) for a, b, c, d in plan.segments().round(3).tolist()),
     )
 
@@ -59,6 +63,17 @@ def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> A
         gaps = np.hypot(*(candidates[:, None, :2] - out[None, :i, :2]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
         out[i] = candidates[np.where(plan.open(in_front), gaps, -1.0).argmax()]
     return out.round(3)
+
+
+def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.Generator) -> PointMap:
+    """Points spread along walls and furniture, at heights drawn from :data:`POINT_HEIGHTS`, on furniture up to its top."""
+    places = _spread(plan, np.concatenate((walls, boxes)), count, rng)
+    x, y, facing = places.T
+    behind = np.column_stack((x - 2.0 * STANDOFF * np.cos(facing), y - 2.0 * STANDOFF * np.sin(facing)))
+    on_wall = plan.open(behind) | ~plan.indoors(behind)
+    low, high = POINT_HEIGHTS
+    z = low + (np.where(on_wall, high, LOWEST_BOX) - low) * rng.random(count)
+    return PointMap.of([f"P{i:04d}" for i in range(count)], np.column_stack((x, y, z.round(3))))
 
 
 def _even(settings: WorldSettings, count: int) -> Array:
