@@ -16,16 +16,21 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.log import (
     BearingRangeStream,
+    FeatureStream,
+    ImageStream,
     IncrementStream,
     Log,
     RfidStream,
+    SightingStream,
     StartPose,
     Stream,
     VelocityStream,
     YawRateStream,
 )
+from factorgraph_loc.points import POINTS_SUFFIX
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.manifests import StartSettings
+from factorgraph_loc.readers.native_camera import IMAGES, PIXELS, make_images, make_pixels, write_images
 from factorgraph_loc.readers.native_rfid import INVENTORIES, READS, read_rounds, tables_of
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
@@ -45,6 +50,8 @@ SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
     "bearing_range": (("t_ns", "landmark", "range", "bearing"),),
     "rfid": READS,
     "inventories": (INVENTORIES,),  # of the sensor rfid too
+    "camera": (IMAGES,),
+    "sightings": (PIXELS,),
 }
 ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 SUFFIXES = (".csv", ".parquet")
@@ -135,7 +142,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
     unread = sorted(
         file.name
         for file in folder.iterdir()
-        if file.suffix in SUFFIXES and file.stem not in SHAPES and not file.name.endswith(TAGS_SUFFIX)
+        if file.suffix in SUFFIXES and file.stem not in SHAPES and not file.name.endswith((TAGS_SUFFIX, POINTS_SUFFIX))
     )
     if unread:
         warnings.append(f"{folder}: this version does not read {', '.join(unread)}")
@@ -144,8 +151,13 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
 
 def make_stream(sensor: str, table: Table, t0_ns: int, warnings: list[str]) -> Stream:
     """A table as a stream; what is wrong in it is an InputError or a line in ``warnings``."""
-    if sensor == "bearing_range":
-        return make_sightings(table, t0_ns, warnings)
+    match sensor:
+        case "bearing_range":
+            return make_sightings(table, t0_ns, warnings)
+        case "camera":
+            return make_images(table, t0_ns, warnings)
+        case "sightings":
+            return make_pixels(table, t0_ns, warnings)
     for field, values in table.numbers.items():
         checks.require_finite(table.path, table.rows, field, values)
     keep = checks.in_order(table.path, table.rows, table.t_ns, warnings)
@@ -186,7 +198,8 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
     """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
-    written, and of a start's deviations in x and y only the larger one.
+    written, and of a start's deviations in x and y only the larger one. Images are links to those of ``log`` where the file
+    system has links; features that were found in images cannot be written: InputError.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
@@ -212,7 +225,12 @@ def write_files(log: Log, folder: Path, format: str) -> None:
             write_table(folder / f"{sensor}.{format}", reads)
             write_table(folder / f"inventories.{format}", inventories)
             continue
-        columns = {"t_ns": absolute(stream.t, log.t0_ns), **columns_of(stream)}
+        if isinstance(stream, FeatureStream):
+            raise InputError(f"{log.name}: {sensor} holds features, expected the images in which they were found")
+        columns: dict[str, Any] = {"t_ns": absolute(stream.t, log.t0_ns)}
+        columns |= (
+            {"file": write_images(stream.file, folder)} if isinstance(stream, ImageStream) else columns_of(stream)
+        )
         write_table(folder / f"{sensor}.{format}", columns)
     if log.reference is not None:
         run["has_heading"] = log.reference.has_heading
@@ -239,6 +257,8 @@ def columns_of(stream: Stream) -> Mapping[str, Array | Sequence[str]]:
             return {"w": stream.w}
         case BearingRangeStream():
             return {"landmark": list(stream.landmark), "range": stream.range, "bearing": stream.bearing}
+        case SightingStream():
+            return {"landmark": list(stream.point), "u": stream.u, "v": stream.v}
     raise TypeError(f"the native format has no table for {type(stream).__name__}")
 
 

@@ -15,7 +15,12 @@ from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
 STAMP = "t_ns"
-NAMES = {"landmark": "the name of a landmark", "antenna": "the name of an antenna", "epc": "the EPC of a tag"}
+NAMES = {
+    "landmark": "the name of a landmark",
+    "antenna": "the name of an antenna",
+    "epc": "the EPC of a tag",
+    "file": "the name of an image",
+}
 MAX_STAMP = 2**62  # ns: leaves room for differences in 64 bits
 
 

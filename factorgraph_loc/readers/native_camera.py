@@ -1,0 +1,81 @@
+"""Images and identified pixels in the native format: ``camera.csv`` with the folder ``camera``, and ``sightings.csv``.
+
+Images are not opened here: whether they can be decoded, and have the size that the camera was calibrated for, is found out
+where their features are looked for (:mod:`factorgraph_loc.vision.frontend`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import inside
+from factorgraph_loc.log import ImageStream, SightingStream
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.tables import Table
+
+IMAGES = ("t_ns", "file")
+PIXELS = ("t_ns", "landmark", "u", "v")
+FOLDER = "camera"
+
+
+def make_images(table: Table, t0_ns: int, warnings: list[str]) -> ImageStream:
+    """The images that there are, in order of arrival; of several at one stamp the last.
+
+    InputError for a path that leaves the log's folder, and a stamp that is late by more than 0.5 s."""
+    checks.arrivals(table.path, table.rows, table.t_ns, warnings)
+    paths = [_image(table.path, row, name) for row, name in zip(table.rows.tolist(), table.names["file"], strict=True)]
+    last = {t: i for i, t in enumerate(table.t_ns.tolist())}
+    if dropped := len(paths) - len(last):
+        warnings.append(f"{table.path}: {dropped} rows have the stamp of a later row and are left out")
+    latest = sorted(last.values())
+    keep = [i for i in latest if paths[i] is not None]
+    if missing := [i for i in latest if paths[i] is None]:
+        first = f"{table.names['file'][missing[0]]} of row {table.rows[missing[0]]}"
+        warnings.append(
+            f"{table.path}: {len(missing)} of {len(latest)} images are missing and left out, the first is {first}"
+        )
+    t = checks.seconds(table.t_ns[keep], t0_ns)
+    return ImageStream(t, [path for path in (paths[i] for i in keep) if path is not None])
+
+
+def make_pixels(table: Table, t0_ns: int, warnings: list[str]) -> SightingStream:
+    """Identified pixels in order of arrival; of one point at one stamp the last."""
+    for field in ("u", "v"):
+        checks.require_finite(table.path, table.rows, field, table.numbers[field])
+    names = table.names["landmark"]
+    keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
+    t = checks.seconds(table.t_ns[keep], t0_ns)
+    return SightingStream(t, [names[i] for i in keep], table.numbers["u"][keep], table.numbers["v"][keep])
+
+
+def write_images(files: Sequence[Path], folder: Path) -> list[str]:
+    """Put the images into the new folder ``camera`` of a log's ``folder``, and return their names there, by their numbers.
+
+    They are links to the same content where the file system can do that, copies elsewhere. InputError names one that is gone.
+    """
+    target = folder / FOLDER
+    target.mkdir()
+    names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
+    for file, name in zip(files, names, strict=True):
+        source = file.resolve()
+        try:
+            os.link(source, target / name)
+        except OSError:  # another file system, or one without links
+            try:
+                shutil.copyfile(source, target / name)
+            except OSError as error:
+                raise InputError(f"{file}: cannot be copied into {target}: {error.strerror}") from error
+    return names
+
+
+def _image(table: Path, row: int, name: str) -> Path | None:
+    """The path of an image below the log's folder; None if there is no such file."""
+    try:
+        path = inside(table.parent, f"{FOLDER}/{name}", f"{table}:{row}")
+        return path if path.is_file() else None
+    except (OSError, ValueError):  # no name that a file could have
+        return None

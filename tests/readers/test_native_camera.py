@@ -1,0 +1,132 @@
+"""Images and identified pixels in the native format: what is read, refused, mended, and that what is written comes back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.log import FeatureStream, ImageStream, SightingStream
+from factorgraph_loc.readers import write_native
+
+CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
+PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"
+
+
+@pytest.fixture
+def seen(native: Path) -> Path:
+    """The small log with three images, of which nothing but the names matters here, and three identified pixels."""
+    (native / "camera").mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        (native / "camera" / name).write_bytes(name.encode())
+    (native / "camera.csv").write_text(CAMERA)
+    (native / "sightings.csv").write_text(PIXELS)
+    return native
+
+
+def test_what_is_read(seen, one):
+    log = one(seen)
+    assert log.warnings == ()
+    images, pixels = log.streams["camera"], log.streams["sightings"]
+    assert isinstance(images, ImageStream)
+    np.testing.assert_allclose(images.t, (0.1, 0.3, 0.5))
+    assert [file.read_bytes() for file in images.file] == [b"a.png", b"b.png", b"c.png"]
+    assert isinstance(pixels, SightingStream)
+    first, second = pixels.measurements(0.0)
+    assert (first.points, second.points) == (("door", "lamp"), ("door",))
+    np.testing.assert_array_equal(first.pixels, ((10.5, 20.0), (-3.0, 400.25)))
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_what_is_written_comes_back(seen, one, tmp_path, format):
+    log = one(seen)
+    write_native(log, tmp_path / "copy", format=format)
+    copy = one(tmp_path / "copy")
+    np.testing.assert_array_equal(copy.streams["camera"].t, log.streams["camera"].t)
+    assert [f.read_bytes() for f in copy.streams["camera"].file] == [b"a.png", b"b.png", b"c.png"]
+    assert all(f.is_relative_to((tmp_path / "copy" / "camera").resolve()) for f in copy.streams["camera"].file)
+    for column in ("t", "u", "v"):
+        np.testing.assert_array_equal(
+            getattr(copy.streams["sightings"], column), getattr(log.streams["sightings"], column)
+        )
+    assert copy.streams["sightings"].point == ["door", "lamp", "door"]
+
+
+def test_images_are_copied_where_there_are_no_links(seen, one, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError("no links here")
+
+    monkeypatch.setattr("os.link", refuse)
+    write_native(one(seen), tmp_path / "copy")
+    copies = [f.read_bytes() for f in one(tmp_path / "copy").streams["camera"].file]
+    assert copies == [b"a.png", b"b.png", b"c.png"]
+
+
+def test_an_image_twice_is_two_images(seen, one, tmp_path):
+    (seen / "camera.csv").write_text("t_ns,file\n1100000000,a.png\n1300000000,a.png\n")
+    write_native(one(seen), tmp_path / "copy")
+    assert len(one(tmp_path / "copy").streams["camera"].file) == 2
+
+
+def test_an_image_that_goes_before_it_is_written_is_an_error_and_leaves_nothing(seen, one, tmp_path):
+    log = one(seen)
+    (seen / "camera" / "b.png").unlink()
+    with pytest.raises(InputError, match=r"b\.png: cannot be copied into"):
+        write_native(log, tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+
+
+def test_features_cannot_be_written(seen, one, tmp_path):
+    log = one(seen)
+    features = replace(log, streams=dict(log.streams) | {"camera": FeatureStream(np.empty(0), [])})
+    with pytest.raises(InputError, match="hall: camera holds features, expected the images in which they were found"):
+        write_native(features, tmp_path / "copy")
+
+
+def test_missing_images_are_left_out_with_a_warning(seen, one):
+    (seen / "camera" / "b.png").unlink()
+    (seen / "camera.csv").write_text(CAMERA + f"1600000000,{'x' * 5000}\n")
+    log = one(seen)
+    assert [file.name for file in log.streams["camera"].file] == ["a.png", "c.png"]
+    (warning,) = log.warnings
+    assert warning.endswith("camera.csv: 2 of 4 images are missing and left out, the first is b.png of row 3")
+
+
+def test_of_two_images_at_one_stamp_the_last_is_kept(seen, one):
+    (seen / "camera.csv").write_text(CAMERA.replace("1300000000", "1100000000"))
+    log = one(seen)
+    assert [file.name for file in log.streams["camera"].file] == ["b.png", "c.png"]
+    assert "1 rows have the stamp of a later row" in log.warnings[0]
+
+
+def test_late_images_are_kept_in_order_of_arrival(seen, one):
+    (seen / "camera.csv").write_text(CAMERA.replace("1500000000", "1000000000"))
+    log = one(seen)
+    assert [file.name for file in log.streams["camera"].file] == ["a.png", "b.png", "c.png"]
+    assert log.streams["camera"].t[2] == 0.0
+    assert "1 rows are late, by at most 0.300 s" in log.warnings[0]
+
+
+BAD = {
+    "image outside": ("camera", "1,../../secret.png", "camera.csv:2: path", "leaves its folder"),
+    "no image": ("camera", "1,", ":2: file is ''", "the name of an image"),
+    "image too late": ("camera", "9000000000,a.png\n8000000000,b.png", ":3: time", "at most 0.5 s older"),
+    "pixel that is none": ("sightings", "1,door,nan,2", ":2: u is 'nan'", "finite"),
+    "pixel missing": ("sightings", "1,door,1,2\n1,lamp,1,", ":3: v is nan", "finite"),
+    "no name": ("sightings", "1,,1,2", ":2: landmark is ''", "the name of a landmark"),
+}
+
+
+@pytest.mark.parametrize(("sensor", "rows", "fragments"), [(s, r, f) for s, r, *f in BAD.values()], ids=list(BAD))
+def test_refused(seen, refused, sensor, rows, fragments):
+    header = (seen / f"{sensor}.csv").read_text().splitlines()[0]
+    (seen / f"{sensor}.csv").write_text(f"{header}\n{rows}\n")
+    refused(seen, *fragments)
+
+
+def test_a_link_out_of_the_folder_is_refused(seen, refused, tmp_path):
+    (tmp_path / "secret.png").write_bytes(b"")
+    (seen / "camera" / "b.png").unlink()
+    (seen / "camera" / "b.png").symlink_to(tmp_path / "secret.png")
+    refused(seen, "camera.csv:3: path", "leaves its folder")
