@@ -1,0 +1,81 @@
+"""Figures 4 and 5 of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011), for any log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, styles
+from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.log import Log
+from factorgraph_loc.tag_map import tag_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DEVIATIONS = (("x", "m"), ("y", "m"), ("heading", "rad"))
+
+
+def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
+    """Figure 4: localization along a run, and the standard deviations of x, y and heading over time, of causal estimates."""
+    figure = empty(8.0, f"{log.name}: where the robot is, and how well that is known (causal)")
+    axes = figure.subplot_mosaic([["map", name] for name, _ in DEVIATIONS], width_ratios=(1.1, 1.0))
+    dress(axes.values())
+    _map(axes["map"], log)
+    for (name, track), style in zip(tracks.items(), styles(), strict=False):
+        if track.causal is None:
+            continue
+        axes["map"].plot(*track.causal.poses[:, :2].T, label=name, linewidth=1.3, zorder=3, **style)
+        assert track.causal.covariances is not None, "what is estimated has a covariance"
+        sigmas = np.sqrt(np.diagonal(track.causal.covariances, axis1=1, axis2=2))
+        for row, (what, _) in enumerate(DEVIATIONS):
+            axes[what].plot(track.causal.t, sigmas[:, row], linewidth=1.2, **style)
+    for what, unit in DEVIATIONS:
+        axes[what].set_ylabel(f"std of {what} [{unit}]")
+        axes[what].set_ylim(bottom=0.0)
+    axes[DEVIATIONS[-1][0]].set_xlabel("time [s]")
+    legend(figure, [axes["map"]])
+    figure.draw_without_rendering()
+    return figure
+
+
+def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
+    """Figure 5: the trajectories from prediction, from single sensors and fused, and with a reference their errors over time.
+
+    Causal ones; of an estimator that has none the final one, and its label says so.
+    """
+    figure = empty(8.0, f"{log.name}: trajectories from each sensor and fused")
+    axes = figure.subplot_mosaic([["map", "errors"]], width_ratios=(1.1, 1.0))
+    dress(axes.values())
+    _map(axes["map"], log)
+    for (name, track), style in zip(tracks.items(), styles(), strict=False):
+        trajectory = track.final if track.causal is None else track.causal
+        label = f"{name} (final)" if track.causal is None else name
+        if not len(trajectory):
+            continue
+        axes["map"].plot(*trajectory.poses[:, :2].T, label=label, linewidth=1.3, zorder=3, **style)
+        if log.reference is not None:
+            error = np.maximum(errors(trajectory, log.reference).position, 1e-4)
+            axes["errors"].semilogy(trajectory.t, error, linewidth=1.0, **style)
+    axes["errors"].set_xlabel("time [s]")
+    axes["errors"].set_ylabel("position error [m]")
+    legend(figure, [axes["map"]])
+    figure.draw_without_rendering()
+    return figure
+
+
+def _map(axis: Axes, log: Log) -> None:
+    """Walls, tags and reference."""
+    for i, (x1, y1, x2, y2) in enumerate(log.world.walls):
+        axis.plot((x1, x2), (y1, y2), color="0.45", linewidth=1.0, label=None if i else "walls", zorder=1)
+    tags = tag_map(log.world, log.rig.survey).tags.points
+    if len(tags):
+        axis.plot(*tags[:, :2].T, "s", color=COLOURS[-1], markersize=5, markerfacecolor="none", label="tags", zorder=2)
+    if log.reference is not None:
+        axis.plot(*log.reference.poses[:, :2].T, color="0.75", linewidth=4.0, label="reference", zorder=1)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")

@@ -1,0 +1,52 @@
+"""Figures 4 and 5: what must be in them is there, also where an estimator has no causal estimate."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.figures import Track
+from factorgraph_loc.evaluation.paper_figures import deviations, fusion
+from factorgraph_loc.log import Log
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Tag, World
+
+
+@pytest.fixture
+def log():
+    t = np.arange(30) * 0.1
+    truth = Trajectory(t, np.column_stack((t, 0.5 * t, 0.0 * t)))
+    return Log("log", Rig(), World(tags={"T": Tag(x=1.0, y=2.0)}, walls=((0.0, 0.0, 3.0, 0.0),)), {}, truth)
+
+
+def track(log, off, sigmas=(0.1, 0.2, 0.05), *, causal=True):
+    count = len(log.reference)
+    poses = log.reference.poses + (off, 0.0, 0.0)
+    trajectory = Trajectory(log.reference.t, poses, np.tile(np.diag(np.square(sigmas)), (count, 1, 1)))
+    return Track(trajectory if causal else None, trajectory, np.array([0.1]))
+
+
+def labels(figure):
+    return {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_deviations_show_each_axis_with_its_unit(log):
+    figure = deviations(log, {"smoother": track(log, 0.1), "batch": track(log, 0.2, causal=False)})
+    assert labels(figure) == {"walls", "tags", "reference", "smoother"}
+    found = {axis.get_ylabel(): axis for axis in figure.axes}
+    for label, sigma in (("std of x [m]", 0.1), ("std of y [m]", 0.2), ("std of heading [rad]", 0.05)):
+        (line,) = found[label].lines
+        np.testing.assert_allclose(line.get_ydata(), sigma)
+
+
+def test_fusion_shows_errors_and_says_what_is_final(log):
+    figure = fusion(log, {"ekf": track(log, 0.1), "batch": track(log, 0.3, causal=False)})
+    assert {"ekf", "batch (final)"} < labels(figure)
+    drawn = next(axis for axis in figure.axes if axis.get_ylabel() == "position error [m]")
+    assert [float(line.get_ydata().max()) for line in drawn.lines] == pytest.approx([0.1, 0.3])
+
+
+def test_fusion_without_reference_has_the_trajectories(log):
+    figure = fusion(replace(log, reference=None), {"ekf": track(log, 0.1)})
+    assert labels(figure) == {"walls", "tags", "ekf"}
