@@ -22,7 +22,7 @@ def log():
 
 def track(log, off, sigmas=(0.1, 0.2, 0.05), *, causal=True):
     count = len(log.reference)
-    poses = log.reference.poses + (off, 0.0, 0.0)
+    poses = log.reference.poses + np.array((off, 0.0, 0.0))
     trajectory = Trajectory(log.reference.t, poses, np.tile(np.diag(np.square(sigmas)), (count, 1, 1)))
     return Track(trajectory if causal else None, trajectory, np.array([0.1]))
 
