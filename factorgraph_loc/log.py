@@ -20,6 +20,7 @@ from factorgraph_loc.measurements import (
     Measurement,
     PixelSightings,
     RfidScan,
+    Twist,
     VelocityOdometry,
     YawRate,
 )
@@ -28,6 +29,8 @@ from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
 from factors.se2 import Array
+
+MOTION = ("odometry", "imu", "twist")  # streams of how the robot moves
 
 
 class Stream(Protocol):
@@ -79,6 +82,18 @@ class YawRateStream:
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         return map(YawRate, (self.t + offset).tolist(), self.w.tolist())
+
+
+@dataclass(frozen=True)
+class TwistStream:
+    """``v`` (N, 3) [m/s] and ``w`` (N, 3) [rad/s] in the robot's frame, each held until the next row."""
+
+    t: Array
+    v: Array
+    w: Array
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        return map(Twist, (self.t + offset).tolist(), self.v, self.w)
 
 
 @dataclass(frozen=True)
@@ -144,12 +159,20 @@ class SightingStream:
     point: Sequence[str]
     u: Array
     v: Array
+    right: ClassVar[bool] = False
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
         for i, j in pairwise(bounds):
             pixels = np.column_stack((self.u[i:j], self.v[i:j]))
-            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels)
+            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels, self.right)
+
+
+@dataclass(frozen=True)
+class RightSightingStream(SightingStream):
+    """The same of the second camera of a stereo pair (``rig.camera_right``)."""
+
+    right: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -186,8 +209,8 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Log:
-    """A run. ``streams`` by sensor name (odometry, imu, bearing_range, rfid, camera, sightings); ``t0_ns``: absolute time of t = 0
-    in nanoseconds.
+    """A run. ``streams`` by sensor name (odometry, imu, twist, bearing_range, rfid, camera, sightings,
+    sightings_right); ``t0_ns``: absolute time of t = 0 in nanoseconds.
 
     ``reference3``: the true robot in space, of a log that was not recorded on a floor. ``warnings``: what the reader mended or
     left out, one line each. ``metadata``: licence, origin and the like.
@@ -223,7 +246,7 @@ class Log:
                 latest = max(latest, m.t)
                 yield latest, rank, i, m
 
-        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (s != "odometry", s != "imu", s))
+        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (s not in MOTION, s != "odometry", s))
         for _, _, _, m in heapq.merge(*(arrivals(rank, name) for rank, name in enumerate(order))):
             yield m
 

@@ -40,6 +40,16 @@ class YawRate:
 
 
 @dataclass(frozen=True, slots=True)
+class Twist:
+    """Motion in space of a robot that is carried: velocity ``v`` (3,) [m/s] and turn rate ``w`` (3,) [rad/s], both in its own
+    frame, held until the next row."""
+
+    t: float
+    v: Array
+    w: Array
+
+
+@dataclass(frozen=True, slots=True)
 class BearingRange:
     """Identified landmarks seen at one time.
 
@@ -74,11 +84,13 @@ class RfidScan:
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down."""
+    """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: by the second
+    camera of a stereo pair."""
 
     t: float
     points: tuple[str, ...]
     pixels: Array
+    right: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +116,6 @@ class Tick:
     t: float
 
 
-Odometry = VelocityOdometry | IncrementOdometry | YawRate
+Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist
 Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # what tells of the world around the robot
 Measurement = Odometry | Exteroceptive | Tick

@@ -30,6 +30,8 @@ Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
 Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
 Noise = Annotated[float, Field(ge=0.0, le=5.0)]
 
+PerRootSecond = Annotated[float, Field(gt=0.0, le=5.0, description="per sqrt(s)")]
+
 # m, rad, s: how long the error of a constant acts before what is seen corrects it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 
@@ -99,6 +101,15 @@ class ImuSettings(FileModel):
     time_offset: Seconds = 0.0
     bias: Rate = 0.0
     heading: GrowthSettings = GrowthSettings(per_time=0.005)
+
+
+class TwistSettings(FileModel):
+    """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: standard deviations of the errors of
+    position and orientation along the robot's axes, which grow with the root of time."""
+
+    time_offset: Seconds = 0.0
+    shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
+    turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
 
 
 class BearingRangeUncertainty(FileModel):
@@ -180,7 +191,9 @@ class Rig(FileModel):
     imu: ImuSettings | None = None
     bearing_range: BearingRangeSettings | None = None
     rfid: RfidSettings | None = None
+    twist: TwistSettings | None = None
     camera: CameraSettings | None = None
+    camera_right: CameraSettings | None = None
     survey: SurveySettings = SurveySettings()
 
     def odometry_model(self, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
@@ -235,8 +248,8 @@ class Rig(FileModel):
         return Estimated.of(reprojection.PARAMETERS, self.camera and self.camera.uncertainty)
 
     def time_offset(self, sensor: str) -> float:
-        """Seconds to add to the stamps of a sensor's stream; those of identified pixels are the camera's."""
-        settings = getattr(self, "camera" if sensor == "sightings" else sensor, None)
+        """Seconds to add to the stamps of a sensor's stream; those of identified pixels are the cameras'."""
+        settings = getattr(self, sensor.replace("sightings", "camera"), None)
         return 0.0 if settings is None else float(settings.time_offset)
 
 

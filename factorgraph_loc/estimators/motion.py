@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.measurements import IncrementOdometry, Odometry, VelocityOdometry, YawRate
+from factorgraph_loc.measurements import IncrementOdometry, Odometry, Twist, VelocityOdometry, YawRate
 from factorgraph_loc.rig import Rig
 from factors import se2
 from factors.odometry import ChainState, Increment
@@ -45,6 +45,9 @@ class Motion:
 
     def add(self, m: Odometry) -> None:
         """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
+        if isinstance(m, Twist):
+            self._diagnostics.ignore("motion in space")
+            return
         if isinstance(m, IncrementOdometry) and self._use_gyro:
             self._use_gyro = False
             self._chain = self._new_chain()
@@ -55,7 +58,7 @@ class Motion:
         elif not self._add(m):
             self._diagnostics.drop_late("odometry")
 
-    def _add(self, m: Odometry) -> bool:
+    def _add(self, m: VelocityOdometry | IncrementOdometry | YawRate) -> bool:
         if isinstance(m, VelocityOdometry):
             return self._chain.add_velocity(m.t, m.v, m.w)
         if isinstance(m, IncrementOdometry):

@@ -24,13 +24,12 @@ from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.measurements import IncrementOdometry, Measurement, Tick, VelocityOdometry, YawRate
+from factorgraph_loc.measurements import Measurement, Odometry, Tick
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
 TICK_RATE = 10  # Hz, the grid on which trajectories are written and scored
-_ODOMETRY = (VelocityOdometry, IncrementOdometry, YawRate)
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
 _SHOWN = 5  # names in a warning
 
@@ -151,7 +150,7 @@ class _Loop:
         initialized = self._prior is None
         fired = 0
         reported = 0.0
-        for (t, is_odometry), group in groupby(self._measurements(), lambda m: (m.t, isinstance(m, _ODOMETRY))):
+        for (t, is_odometry), group in groupby(self._measurements(), lambda m: (m.t, isinstance(m, Odometry))):
             if not initialized and t > self._start:
                 self._initialize()
                 initialized = True

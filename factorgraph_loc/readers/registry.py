@@ -19,6 +19,7 @@ READERS: dict[str, str] = {
     "plaza": "factorgraph_loc.readers.plaza",
     "rf_robot": "factorgraph_loc.readers.rf_robot",
     "sevenscenes": "factorgraph_loc.readers.sevenscenes",
+    "starry_night": "factorgraph_loc.readers.starry_night",
     "utias_woods": "factorgraph_loc.readers.utias_woods",
 }
 
