@@ -57,6 +57,10 @@ class BearingRangeFactor:
         error, _ = self.whitened(values)
         return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return robust_weight(squared, self.model.robust)
+
     def widened(self, width: float) -> BearingRangeFactor:
         """The same with a robust loss that is ``width`` times as wide."""
         return replace(self, model=replace(self.model, robust=width * self.model.robust))

@@ -56,6 +56,10 @@ class ReprojectionFactor:
         error, _ = self.whitened(values)
         return float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return huber_weight(squared, self.model.robust)
+
     def widened(self, width: float) -> ReprojectionFactor:
         """The same with a robust loss that is ``width`` times as wide."""
         return replace(self, model=replace(self.model, robust=width * self.model.robust))

@@ -16,9 +16,10 @@ from pydantic import Field
 
 from factorgraph_loc.estimators.base import Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, together, update_state
+from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, together
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.robust_update import update_state
 from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
@@ -200,7 +201,7 @@ class Ekf(Filter):
             return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])
 
         measured = together([factor for factor, _ in seen])
-        update = update_state(linearize, prior.covariance, measured.model.robust, self._iterations, measured.dof())
+        update = update_state(linearize, prior.covariance, measured.weight, self._iterations, measured.dof())
         self._landmarks.report(t, measured, update)
         self._state = prior.plus(update.delta, update.covariance)
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.cloud import Cloud
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
+from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import Relocalizer
+from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.rig import Estimated

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.robust_update import Update
 from factorgraph_loc.measurements import BearingRange
-from factors import se2
-from factors.bearing_range import BearingRangeModel, robust_weight, sigmas
+from factors.bearing_range import BearingRangeModel, sigmas
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import Increment
 from factors.se2 import Array
 
-CONVERGED = 1e-6  # of an iterated update, m and rad
 EXACT = 0.1  # a survey that is so much better than the sensor (as a share of its sigma) is taken as exact
-GATE = 9.21  # 99 % of chi-square with two degrees of freedom
-
 
 MapUse = Literal["known", "extended", "unknown"]
 
@@ -122,18 +119,6 @@ class KnownLandmarks:
             self._diagnostics.residuals.setdefault(f"bearing_range.{name}", []).extend(found)
 
 
-@dataclass(frozen=True)
-class Update:
-    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and at the prediction
-    the whitened ``residual`` (K, 2), predicted less measured, and its normalised square (``nis``) with degrees of freedom."""
-
-    delta: Array
-    covariance: Array
-    residual: Array
-    nis: float
-    dof: int
-
-
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
     """Factors on one pose alone, of one measurement, as one."""
     first, *others = factors
@@ -149,68 +134,3 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
         bearings=np.concatenate([f.bearings for f in factors]),
         point_covariances=np.concatenate(covariances),
     )
-
-
-def robust_update(factor: BearingRangeFactor, pose: Array, covariance: Array, iterations: int) -> Update:
-    """Kalman update of ``pose`` (3,) and further states by a factor on the pose alone; see :func:`update_state`.
-
-    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
-    """
-
-    def linearize(delta: Array) -> tuple[Array, Array]:
-        residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])
-        return residual, block
-
-    return update_state(linearize, covariance, factor.model.robust, iterations, factor.dof())
-
-
-def update_state(
-    linearize: Callable[[Array], tuple[Array, Array]], covariance: Array, robust: float, iterations: int, dof: int
-) -> Update:
-    """Kalman update, robust and iterated, in information form.
-
-    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the first D
-    components of the error state, with the state moved by ``delta`` (S,). ``robust``: scale of the loss. At first a
-    landmark whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that
-    it pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
-    robust weight at the updated state (iteratively reweighted least squares).
-    """
-    prior = np.asarray(np.linalg.inv(covariance), dtype=float)
-    zero = np.zeros(len(covariance))
-    residual, blocks = linearize(zero)
-    size = blocks.shape[2]
-    widening = np.maximum(1.0, _per_landmark(residual, blocks, covariance[:size, :size]) / GATE)
-    delta, updated = _solve(prior, blocks, residual, np.ones(len(residual)), zero[:size])
-    # by the matrix inversion lemma
-    pull = np.einsum("kij,ki->j", blocks, residual)
-    nis = float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull)
-    if widening.max() > 1.0:
-        delta, updated = _solve(prior, blocks, residual, widening**-2, zero[:size])
-    first = residual
-    for _ in range(iterations - 1):
-        residual, blocks = linearize(delta)
-        weight = robust_weight(np.einsum("ki,ki->k", residual, residual), robust)
-        before = delta
-        delta, updated = _solve(prior, blocks, residual, weight, delta[:size])
-        if np.abs(delta - before).max() < CONVERGED:
-            break
-    return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
-
-
-def _solve(prior: Array, blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
-    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (D,)."""
-    size = len(at)
-    jacobian = blocks.reshape(-1, size)
-    weighted = jacobian.T * np.repeat(weight, 2)
-    information = prior.copy()
-    information[:size, :size] += weighted @ jacobian
-    updated = np.asarray(np.linalg.inv(information), dtype=float)
-    return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
-
-
-def _per_landmark(residual: Array, blocks: Array, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of each landmark by itself."""
-    s = blocks @ covariance @ blocks.transpose(0, 2, 1)
-    a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
-    x, y = residual[:, 0], residual[:, 1]
-    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

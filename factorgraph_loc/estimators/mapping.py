@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from factorgraph_loc.estimators.landmarks import GATE
+from factorgraph_loc.estimators.robust_update import GATE
 from factors.se2 import Array
 
 MAX_PENDING = 5  # sightings that wait for another to agree

@@ -18,10 +18,11 @@ import numpy as np
 from factorgraph_loc.estimators import landmarks
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
 from factorgraph_loc.estimators.keyframes import KeyframeGraph
-from factorgraph_loc.estimators.landmarks import KnownLandmarks, robust_update
+from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, landmark_key, pose_key
 from factorgraph_loc.estimators.waiting_scans import WaitingScans

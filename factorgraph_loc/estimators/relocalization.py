@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import PosePrior, Status
-from factorgraph_loc.estimators.landmarks import GATE
 from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.robust_update import GATE
 from factorgraph_loc.estimators.sighting_window import Sighting, Window
 from factors import se2
 from factors.bearing_range import BearingRangeModel, robust_loss

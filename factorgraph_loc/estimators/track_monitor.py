@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_loc.estimators.landmarks import GATE
-from factors.bearing_range_factor import BearingRangeFactor
+from factorgraph_loc.estimators.robust_update import GATE, Sightings
 from factors.se2 import Array
 
 STAMPS, DURATION = 4, 2.0  # at least as many, over at least so many seconds
@@ -29,7 +28,7 @@ class TrackMonitor:
         """When most landmarks began to lie beyond, None if all is well."""
         return self._since
 
-    def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
+    def add(self, t: float, seen: Sightings, pose: Array, covariance: Array) -> None:
         """Take the landmarks of a stamp, with the ``pose`` (3,) predicted there and its body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = seen.whitened([pose])
         spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
