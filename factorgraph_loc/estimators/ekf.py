@@ -1,7 +1,7 @@
 """Extended Kalman filter on SE(2), with Rauch-Tung-Striebel smoothing for its final trajectory.
 
 The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by the constants of
-odometry and sensor that are estimated, and by the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990). A
+odometry and sensors that are estimated, and by the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990). A
 measurement whose innovation is too large has its noise widened instead of being dropped, so that the filter cannot lock itself out.
 """
 
@@ -20,7 +20,8 @@ from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, togethe
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import update_state
-from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, KnownPoints, Predicted
+from factorgraph_loc.measurements import BearingRange, CameraFrame, PixelSightings
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
@@ -31,7 +32,8 @@ from factors.se2 import Array
 
 
 class EkfSettings(FilterSettings):
-    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993).
+    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993). Pixels, which are
+    sharp, have as many as they need.
 
     ``self_calibration``: constants to which the rig gives an uncertainty are states. ``landmarks``: see
     :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
@@ -92,6 +94,7 @@ class _Record:
 class Ekf(Filter):
     """The EKF; see the module."""
 
+    takes_pixels = True
     _state: _State
 
     def __init__(self, setup: Setup, settings: EkfSettings) -> None:
@@ -100,10 +103,14 @@ class Ekf(Filter):
         self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
+        self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
+        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants)
         # where the constants lie in the state's rest, and where the landmarks begin
         middle = len(self._odometry_constants.names)
-        self._first_landmark = middle + len(self._sensor_constants.names)
-        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, self._first_landmark)
+        end = middle + len(self._sensor_constants.names)
+        self._first_landmark = end + len(self._camera_constants.names)
+        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, end)
+        self._camera_part = slice(end, self._first_landmark)
         self._step: _Step | None = None
 
     def learnt(self) -> Learnt:
@@ -113,6 +120,7 @@ class Ekf(Filter):
         rest, covariance = self._state.rest, self._state.covariance[3:, 3:]
         sigmas = np.sqrt(np.diag(covariance))
         names = [*self._odometry_constants.names, *(f"bearing_range.{name}" for name in self._sensor_constants.names)]
+        names += [f"camera.{name}" for name in self._camera_constants.names]
         points = {}
         for number, name in enumerate(self._state.landmarks):
             part = self._landmark_part(number)
@@ -142,7 +150,8 @@ class Ekf(Filter):
         return here.plus(gain @ change, here.covariance + gain @ (after.covariance - predicted) @ gain.T)
 
     def _start(self, prior: PosePrior) -> _State:
-        sigmas = np.concatenate((self._odometry_constants.sigmas, self._sensor_constants.sigmas))
+        constants = (self._odometry_constants, self._sensor_constants, self._camera_constants)
+        sigmas = np.concatenate([c.sigmas for c in constants])
         covariance = np.diag(np.concatenate((np.zeros(3), sigmas**2)))
         covariance[:3, :3] = se2.world_to_body(prior.pose, prior.covariance)
         return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance)
@@ -178,13 +187,41 @@ class Ekf(Filter):
         for name, factor in met:
             self._meet(name, factor)
 
+    def _look(self, m: PixelSightings | CameraFrame) -> None:
+        self._step = self._step or self._standstill()
+        prior, part = self._state, self._camera_part
+        twist = self._motion.twist(m.t) if self._points.needs_twist else None
+        predicted = Predicted(prior.pose, prior.covariance[:3, :3])
+        size = 3
+        if self._camera_constants.names:
+            size = 3 + part.stop
+            spread = prior.covariance[3 + part.start : size, 3 + part.start : size]
+            predicted = replace(predicted, constants=prior.rest[part], spread=spread)
+        factor = self._points.factor(m, predicted, None, twist)
+        if factor is None:
+            return
+
+        def linearize(delta: Array) -> tuple[Array, Array]:
+            state = prior.plus(delta, prior.covariance)
+            values = [state.pose, state.rest[part]] if self._camera_constants.names else [state.pose]
+            residual, blocks = factor.whitened(values)
+            jacobian = np.zeros((len(residual), 2, size))
+            jacobian[..., :3] = blocks[0]
+            if self._camera_constants.names:
+                jacobian[..., 3 + part.start :] = blocks[1]
+            return residual, jacobian
+
+        update = update_state(linearize, prior.covariance, factor.weight, ITERATIONS, factor.dof(), SETTLED)
+        self._points.report(m.t, factor, update)
+        self._state = prior.plus(update.delta, update.covariance)
+
     def _correct(self, t: float, seen: Sequence[tuple[BearingRangeFactor, slice | None]]) -> None:
         prior = self._state
         size = 3  # of the part of the state that the measurement depends on
         if any(part is not None for _, part in seen):
             size = len(prior.covariance)
         elif self._sensor_constants.names:
-            size = 3 + self._first_landmark
+            size = 3 + self._sensor_part.stop
 
         def linearize(delta: Array) -> tuple[Array, Array]:
             state = prior.plus(delta, prior.covariance)

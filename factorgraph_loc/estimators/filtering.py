@@ -48,6 +48,7 @@ class Filter(ABC):
     deterministic = True
     supports_unknown_start = False
     takes_scans = False  # whether scans of RFID tags update it; else they are counted as ignored
+    takes_pixels = False  # and whether what a camera sees does
 
     def __init__(self, setup: Setup, settings: FilterSettings) -> None:
         self.diagnostics = Diagnostics()
@@ -75,7 +76,7 @@ class Filter(ABC):
             self._motion.add(measurement)
         elif isinstance(measurement, RfidScan) and not self.takes_scans:
             self.diagnostics.ignore("rfid", len(measurement.antennas))
-        elif isinstance(measurement, PixelSightings | CameraFrame):
+        elif isinstance(measurement, PixelSightings | CameraFrame) and not self.takes_pixels:
             self.diagnostics.ignore("camera", len(measurement.pixels))
         elif self._state is None:
             self._begin(measurement)
@@ -119,6 +120,9 @@ class Filter(ABC):
     def _scan(self, m: RfidScan) -> None:  # noqa: B027
         """Take a scan of tags at the state's time; only of those that take scans."""
 
+    def _look(self, m: PixelSightings | CameraFrame) -> None:  # noqa: B027
+        """Take what a camera saw at the state's time; only of those that take pixels."""
+
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
         """Mean and covariance of the state."""
@@ -157,6 +161,8 @@ class Filter(ABC):
             self._scan(m)
         elif isinstance(m, BearingRange):
             self._update(m)
+        else:
+            self._look(m)
         self._records.append(self._record())
 
     def _take_late(self, late: Exteroceptive | Tick) -> None:
@@ -177,6 +183,8 @@ class Filter(ABC):
             self.diagnostics.drop_late("bearing_range", len(m.landmarks))
         elif isinstance(m, RfidScan):
             self.diagnostics.drop_late("rfid", len(m.antennas))
+        elif isinstance(m, PixelSightings | CameraFrame):
+            self.diagnostics.drop_late("camera", len(m.pixels))
 
     def _go_back(self, checkpoint: tuple[Any, ...]) -> None:
         self._state, self._t, self._odometry, records, ticks = checkpoint

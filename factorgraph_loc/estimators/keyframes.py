@@ -21,7 +21,15 @@ from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Gues
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, landmark_key, pose_key
+from factorgraph_loc.estimators.variables import (
+    CAMERA_KEY,
+    ODOMETRY_KEY,
+    SENSOR_KEY,
+    Node,
+    Values,
+    landmark_key,
+    pose_key,
+)
 from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
@@ -46,6 +54,7 @@ class KeyframeGraph(ABC):
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=self_calibration)
         self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
+        self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         # all variables but the poses: estimate and covariance
         self._constants, self._spreads = self._constant_priors()
@@ -99,6 +108,7 @@ class KeyframeGraph(ABC):
         for key, prefix, constants in (
             (ODOMETRY_KEY, "", self._odometry_constants),
             (SENSOR_KEY, "bearing_range.", self._sensor_constants),
+            (CAMERA_KEY, "camera.", self._camera_constants),
         ):
             if key in self._constants:
                 sigmas = np.sqrt(np.diag(self._spreads[key]))
@@ -165,7 +175,11 @@ class KeyframeGraph(ABC):
         """Means and covariances of the sensors' constants before any measurement."""
         means: Values = {}
         spreads: Values = {}
-        for key, constants in ((ODOMETRY_KEY, self._odometry_constants), (SENSOR_KEY, self._sensor_constants)):
+        for key, constants in (
+            (ODOMETRY_KEY, self._odometry_constants),
+            (SENSOR_KEY, self._sensor_constants),
+            (CAMERA_KEY, self._camera_constants),
+        ):
             if constants.names:
                 means[key], spreads[key] = np.zeros(len(constants.names)), np.diag(constants.sigmas**2)
         return means, spreads

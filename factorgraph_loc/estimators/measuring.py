@@ -1,8 +1,8 @@
 """Graphs that take measurements: where keyframes stand, and what becomes a factor on them.
 
-A keyframe stands at each stamp of landmarks, unless the one before is nearer than ``keyframe_interval``, and at least every
-``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one, displaced
-by the odometry since.
+A keyframe stands at each stamp of landmarks or of an image, unless the one before is nearer than ``keyframe_interval``, and at
+least every ``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one,
+displaced by the odometry since.
 
 Scans of RFID antennas come many a second and each tells little. Those from one keyframe to the next, half a second later, make one
 factor, which enters the graph with the next keyframe; until then the newest pose is updated by them alone, as a filter would.
@@ -23,8 +23,9 @@ from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import robust_update
+from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels, Predicted, pixel_update
 from factorgraph_loc.estimators.tags import TagUpdate
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, landmark_key, pose_key
+from factorgraph_loc.estimators.variables import CAMERA_KEY, ODOMETRY_KEY, SENSOR_KEY, Node, landmark_key, pose_key
 from factorgraph_loc.estimators.waiting_scans import WaitingScans
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan, Tick
 from factors import se2
@@ -48,6 +49,7 @@ class MeasuringGraph(KeyframeGraph):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
+        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants)
         self._scans = WaitingScans(setup, self.diagnostics)
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
 
@@ -58,16 +60,16 @@ class MeasuringGraph(KeyframeGraph):
         self._t = max(self._t, m.t)
         if isinstance(m, RfidScan):
             self._scan(m)
-        elif isinstance(m, BearingRange):
-            self._see(m)
         else:
-            self.diagnostics.ignore("camera", len(m.pixels))
+            self._see(m)
 
     def _drop_late(self, m: Exteroceptive | Tick) -> None:
         if isinstance(m, BearingRange):
             self.diagnostics.drop_late("bearing_range", len(m.landmarks))
         elif isinstance(m, RfidScan):
             self.diagnostics.drop_late("rfid", len(m.antennas))
+        elif isinstance(m, Pixels):
+            self.diagnostics.drop_late("camera", len(m.pixels))
 
     @abstractmethod
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
@@ -76,6 +78,10 @@ class MeasuringGraph(KeyframeGraph):
         The guess of its pose in ``addition``, and its body-frame covariance ``spread`` (3, 3), come from an update of the one
         before.
         """
+
+    @abstractmethod
+    def _pose_of(self, keyframe: int) -> Array:
+        """The causal estimate (3,) of a keyframe."""
 
     @abstractmethod
     def _refine(self, newest: Keyframe, guess: Guess) -> None:
@@ -96,18 +102,22 @@ class MeasuringGraph(KeyframeGraph):
         before = self._keyframe_before(t)
         self._ticks.append(TickAt(t, before.index, self._since(before, t)))
 
-    def _see(self, m: BearingRange) -> None:
+    def _see(self, m: BearingRange | Pixels) -> None:
         newest = self._keyframes[-1]
         if m.t - newest.t >= self._interval:
             self._add_keyframe(m.t, m)
             return
         before = self._keyframe_before(m.t)
         if not self._is_open(before.index):
-            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
+            self._drop_late(m)
             return
         offset = self._since(before, m.t) if m.t > before.t else None
         addition = Addition(self._gather())
-        guess = self._sight(before, m, offset, (self._pose, self._covariance) if before is newest else None, addition)
+        here = (self._pose, self._covariance) if before is newest else None
+        if isinstance(m, BearingRange):
+            guess = self._sight(before, m, offset, here, addition)
+        else:
+            guess = self._spot(before, m, offset, here, addition)
         if addition.nodes:
             self._attach(before, addition, guess)
 
@@ -158,7 +168,7 @@ class MeasuringGraph(KeyframeGraph):
         keyframe.nodes += nodes
         return nodes
 
-    def _add_keyframe(self, t: float, m: BearingRange | None) -> None:
+    def _add_keyframe(self, t: float, m: BearingRange | Pixels | None) -> None:
         newest = self._keyframes[-1]
         odometry = self._motion.state(t)
         increment = self._motion.relative(newest.odometry, odometry)
@@ -168,8 +178,10 @@ class MeasuringGraph(KeyframeGraph):
         addition = Addition(self._gather())
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)
-        if m is not None:
+        if isinstance(m, BearingRange):
             guess = self._sight(keyframe, m, None, guess, addition)
+        elif m is not None:
+            guess = self._spot(keyframe, m, None, guess, addition)
         assert guess is not None
         addition.values[keyframe.key] = guess[0]
         self._extend(keyframe, addition, guess[1])
@@ -218,6 +230,29 @@ class MeasuringGraph(KeyframeGraph):
         keyframe.nodes += nodes
         addition.nodes += nodes
         return guess
+
+    def _spot(
+        self, keyframe: Keyframe, m: Pixels, offset: Increment | None, guess: Guess | None, addition: Addition
+    ) -> Guess | None:
+        """Turn what a camera saw into a factor of ``keyframe``; returned is the guess of its pose, updated by it. Without a guess
+        the keyframe is an older one."""
+        twist = self._motion.twist(m.t) if self._points.needs_twist else None
+        shared = (CAMERA_KEY,) if self._camera_constants.names else ()
+        constants = [self._constants[key] for key in shared]
+        pose, covariance = (self._pose_of(keyframe.index), self._covariance) if guess is None else guess
+        predicted = Predicted(pose, covariance, *constants, *(self._spreads[key] for key in shared))
+        factor = self._points.factor(m, predicted, offset, twist)
+        if factor is None:
+            return guess
+        node = Node((keyframe.key, *shared), factor, 2 * len(factor.points))
+        keyframe.nodes.append(node)
+        addition.nodes.append(node)
+        if guess is None:
+            return None
+        here = factor.fixed(constants, None)
+        update = pixel_update(here, *guess)
+        self._points.report(m.t, here, update)
+        return se2.compose(guess[0], se2.exp(update.delta)), update.covariance
 
     def _meet(
         self, name: str, factor: BearingRangeFactor, keyframe: Keyframe, guess: Guess, addition: Addition

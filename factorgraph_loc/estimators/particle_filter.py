@@ -26,10 +26,11 @@ from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, s
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
+from factorgraph_loc.estimators.pixel_tracker import PixelTracker
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.scan_monitor import Silence
 from factorgraph_loc.estimators.scan_tracker import ScanTracker
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
+from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
@@ -60,6 +61,7 @@ class ParticleFilter(Filter):
     deterministic = False
     supports_unknown_start = True
     takes_scans = True
+    takes_pixels = True
     _state: Cloud
 
     def __init__(self, setup: Setup, settings: ParticleFilterSettings) -> None:
@@ -75,6 +77,7 @@ class ParticleFilter(Filter):
         self._odometry_part = slice(0, middle)  # where they lie in the constants of the particles
         self._landmarks = LandmarkTracker(setup, self._motion, self.diagnostics, self._sensor_constants, first=middle)
         self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
+        self._pixels = PixelTracker(setup, self.diagnostics)
         self._lost = False
 
     def belief(self) -> Belief:
@@ -178,6 +181,11 @@ class ParticleFilter(Filter):
             if self._landmarks.settled(self._state):
                 self._state = replace(self._state, localized=True)
                 self._event("recovered" if self._lost else "localized")
+
+    def _look(self, m: PixelSightings | CameraFrame) -> None:
+        seen = self._pixels.factor(m, self._state) if self._state.localized else None
+        if seen is not None:
+            self._weigh(lambda cloud: self._pixels.log_likelihood(seen, cloud))
 
     def _scan(self, m: RfidScan) -> None:
         if not self._state.localized and self._scans.finds:

@@ -42,6 +42,8 @@ SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 class RelocatingGraph(MeasuringGraph):
     """A graph estimator that finds its place; see the module."""
 
+    takes_pixels = True
+
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
         super().__init__(setup, settings)
         self._motion.keep(2.0 * DURATION)
@@ -208,10 +210,6 @@ class RelocatingGraph(MeasuringGraph):
         if self._monitor.suspicious_since is None:
             self._finder.rest()
         self._finder.add(self._motion.state(t), looks, update.evidence)
-
-    @abstractmethod
-    def _pose_of(self, keyframe: int) -> Array:
-        """The causal estimate (3,) of a keyframe."""
 
     @abstractmethod
     def _begin_again(self, newest: Keyframe) -> None:

@@ -19,7 +19,7 @@ from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Gues
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values
+from factorgraph_loc.estimators.variables import CAMERA_KEY, ODOMETRY_KEY, SENSOR_KEY, Node, Values
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
@@ -120,7 +120,7 @@ class Smoother(RelocatingGraph):
         self._pose, self._covariance = self._marginal(newest.key)
         self._filtered[newest.index] = (self._pose, self._covariance)
         for key in touched:
-            if key in (ODOMETRY_KEY, SENSOR_KEY):
+            if key in (ODOMETRY_KEY, SENSOR_KEY, CAMERA_KEY):
                 self._constants[key] = self._solver.value(key)
             else:
                 self._constants[key], self._spreads[key] = self._marginal(key)
@@ -159,7 +159,7 @@ class Smoother(RelocatingGraph):
         except RuntimeError as error:
             if not newest.nodes:
                 raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
-            self.diagnostics.reject("bearing_range: the graph cannot be solved with it", len(newest.nodes))
+            self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", len(newest.nodes))
             newest.nodes.clear()
             self._rebuild(newest)
 

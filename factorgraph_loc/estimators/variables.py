@@ -19,6 +19,7 @@ Values = dict[int, Array]
 
 ODOMETRY_KEY = int(gtsam.symbol("c", 0))  # constants of the odometry
 SENSOR_KEY = int(gtsam.symbol("s", 0))  # constants of the sensor of landmarks
+CAMERA_KEY = int(gtsam.symbol("k", 0))  # constants of the camera
 _POSE = ord("x")
 _CHARACTER = 56  # bits of a key below its character
 

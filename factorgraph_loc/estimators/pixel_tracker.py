@@ -1,0 +1,45 @@
+"""What a camera sees of known points as a particle filter takes it in.
+
+Which points are seen is decided once, at the mean of the cloud; what they tell weighs the particles. The constants of the camera
+are those of the rig.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.cloud import Cloud
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels, Predicted, pixel_update
+from factorgraph_loc.rig import NOTHING
+from factors import reprojection, se2
+from factors.reprojection_factor import ReprojectionFactor
+from factors.se2 import Array
+
+
+class PixelTracker:
+    """What pixels make of a cloud whose place is known; see the module."""
+
+    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+        self._points = KnownPoints(setup, diagnostics, NOTHING)
+
+    def factor(self, m: Pixels, cloud: Cloud) -> ReprojectionFactor | None:
+        """What was seen of points of the map; None where that is nothing. Reports the innovation."""
+        mean, covariance = cloud.moments
+        covariance = se2.world_to_body(mean, covariance)
+        factor = self._points.factor(m, Predicted(mean, covariance))
+        if factor is not None:
+            self._points.report(m.t, factor, pixel_update(factor, mean, covariance))
+        return factor
+
+    @staticmethod
+    def log_likelihood(factor: ReprojectionFactor, cloud: Cloud) -> Array:
+        """Of the particles (N,)."""
+        spreads = None
+        if factor.point_covariances is not None:
+            mean, _ = cloud.moments
+            _, _, by_point, _ = reprojection.linearize(factor.model, mean, factor.points)
+            spreads = by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+            spreads = spreads + factor.model.sigma**2 * np.eye(2)
+        return reprojection.log_likelihood(factor.model, cloud.poses, factor.points, factor.pixels, spreads)

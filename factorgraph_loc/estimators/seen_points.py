@@ -1,0 +1,173 @@
+"""Points of the map seen by a camera, as all estimators take them in: by name, or as features that are found in the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.robust_update import Update, robust_update
+from factorgraph_loc.measurements import CameraFrame, PixelSightings
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import Estimated
+from factorgraph_loc.vision.consensus import CameraPose, Truths, agreeing
+from factors import reprojection, se2
+from factors.odometry import Increment
+from factors.reprojection import FOCAL, TIME_OFFSET, CameraModel
+from factors.reprojection_factor import ReprojectionFactor
+from factors.se2 import Array
+
+CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
+EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
+# A pixel is so sharp that one step from a poor prediction does not lead to the optimum
+ITERATIONS, SETTLED = 8, 1e-3  # m, rad: a step that needs no further one
+
+Pixels = PixelSightings | CameraFrame  # what a camera sees
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What is expected when an image is taken: the ``pose`` (3,) of the variable that a factor hangs on, with its body-frame
+    ``covariance`` (3, 3); and of the camera's constants that are estimated their changes (P,) and ``spread`` (P, P)."""
+
+    pose: Array
+    covariance: Array
+    constants: Array | None = None
+    spread: Array | None = None
+
+
+class KnownPoints:
+    """Turns what a camera sees into factors; what the map or the rig lacks is counted as ignored, what cannot be right as rejected.
+
+    ``estimated``: the camera's constants that are estimated.
+    """
+
+    def __init__(self, setup: Setup, diagnostics: Diagnostics, estimated: Estimated) -> None:
+        used = any(sensor in setup.sensors for sensor in CAMERAS)
+        settings = setup.rig.camera if used else None
+        self.model: CameraModel | None = None if settings is None else settings.model()
+        self.map = PointMap.of((), np.empty((0, 3))) if setup.world.points is None else setup.world.points
+        self._estimated = estimated
+        self._diagnostics = diagnostics
+        self._map_matters = False
+        if settings is not None and len(self.map):
+            worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
+            self._map_matters = worst > (EXACT * settings.pixel_sigma / settings.fx) ** 2
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a camera that is used, and a point in the map."""
+        return self.model is not None and len(self.map) > 0
+
+    @property
+    def needs_twist(self) -> bool:
+        """Whether the camera's time offset is estimated."""
+        return TIME_OFFSET in self._estimated.indices
+
+    def named(self, m: PixelSightings) -> ReprojectionFactor | None:
+        """All points of the map that are named, none of them doubted, on the pose at their time."""
+        if self.model is None:
+            self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        rows = [i for i, name in enumerate(m.points) if name in self.map.index]
+        if len(rows) < len(m.points):
+            self._diagnostics.ignore("point not in the map", len(m.points) - len(rows))
+        if not rows:
+            return None
+        return self._factor(self.model, [self.map.index[m.points[i]] for i in rows], m.pixels[rows])
+
+    def factor(
+        self, m: Pixels, predicted: Predicted, offset: Increment | None = None, twist: Array | None = None
+    ) -> ReprojectionFactor | None:
+        """The factor of the known points, on the pose at the image's time, or on the one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity then, where the camera's time offset is estimated.
+        """
+        if isinstance(m, CameraFrame):
+            self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        factor = self.named(m)
+        if factor is None:
+            return None
+        if offset is not None:
+            factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
+        factor = replace(factor, estimated=self._estimated.indices, twist=twist)
+        right = self._agreeing(factor, predicted)
+        if not right.all():
+            self._diagnostics.reject("camera: does not agree with the others", int(np.count_nonzero(~right)))
+        return _rows(factor, right) if right.any() else None
+
+    def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
+        """Record the innovation of an update at time ``t``."""
+        self._diagnostics.innovation("camera", t, update.nis, update.dof)
+        errors = -update.residual * factor.model.sigma
+        for i, name in enumerate("uv"):
+            self._diagnostics.residuals.setdefault(f"camera.{name}", []).extend(errors[:, i].tolist())
+
+    def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
+
+    def _agreeing(self, factor: ReprojectionFactor, predicted: Predicted) -> Truths:
+        """Which points of a factor agree near what is predicted."""
+        here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
+        pose, covariance = predicted.pose, predicted.covariance
+        if here.offset is not None:
+            noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
+            since = Increment(here.offset, noise, 0.0)
+            pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
+        camera = lifted(here.model, pose, covariance)
+        spreads = np.broadcast_to(here.model.sigma**2 * np.eye(2), (len(here.pixels), 2, 2))
+        if here.point_covariances is not None:
+            _, _, by_point = reprojection.linearize_in_space(here.model, camera.position, camera.rotation, here.points)
+            spreads = spreads + by_point @ here.point_covariances @ by_point.transpose(0, 2, 1)
+        if predicted.spread is not None:
+            camera, spreads = self._widened(here, camera, spreads, predicted.spread)
+        return agreeing(here.model, camera, here.points, here.pixels, spreads)
+
+    def _widened(
+        self, factor: ReprojectionFactor, camera: CameraPose, spreads: Array, spread: Array
+    ) -> tuple[CameraPose, Array]:
+        """Prediction and noise of the pixels with what is not known of the camera's constants."""
+        model = factor.model
+        full = np.zeros((6, len(spread)))
+        for column, place in enumerate(self._estimated.indices):
+            if place < 3:
+                full[3:, column] = model.rotation[place]
+            elif place < FOCAL:
+                full[:3, column] = model.rotation[place - 3]
+            elif place == TIME_OFFSET and factor.twist is not None:
+                full[:, column] = _lift(model) @ factor.twist
+            elif place == FOCAL:
+                away = factor.pixels - (model.cx, model.cy)
+                spreads = spreads + spread[column, column] * away[:, :, None] * away[:, None, :]
+        return replace(camera, covariance=camera.covariance + full @ spread @ full.T), spreads
+
+
+def pixel_update(factor: ReprojectionFactor, pose: Array, covariance: Array) -> Update:
+    """Kalman update of ``pose`` (3,), with body-frame ``covariance`` (3, 3), by a factor on it alone, up to the optimum."""
+    return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
+
+
+def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
+    """The camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    lift = _lift(model)
+    return CameraPose(*reprojection.camera_pose(model, pose), lift @ covariance @ lift.T)
+
+
+def _lift(model: CameraModel) -> Array:
+    """The camera's perturbation (6, 3), turn first, in its own frame, by that of the robot's planar pose."""
+    x, y, _ = model.position
+    lift = np.zeros((6, 3))
+    lift[:3, 2] = model.rotation[2]
+    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
+    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
+    return lift
+
+
+def _rows(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
+    spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
+    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)

@@ -1,0 +1,139 @@
+"""Which of several points seen in one image belong together: they must agree on one pose of the camera near a predicted one.
+
+If all together are as near to the prediction as noise lets them be (joint compatibility: Neira, Tardos, IEEE Transactions on
+Robotics and Automation 17(6), 2001), all are taken. Else three of them at a time correct the prediction, as a Kalman filter
+would, and the correction that most others agree with tells the right ones from the wrong ones (after Civera, Grasa, Davison,
+Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). A prediction of a planar robot has a
+covariance of rank 3, and so has what is corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from factors import reprojection
+from factors.reprojection import CameraModel
+from factors.se2 import Array
+
+Truths = NDArray[np.bool_]
+
+FEWEST = 4  # points that must agree: any three do, on some pose
+SAMPLE = 3
+HYPOTHESES, ROUND = 96, 16  # at most, and between looks whether that is enough
+MISSED = 1e-3  # probability that no sample of right points was drawn
+REACH = 10.0  # standard deviations of the prediction, within which a correction may lie
+LOOSE, GATE = 25.0, 13.8  # squared residuals of those that agree with three, and with all (99.9 %)
+JOINT = 0.99  # probability of all together to be compatible, if all are right
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """``position`` (3,) and ``rotation`` (3, 3) of a camera in the world, and the ``covariance`` (6, 6) of its perturbation in its
+    own frame, turn first, then shift."""
+
+    position: Array
+    rotation: Array
+    covariance: Array
+
+
+def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
+    """Which of ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], agree near
+    the predicted ``camera``; all where they are too few to tell, none where fewer than :data:`FEWEST` agree."""
+    count = len(points)
+    whiteners = np.linalg.inv(np.linalg.cholesky(spreads))
+    values, vectors = np.linalg.eigh(camera.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    residual, jacobian = _whitened(model, camera.position, camera.rotation, points, pixels, whiteners)
+    flat = (jacobian @ root).reshape(-1, 6)
+    pull = residual.ravel() @ flat
+    joint = float(np.vdot(residual, residual) - pull @ np.linalg.solve(np.eye(6) + flat.T @ flat, pull))
+    if joint < chi2.ppf(JOINT, 2 * count) or count < FEWEST:
+        return np.ones(count, dtype=bool)
+    position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
+    inside = squared < LOOSE
+    for _ in range(2):
+        if np.count_nonzero(inside) < FEWEST:
+            return np.zeros(count, dtype=bool)
+        residual, jacobian = _whitened(model, position, rotation, points[inside], pixels[inside], whiteners[inside])
+        step = np.linalg.lstsq((jacobian @ root).reshape(-1, 6), -residual.ravel(), rcond=1e-9)[0]
+        position, rotation = _moved(position[None], rotation[None], (root @ step)[None])
+        position, rotation = position[0], rotation[0]
+        squared = _squared(model, position[None], rotation[None], points, pixels, whiteners)[0]
+        inside = squared < GATE
+    return np.asarray(inside) if np.count_nonzero(inside) >= FEWEST else np.zeros(count, dtype=bool)
+
+
+def _best_of_samples(
+    model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
+) -> tuple[Array, Array, Array]:
+    """The pose that most points agree with, of those that samples of them lead to, and the squared residuals (K,) there."""
+    rng, count = np.random.default_rng(0), len(points)
+    best: tuple[float, Array, Array, Array] | None = None
+    tried = 0
+    while tried < HYPOTHESES:
+        rows = np.argsort(rng.random((ROUND, count)), axis=1)[:, :SAMPLE]
+        position = np.repeat(camera.position[None], ROUND, axis=0)
+        rotation = np.repeat(camera.rotation[None], ROUND, axis=0)
+        moved = np.zeros((ROUND, 6))
+        for _ in range(3):
+            # Gauss-Newton in the whitened perturbation, whose prior is the unit Gaussian
+            residual, jacobian = _whitened_each(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
+            flat = jacobian @ root
+            normal = np.eye(6) + flat.transpose(0, 2, 1) @ flat
+            gradient = np.einsum("hij,hi->hj", flat, residual) + moved
+            step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+            moved = moved + step
+            position, rotation = _moved(position, rotation, step @ root.T)
+        squared = _squared(model, position, rotation, points, pixels, whiteners)
+        costs = np.minimum(squared, LOOSE).sum(axis=1)
+        i = int(np.argmin(costs))
+        if best is None or costs[i] < best[0]:
+            best = float(costs[i]), position[i], rotation[i], squared[i]
+        tried += ROUND
+        share = np.count_nonzero(best[3] < LOOSE) / count
+        if (1.0 - share**SAMPLE) ** tried < MISSED:
+            break
+    assert best is not None
+    return best[1:]
+
+
+def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
+    """Cameras (H) moved by perturbations (H, 6)."""
+    moved = position + (rotation @ step[:, 3:, None])[..., 0]
+    return moved, rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+
+
+def _whitened(
+    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
+) -> tuple[Array, Array]:
+    """Whitened residuals (K, 2), predicted less measured, and their Jacobians (K, 2, 6) by the camera's perturbation."""
+    predicted, jacobian, _ = reprojection.linearize_in_space(model, position, rotation, points)
+    return np.einsum("kij,kj->ki", whiteners, predicted - pixels), whiteners @ jacobian
+
+
+def _whitened_each(
+    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
+) -> tuple[Array, Array]:
+    """The same of H cameras with ``points`` (H, S, 3) each, stacked: (H, 2S) and (H, 2S, 6)."""
+    count = len(position)
+    local = (points - position[:, None]) @ rotation
+    # a point in the frame of a camera is as one of the world seen by a camera that is not moved
+    predicted, jacobian, _ = reprojection.linearize_in_space(model, np.zeros(3), np.eye(3), local.reshape(-1, 3))
+    jacobian = whiteners @ jacobian.reshape(count, -1, 2, 6)
+    residual = np.einsum("hkij,hkj->hki", whiteners, predicted.reshape(pixels.shape) - pixels)
+    return residual.reshape(count, -1), jacobian.reshape(count, -1, 6)
+
+
+def _squared(
+    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
+) -> Array:
+    """Squared whitened residuals (H, K) of all points seen by H cameras."""
+    local = (points - position[:, None]) @ rotation
+    predicted = reprojection.project(model, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
+    error = np.einsum("kij,hkj->hki", whiteners, predicted - pixels)
+    return np.asarray(np.einsum("hki,hki->hk", error, error))

@@ -1,0 +1,86 @@
+"""A room whose walls carry named points, and a robot with a camera that drives in it: noise as the rig says."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.log import Log, SightingStream, VelocityStream
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import reprojection, se2
+
+ODOMETRY_STEP = 0.05  # s
+HALF = 4.0  # m: the room is a square of twice that
+NOISE = OdometryNoise(
+    along=GrowthSettings(per_distance=0.05),
+    lateral=GrowthSettings(per_distance=0.02),
+    heading=GrowthSettings(per_distance=0.05, per_rotation=0.05),
+)
+CAMERA = CameraSettings(
+    fx=500.0, fy=500.0, cx=319.5, cy=239.5, distortion=(-0.1, 0.01, 0.001, -0.001), x=0.15, y=0.05, z=0.9, pitch=-0.1
+)
+RIG = Rig(sensors=("odometry", "sightings"), odometry=OdometrySettings(noise=NOISE), camera=CAMERA)
+
+
+def room(count=160, seed=0):
+    """Points on the four walls."""
+    rng = np.random.default_rng(seed)
+    along, height = rng.uniform(-HALF, HALF, count), rng.uniform(0.3, 2.4, count)
+    wall = np.arange(count) % 4
+    x = np.choose(wall, (along, along, HALF, -HALF))
+    y = np.choose(wall, (HALF, -HALF, along, along))
+    return PointMap.of(tuple(f"p{i}" for i in range(count)), np.column_stack((x, y, height)))
+
+
+def drive(seconds, rng):
+    """A circle of 1.5 m radius at 0.3 m/s; the robot slips off what the wheels report by the noise of the rig."""
+    t = np.arange(round(seconds / ODOMETRY_STEP) + 1) * ODOMETRY_STEP
+    v, w = np.full(len(t), 0.3), np.full(len(t), 0.2)
+    reported = se2.exp(np.column_stack((v, 0.0 * v, w)) * ODOMETRY_STEP)
+    growth = (NOISE.along, NOISE.lateral, NOISE.heading)
+    sigma = np.sqrt([g.model().variance(0.3 * ODOMETRY_STEP, 0.2 * ODOMETRY_STEP, ODOMETRY_STEP) for g in growth])
+    steps = se2.compose(reported, se2.exp(rng.standard_normal((len(t), 3)) * sigma))
+    poses = np.zeros((len(t), 3))
+    poses[0] = (1.0, -1.0, 0.0)
+    for i in range(1, len(t)):
+        poses[i] = se2.compose(poses[i - 1], steps[i - 1])
+    return VelocityStream(t, v, w), Trajectory(t, poses)
+
+
+def sightings(truth, points, t, rng, camera=CAMERA, limit=20):
+    """What the camera sees at times (N,) of the points that are in its image, at most ``limit`` in each."""
+    model = camera.model()
+    stamps, names, pixels = [], [], []
+    for stamp, pose in zip(t, truth.at(t), strict=True):
+        seen, depth = reprojection.predict(model, pose, points.positions)
+        rows = np.flatnonzero(model.contains(seen) & (depth > 0.3))
+        rows = rng.permutation(rows)[:limit]
+        stamps += [stamp] * len(rows)
+        names += [points.names[i] for i in rows]
+        pixels.append(seen[rows] + camera.pixel_sigma * rng.standard_normal((len(rows), 2)))
+    u, v = np.concatenate(pixels).T
+    return SightingStream(np.array(stamps), names, u, v)
+
+
+def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA):
+    """A log; ``camera``: as it is in truth, which the log's rig need not know."""
+    rng = np.random.default_rng(seed)
+    odometry, truth = drive(seconds, rng)
+    points = room()
+    stream = sightings(truth, points, np.arange(0.13, seconds, 1.0 / rate), rng, camera, limit)
+    return Log(
+        name="room",
+        rig=RIG,
+        world=World(points=points),
+        streams={"odometry": odometry, "sightings": stream},
+        reference=truth,
+    )
+
+
+def with_camera(log, **changes):
+    """The log with another belief about the camera."""
+    camera = log.rig.camera.model_copy(update=changes)
+    return replace(log, rig=log.rig.model_copy(update={"camera": camera}))
