@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,13 +14,15 @@ from factorgraph_loc.estimators.robust_update import Update, robust_update
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Estimated
-from factorgraph_loc.vision.consensus import CameraPose, Truths, agreeing
+from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factors import reprojection, se2
 from factors.odometry import Increment
 from factors.reprojection import FOCAL, TIME_OFFSET, CameraModel
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
+DISAGREES = "camera: does not agree with the others"  # why a sighting is rejected
 CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
 EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
 # A pixel is so sharp that one step from a poor prediction does not lead to the optimum
@@ -52,6 +55,9 @@ class KnownPoints:
         self.map = PointMap.of((), np.empty((0, 3))) if setup.world.points is None else setup.world.points
         self._estimated = estimated
         self._diagnostics = diagnostics
+        self.associator: Associator | None = None
+        if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
+            self.associator = Associator(self.map, self.model)
         self._map_matters = False
         if settings is not None and len(self.map):
             worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
@@ -86,18 +92,23 @@ class KnownPoints:
 
         ``twist`` (3,): the robot's velocity then, where the camera's time offset is estimated.
         """
-        if isinstance(m, CameraFrame):
-            self._diagnostics.ignore("camera", len(m.pixels))
-            return None
-        factor = self.named(m)
+        factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
         if factor is None:
             return None
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
         factor = replace(factor, estimated=self._estimated.indices, twist=twist)
-        right = self._agreeing(factor, predicted)
+        here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
+        camera = self._camera(here, predicted)
+        focal = 0.0
+        if predicted.spread is not None and FOCAL in self._estimated.indices:
+            place = self._estimated.indices.index(FOCAL)
+            focal = math.sqrt(predicted.spread[place, place])
+        if isinstance(m, CameraFrame):
+            return self._found(m, factor, here.model, camera, focal)
+        right = _agreeing(here, camera, focal)
         if not right.all():
-            self._diagnostics.reject("camera: does not agree with the others", int(np.count_nonzero(~right)))
+            self._diagnostics.reject(DISAGREES, int(np.count_nonzero(~right)))
         return _rows(factor, right) if right.any() else None
 
     def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
@@ -111,40 +122,50 @@ class KnownPoints:
         spreads = self.map.covariances[points] if self._map_matters else None
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
 
-    def _agreeing(self, factor: ReprojectionFactor, predicted: Predicted) -> Truths:
-        """Which points of a factor agree near what is predicted."""
-        here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
+    def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
+        """A factor of no points yet, where features can be found in the map."""
+        if self.model is None or self.associator is None:
+            self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        if m.feature != self.map.feature:
+            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
+            return None
+        return self._factor(self.model, [], np.empty((0, 2)))
+
+    def _found(
+        self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
+    ) -> ReprojectionFactor | None:
+        """A factor of the points that are found in a frame."""
+        assert self.associator is not None
+        seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        if seen.rejected:
+            self._diagnostics.reject(DISAGREES, seen.rejected)
+        if len(seen) == 0:
+            return None
+        spreads = self.map.covariances[seen.points] if self._map_matters else None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        return replace(factor, points=self.map.positions[seen.points], pixels=pixels, point_covariances=spreads)
+
+    def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
+        """Where the camera is when the image is taken, with what is not known of its constants."""
         pose, covariance = predicted.pose, predicted.covariance
         if here.offset is not None:
             noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
             since = Increment(here.offset, noise, 0.0)
             pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
         camera = lifted(here.model, pose, covariance)
-        spreads = np.broadcast_to(here.model.sigma**2 * np.eye(2), (len(here.pixels), 2, 2))
-        if here.point_covariances is not None:
-            _, _, by_point = reprojection.linearize_in_space(here.model, camera.position, camera.rotation, here.points)
-            spreads = spreads + by_point @ here.point_covariances @ by_point.transpose(0, 2, 1)
-        if predicted.spread is not None:
-            camera, spreads = self._widened(here, camera, spreads, predicted.spread)
-        return agreeing(here.model, camera, here.points, here.pixels, spreads)
-
-    def _widened(
-        self, factor: ReprojectionFactor, camera: CameraPose, spreads: Array, spread: Array
-    ) -> tuple[CameraPose, Array]:
-        """Prediction and noise of the pixels with what is not known of the camera's constants."""
-        model = factor.model
-        full = np.zeros((6, len(spread)))
+        if predicted.spread is None:
+            return camera
+        model = here.model
+        full = np.zeros((6, len(predicted.spread)))
         for column, place in enumerate(self._estimated.indices):
             if place < 3:
                 full[3:, column] = model.rotation[place]
             elif place < FOCAL:
                 full[:3, column] = model.rotation[place - 3]
-            elif place == TIME_OFFSET and factor.twist is not None:
-                full[:, column] = _lift(model) @ factor.twist
-            elif place == FOCAL:
-                away = factor.pixels - (model.cx, model.cy)
-                spreads = spreads + spread[column, column] * away[:, :, None] * away[:, None, :]
-        return replace(camera, covariance=camera.covariance + full @ spread @ full.T), spreads
+            elif place == TIME_OFFSET and here.twist is not None:
+                full[:, column] = _lift(model) @ here.twist
+        return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
 def pixel_update(factor: ReprojectionFactor, pose: Array, covariance: Array) -> Update:
@@ -166,6 +187,22 @@ def _lift(model: CameraModel) -> Array:
     lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
     lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
     return lift
+
+
+def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
+    """Which points agree near what is predicted; all where too few are seen to tell. ``focal``: standard deviation of the logarithm
+    of the focal length."""
+    model, count = here.model, len(here.pixels)
+    if count < FEWEST:
+        return np.ones(count, dtype=bool)
+    spreads = np.broadcast_to(model.sigma**2 * np.eye(2), (count, 2, 2))
+    if here.point_covariances is not None:
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
+        spreads = spreads + by_point @ here.point_covariances @ by_point.transpose(0, 2, 1)
+    if focal > 0.0:
+        away = focal * (here.pixels - (model.cx, model.cy))
+        spreads = spreads + away[:, :, None] * away[:, None, :]
+    return agreeing(model, camera, here.points, here.pixels, spreads)
 
 
 def _rows(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:

@@ -41,19 +41,26 @@ class CameraPose:
     covariance: Array
 
 
-def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
-    """Which of ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], agree near
-    the predicted ``camera``; all where they are too few to tell, none where fewer than :data:`FEWEST` agree."""
-    count = len(points)
+def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> bool:
+    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], lie
+    together as near to what is predicted as they should."""
     whiteners = np.linalg.inv(np.linalg.cholesky(spreads))
-    values, vectors = np.linalg.eigh(camera.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
     residual, jacobian = _whitened(model, camera.position, camera.rotation, points, pixels, whiteners)
-    flat = (jacobian @ root).reshape(-1, 6)
+    flat = (jacobian @ _root(camera)).reshape(-1, 6)
     pull = residual.ravel() @ flat
     joint = float(np.vdot(residual, residual) - pull @ np.linalg.solve(np.eye(6) + flat.T @ flat, pull))
-    if joint < chi2.ppf(JOINT, 2 * count) or count < FEWEST:
+    return bool(joint < chi2.ppf(JOINT, 2 * len(points)))
+
+
+def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
+    """Which of ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], agree on a pose
+    near the predicted ``camera``: all that are :func:`compatible`, none where fewer than :data:`FEWEST` agree."""
+    count = len(points)
+    if compatible(model, camera, points, pixels, spreads):
         return np.ones(count, dtype=bool)
+    if count < FEWEST:
+        return np.zeros(count, dtype=bool)
+    whiteners, root = np.linalg.inv(np.linalg.cholesky(spreads)), _root(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
     inside = squared < LOOSE
     for _ in range(2):
@@ -100,6 +107,12 @@ def _best_of_samples(
             break
     assert best is not None
     return best[1:]
+
+
+def _root(camera: CameraPose) -> Array:
+    """A root (6, 6) of the covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(camera.covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.log import Log, SightingStream, VelocityStream
+from factorgraph_loc.log import FeatureStream, Log, SightingStream, VelocityStream
+from factorgraph_loc.measurements import CameraFrame
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
 from factorgraph_loc.trajectory import Trajectory
@@ -84,3 +85,59 @@ def with_camera(log, **changes):
     """The log with another belief about the camera."""
     camera = log.rig.camera.model_copy(update=changes)
     return replace(log, rig=log.rig.model_copy(update={"camera": camera}))
+
+
+def with_views(points, seed=0, size=64, views=3):
+    """The same points with descriptors: each was seen from about the middle of the room, and looks nearly the same each time."""
+    rng = np.random.default_rng(seed)
+    looks = rng.standard_normal((len(points), size))
+    owners = np.repeat(np.arange(len(points)), views)
+    middle = np.append(rng.uniform(-1.5, 1.5, (len(owners), 2)), np.full((len(owners), 1), 0.9), axis=1)
+    return replace(
+        points,
+        feature="colour",
+        owners=owners,
+        descriptors=(looks[owners] + 0.2 * rng.standard_normal((len(owners), size))).astype(np.float32),
+        seen_from=middle,
+        sizes=np.full(len(owners), 5.0),
+    )
+
+
+def frame(points, pose, t, rng, camera=CAMERA, clutter=100, wrong=0.0, limit=400):
+    """Features of the points in view, in random order, with some that show none of them; a share of the points look like others."""
+    model = camera.model()
+    seen, depth = reprojection.predict(model, pose, points.positions)
+    rows = rng.permutation(np.flatnonzero(model.contains(seen) & (depth > 0.3)))[:limit]
+    looks = points.descriptors[np.searchsorted(points.owners, rows)].copy()
+    swapped = rng.permutation(len(rows))[: int(wrong * len(rows))]
+    looks[swapped] = looks[np.roll(swapped, 1)]
+    size = looks.shape[1]
+    pixels = seen[rows] + camera.pixel_sigma * rng.standard_normal((len(rows), 2))
+    pixels = np.concatenate((pixels, rng.uniform((0, 0), (camera.width, camera.height), (clutter, 2))))
+    looks = np.concatenate((looks, rng.standard_normal((clutter, size)))) + 0.2 * rng.standard_normal(
+        (len(rows) + clutter, size)
+    )
+    order = rng.permutation(len(pixels))
+    shown = np.concatenate((rows, np.full(clutter, -1)))[order]
+    found = CameraFrame(
+        t,
+        "colour",
+        pixels[order],
+        np.full(len(pixels), 5.0),
+        looks[order].astype(np.float32),
+        np.arange(len(pixels)),
+    )
+    return found, shown
+
+
+def with_frames(log, seed=2, rate=5.0, wrong=0.0, clutter=100):
+    """The same log with frames of features in place of named sightings."""
+    rng = np.random.default_rng(seed)
+    points = with_views(log.world.points)
+    t = np.arange(0.13, log.reference.t[-1], 1.0 / rate)
+    frames = [
+        frame(points, p, s, rng, clutter=clutter, wrong=wrong)[0] for s, p in zip(t, log.reference.at(t), strict=True)
+    ]
+    streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(t, frames)}
+    rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
+    return replace(log, rig=rig, world=World(points=points), streams=streams)

@@ -1,0 +1,184 @@
+"""Compiled loops of :mod:`~factorgraph_loc.vision.association`: thousands of points of a map against hundreds of features."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.se2 import Array
+
+Integers = NDArray[np.int64]
+NOWHERE = -1
+
+BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
+
+
+@numba.njit(cache=True)
+def agreeing_views(
+    rows: Integers, place: Array, positions: Array, starts: Integers, seen_from: Array, cosine: float, ratio: float
+) -> tuple[Integers, Integers]:
+    """Of the points ``rows`` (C,) the views from where they look as from ``place`` (3,): indices of these, and where those of each
+    point begin (C+1,). Views stand in the order of the points they show, from ``starts`` (P+1,) on."""
+    total = 0
+    for row in rows:
+        total += starts[row + 1] - starts[row]
+    views = np.empty(total, np.int64)
+    begins = np.empty(len(rows) + 1, np.int64)
+    n = 0
+    for i in range(len(rows)):
+        begins[i] = n
+        p = rows[i]
+        ax, ay, az = place[0] - positions[p, 0], place[1] - positions[p, 1], place[2] - positions[p, 2]
+        here = np.sqrt(ax * ax + ay * ay + az * az)
+        for v in range(starts[p], starts[p + 1]):
+            bx = seen_from[v, 0] - positions[p, 0]
+            by = seen_from[v, 1] - positions[p, 1]
+            bz = seen_from[v, 2] - positions[p, 2]
+            there = np.sqrt(bx * bx + by * by + bz * bz)
+            if here > ratio * there or there > ratio * here:
+                continue
+            if ax * bx + ay * by + az * bz >= cosine * here * there:
+                views[n] = v
+                n += 1
+    begins[len(rows)] = n
+    return views[:n], begins
+
+
+@numba.njit(cache=True)
+def in_view(
+    positions: Array, place: Array, rotation: Array, nearest: float, farthest: float, slopes: Array
+) -> Integers:
+    """Which points lie ahead of the camera, between two depths and below the ``slopes`` (2,) of its widest directions."""
+    out = np.empty(len(positions), np.int64)
+    n = 0
+    for i in range(len(positions)):
+        x, y, z = positions[i, 0] - place[0], positions[i, 1] - place[1], positions[i, 2] - place[2]
+        depth = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
+        if depth < nearest or depth > farthest:
+            continue
+        right = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z
+        down = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
+        if abs(right) <= slopes[0] * depth and abs(down) <= slopes[1] * depth:
+            out[n] = i
+            n += 1
+    return out[:n]
+
+
+@numba.njit(cache=True)
+def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
+    """Pairs (N, 2) of a point and a feature that lies in the gate of the point's prediction.
+
+    ``predicted`` (C, 2); ``inverses`` (C, 2, 2): of the gates' matrices, so that a point on the border has 1; ``reaches`` (C,):
+    half their largest diameters; ``features`` (K, 2). ``cell``: size of the cells that features are sorted into.
+    """
+    low_x, low_y = features[:, 0].min(), features[:, 1].min()
+    columns = int((features[:, 0].max() - low_x) / cell) + 1
+    lines = int((features[:, 1].max() - low_y) / cell) + 1
+    where = np.empty(len(features), np.int64)
+    counts = np.zeros(columns * lines + 1, np.int64)
+    for i in range(len(features)):
+        where[i] = int((features[i, 1] - low_y) / cell) * columns + int((features[i, 0] - low_x) / cell)
+        counts[where[i] + 1] += 1
+    begins = np.cumsum(counts)
+    sorted_features = np.argsort(where, kind="mergesort")
+    pairs = np.empty((1024, 2), np.int64)
+    n = 0
+    for c in range(len(predicted)):
+        u, v, reach = predicted[c, 0], predicted[c, 1], reaches[c]
+        x0 = max(0, int(np.floor((u - reach - low_x) / cell)))
+        x1 = min(columns - 1, int(np.floor((u + reach - low_x) / cell)))
+        y0 = max(0, int(np.floor((v - reach - low_y) / cell)))
+        y1 = min(lines - 1, int(np.floor((v + reach - low_y) / cell)))
+        if x1 < x0:
+            continue
+        m = inverses[c]
+        for y in range(y0, y1 + 1):
+            for j in range(begins[y * columns + x0], begins[y * columns + x1 + 1]):
+                f = sorted_features[j]
+                du, dv = features[f, 0] - u, features[f, 1] - v
+                if m[0, 0] * du * du + 2.0 * m[0, 1] * du * dv + m[1, 1] * dv * dv > 1.0:
+                    continue
+                if n == len(pairs):
+                    longer = np.empty((2 * n, 2), np.int64)
+                    longer[:n] = pairs
+                    pairs = longer
+                pairs[n, 0], pairs[n, 1] = c, f
+                n += 1
+    return pairs[:n]
+
+
+@numba.njit(cache=True, fastmath=True)
+def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any) -> Array:
+    """Squared distance (N,) of each pair's feature, of descriptors ``seen`` (K, D), from the nearest of the point's views, of
+    descriptors ``known`` (V, D)."""
+    out = np.empty(len(pairs))
+    size = known.shape[1]
+    for i in range(len(pairs)):
+        best = np.float32(np.inf)
+        f = seen[pairs[i, 1]]
+        for j in range(begins[pairs[i, 0]], begins[pairs[i, 0] + 1]):
+            k = known[views[j]]
+            total = np.float32(0.0)
+            for d in range(size):
+                total += (f[d] - k[d]) * (f[d] - k[d])
+            best = min(best, total)
+        out[i] = best
+    return out
+
+
+@numba.njit(cache=True)
+def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any, bits: Integers) -> Array:
+    """The same, as the number of bits that differ."""
+    out = np.empty(len(pairs))
+    for i in range(len(pairs)):
+        best = 1 << 30
+        for j in range(begins[pairs[i, 0]], begins[pairs[i, 0] + 1]):
+            total = 0
+            for d in range(known.shape[1]):
+                total += bits[seen[pairs[i, 1], d] ^ known[views[j], d]]
+            best = min(best, total)
+        out[i] = best
+    return out
+
+
+@numba.njit(cache=True)
+def clear_pairs(
+    pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
+) -> Integers:
+    """Indices of the pairs whose point and feature are nearest to each other, and clearly nearer than to any other: a cost below
+    ``ratio`` times that of the best other that lies ``apart`` pixels away."""
+    count, amount = len(predicted), len(features)
+    of_point, of_feature = np.full(count, NOWHERE), np.full(amount, NOWHERE)
+    for i in range(len(pairs)):
+        c, f = pairs[i]
+        if of_point[c] == NOWHERE or costs[i] < costs[of_point[c]]:
+            of_point[c] = i
+        if of_feature[f] == NOWHERE or costs[i] < costs[of_feature[f]]:
+            of_feature[f] = i
+    clear = np.ones(len(pairs), np.bool_)
+    square = apart * apart
+    for i in range(len(pairs)):
+        c, f = pairs[i]
+        best = of_feature[f]
+        if best != i and costs[best] >= ratio * costs[i]:
+            b = pairs[best, 0]
+            du, dv = predicted[b, 0] - predicted[c, 0], predicted[b, 1] - predicted[c, 1]
+            if du * du + dv * dv > square:
+                clear[best] = False
+        best = of_point[c]
+        if best != i and costs[best] >= ratio * costs[i]:
+            b = pairs[best, 1]
+            du, dv = features[b, 0] - features[f, 0], features[b, 1] - features[f, 1]
+            if du * du + dv * dv > square:
+                clear[best] = False
+    out = np.empty(min(count, amount), np.int64)
+    n = 0
+    for c in range(count):
+        i = of_point[c]
+        if i != NOWHERE and of_feature[pairs[i, 1]] == i and clear[i]:
+            out[n] = i
+            n += 1
+    return out[:n]

@@ -1,0 +1,147 @@
+"""Where a camera is, from points of the map that it sees, without any prediction.
+
+Three points at a time give up to four poses, of which the one that most others agree with is kept (universal RANSAC: Raguram, Chum,
+Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as OpenCV has it), and refined by all that agree. On a robot that stays on the floor
+three values tell the pose: they are refined alone, and a camera that would float or tilt is not believed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
+from factors import reprojection, se2
+from factors.reprojection import CameraModel, huber_weight
+from factors.reprojection_factor import ReprojectionFactor
+from factors.se2 import Array
+
+REACH = 3.0  # standard deviations of a pixel that an agreeing point may be off
+CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
+REFINEMENTS = 10
+CONVERGED = 1e-6  # m, rad
+# m, rad: how high and how tilted a robot on the floor may seem: errors of a pose in space, and of the camera's mounting
+FLOATS, TILTS = 0.3, 0.15
+DETERMINED = 0.5  # m, rad: standard deviations beyond which a pose is not known
+
+
+@dataclass(frozen=True)
+class Found:
+    """A camera's pose, and which of the points agree with it (K,)."""
+
+    camera: CameraPose
+    inliers: Truths
+
+
+@dataclass(frozen=True)
+class FoundOnFloor:
+    """A robot's ``pose`` (3,) with its body-frame ``covariance`` (3, 3), and which of the points agree with it (K,)."""
+
+    pose: Array
+    covariance: Array
+    inliers: Truths
+
+
+def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None) -> Found | None:
+    """The pose that most of ``points`` (K, 3), seen at ``pixels`` (K, 2), agree with; None where there is none.
+
+    ``spreads`` (K, 3, 3) [m^2]: covariances of the points.
+    """
+    if len(points) < FEWEST:
+        return None
+    parameters = cv2.UsacParams()
+    parameters.confidence, parameters.maxIterations = CONFIDENCE, MOST_SAMPLES
+    parameters.threshold = REACH * model.sigma
+    parameters.score, parameters.sampler = cv2.SCORE_METHOD_MSAC, cv2.SAMPLING_UNIFORM
+    parameters.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    parameters.randomGeneratorState, parameters.isParallel = 0, False
+    ideal = reprojection.undistorted(model, pixels) * (model.fx, model.fy) + (model.cx, model.cy)
+    try:
+        found, _, turn, shift, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(points), ideal, model.matrix(), None, params=parameters
+        )
+    except cv2.error:  # of degenerate samples
+        return None
+    if not found or inliers is None or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
+        return None
+    rotation = Rotation.from_rotvec(turn.ravel()).as_matrix().T
+    return _refined(model, -rotation @ shift.ravel(), rotation, points, pixels, spreads)
+
+
+def on_floor(
+    model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array | None = None
+) -> FoundOnFloor | None:
+    """The pose of a robot on the floor whose camera was found at ``camera``; None where it floats, tilts or is not determined."""
+    rotation = camera.rotation @ model.rotation.T
+    position = camera.position - rotation @ model.position
+    tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
+    if abs(position[2]) > FLOATS or tilt > TILTS:
+        return None
+    pose = np.array((position[0], position[1], math.atan2(rotation[1, 0], rotation[0, 0])))
+    factor = ReprojectionFactor(model, points, pixels, point_covariances=spreads)
+    information = np.zeros((3, 3))
+    for _ in range(REFINEMENTS):
+        residual, (jacobian,) = factor.linearize([pose])
+        information = jacobian.T @ jacobian
+        if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
+            return None
+        step: Array = -np.asarray(np.linalg.solve(information, jacobian.T @ residual), dtype=float)
+        pose = se2.compose(pose, se2.exp(step))
+        if np.abs(step).max() < CONVERGED:
+            break
+    error, _ = factor.whitened([pose])
+    inliers = np.sum(error**2, axis=1) < GATE
+    if np.count_nonzero(inliers) < FEWEST:
+        return None
+    return FoundOnFloor(pose, np.asarray(np.linalg.inv(information), dtype=float), np.asarray(inliers))
+
+
+def _refined(
+    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, spreads: Array | None
+) -> Found | None:
+    information = np.zeros((6, 6))
+    for i in range(REFINEMENTS):
+        predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
+        residual = predicted - pixels
+        noise = np.broadcast_to(model.sigma**2 * np.eye(2), (len(points), 2, 2))
+        if spreads is not None:
+            noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        whitener = np.linalg.inv(np.linalg.cholesky(noise))
+        residual = np.einsum("kij,kj->ki", whitener, residual)
+        squared = np.sum(residual**2, axis=1)
+        # wrong points far off would pull as one under the loss
+        weight = np.where(squared < (2.0 * GATE if i < 3 else GATE), huber_weight(squared, model.robust), 0.0)
+        by_camera = whitener @ by_camera
+        information = np.einsum("k,kri,krj->ij", weight, by_camera, by_camera)
+        if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
+            return None
+        step = -np.linalg.solve(information, np.einsum("k,kri,kr->i", weight, by_camera, residual))
+        position = position + rotation @ step[3:]
+        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        if i >= 3 and np.abs(step).max() < CONVERGED:
+            break
+    inliers = squared < GATE
+    if np.count_nonzero(inliers) < FEWEST:
+        return None
+    covariance = np.asarray(np.linalg.inv(information), dtype=float)
+    return Found(CameraPose(position, rotation, covariance), np.asarray(inliers))
+
+
+def found_on_floor(
+    model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None
+) -> FoundOnFloor | None:
+    """Where a robot on the floor is, from K points that may be wrong; ``inliers`` tells of all of them."""
+    found = located(model, points, pixels, spreads)
+    if found is None:
+        return None
+    rows = found.inliers
+    planar = on_floor(model, found.camera, points[rows], pixels[rows], None if spreads is None else spreads[rows])
+    if planar is None:
+        return None
+    inliers = rows.copy()
+    inliers[rows] = planar.inliers
+    return replace(planar, inliers=inliers)
