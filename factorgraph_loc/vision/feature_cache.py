@@ -1,0 +1,86 @@
+"""What was found in images, kept in the user's cache folder, so that it is computed once.
+
+A cache may vanish, be full or be damaged at any time: then things are computed again, and nothing else happens.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import platformdirs
+
+from factorgraph_loc.files import replacing
+
+VARIABLE = "FGLOC_CACHE"  # of the environment: another folder than the user's
+LIMIT = 4 * 10**9  # bytes
+_HEAD = struct.Struct("<4sII")  # mark, CRC-32 and length of the content
+_MARK = b"FGLC"
+
+
+def cache_folder() -> Path:
+    """The folder that ``FGLOC_CACHE`` names, else that for caches of the user's system."""
+    told = os.environ.get(VARIABLE)
+    return Path(told) if told else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
+
+
+class FeatureCache:
+    """Contents by their keys, a file each, below ``folder``; together at most ``limit`` bytes once :meth:`trim` is called."""
+
+    def __init__(self, folder: Path, limit: int = LIMIT) -> None:
+        self._folder = folder / "features"
+        self._limit = limit
+        self._writable = True
+
+    def read(self, key: str) -> bytes | None:
+        """What was written, and a mark that it was used now; None if it is not there or not as it was written."""
+        path = self._path(key)
+        try:
+            stored = path.read_bytes()
+            if len(stored) < _HEAD.size:
+                return None
+            mark, check, length = _HEAD.unpack_from(stored)
+            content = stored[_HEAD.size :]
+            if mark != _MARK or len(content) != length or zlib.crc32(content) != check:
+                return None
+            os.utime(path)
+        except OSError:
+            return None
+        return content
+
+    def write(self, key: str, content: bytes) -> None:
+        """Keep ``content``, at once or not at all; where nothing can be written, nothing is."""
+        if not self._writable:
+            return
+        path = self._path(key)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary:
+                temporary.write_bytes(_HEAD.pack(_MARK, zlib.crc32(content), len(content)) + content)
+        except OSError:
+            self._writable = False
+
+    def trim(self) -> None:
+        """Remove what was not used for longest, until the rest is within the limit."""
+        files = []
+        for path in self._folder.glob("*/*"):
+            try:
+                status = path.stat()
+            except OSError:  # another process removed it
+                continue
+            files.append((status.st_mtime_ns, status.st_size, path))
+        excess = sum(size for _, size, _ in files) - self._limit
+        for _, size, path in sorted(files):
+            if excess <= 0:
+                return
+            try:
+                path.unlink(missing_ok=True)
+            except OSError:
+                return
+            excess -= size
+
+    def _path(self, key: str) -> Path:
+        # folders of 256 parts: some file systems are slow with many files in one
+        return self._folder / key[:2] / key

@@ -1,0 +1,97 @@
+"""What is followed from image to image: features of one number are, as far as their neighbours tell, one point.
+
+Between two images descriptors must be mutually nearest, clearly nearer than the second nearest and not far apart in the
+image, and the pairs together must obey one epipolar geometry: an essential matrix, found by USAC (Raguram et al., PAMI 35,
+2013) as OpenCV has it, whose random numbers are the same each time. A fundamental matrix would be too obliging: it often fits
+a moving object too. What an image misses is looked for in the one before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.vision.colour import Float
+from factorgraph_loc.vision.keypoints import Descriptors, Integers
+from factorgraph_loc.vision.matching import Truths, match
+from factors.reprojection import CameraModel, undistorted
+from factors.se2 import Array
+
+RADIUS = 0.25  # of the longer side of an image: how far a feature may move
+EPIPOLAR = 1.5  # px from the epipolar line
+CONFIDENCE, DRAWS = 0.99, 300  # of five pairs
+FEWEST = 16  # pairs: with fewer, a geometry that eight of them fit says nothing of the others
+THREADS = 2
+
+
+def follow(
+    pixels: Sequence[Array], descriptors: Sequence[Descriptors], camera: CameraModel, *, binary: bool
+) -> list[Integers]:
+    """Numbers (K,) of the features of each of N images, given in the order of time.
+
+    ``pixels``: N times (K, 2) as the ``camera`` has them; ``descriptors``: N times (K, D), ``binary`` or not. A number stands at
+    most once in an image; what is seen once has one of its own.
+    """
+    count = len(pixels)
+    directions = [undistorted(camera, p) for p in pixels]
+
+    def matched(i: int, j: int, first: Integers, second: Integers) -> Integers:
+        """Pairs (M, 2) of features among ``first`` of image i and ``second`` of image j."""
+        found = pairs(
+            (directions[i][first], descriptors[i][first]),
+            (directions[j][second], descriptors[j][second]),
+            camera,
+            binary=binary,
+        )
+        return np.column_stack((first[found[:, 0]], second[found[:, 1]]))
+
+    every = [np.arange(len(p)) for p in pixels]
+    with ThreadPoolExecutor(THREADS) as pool:  # the work is done by numpy and OpenCV, outside of the interpreter
+        steps = range(1, count)
+        near = list(pool.map(lambda j: matched(j - 1, j, every[j - 1], every[j]), steps))
+        missed = [np.setdiff1d(every[j], near[j][:, 0]) for j in range(count - 1)]  # of image j in the one after
+        new = [np.setdiff1d(every[j], near[j - 1][:, 1]) for j in steps]  # of image j
+        far = list(pool.map(lambda j: matched(j - 2, j, missed[j - 2], new[j - 1]), range(2, count)))
+    tracks: list[Integers] = []
+    following = 0
+    for j in range(count):
+        numbers = np.full(len(every[j]), -1, dtype=np.int64)
+        if j >= 1:
+            numbers[near[j - 1][:, 1]] = tracks[j - 1][near[j - 1][:, 0]]
+        if j >= 2:
+            numbers[far[j - 2][:, 1]] = tracks[j - 2][far[j - 2][:, 0]]
+        fresh = np.flatnonzero(numbers < 0)
+        numbers[fresh] = following + np.arange(len(fresh))
+        following += len(fresh)
+        tracks.append(numbers)
+    return tracks
+
+
+def pairs(
+    first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel, *, binary: bool
+) -> Integers:
+    """Pairs (M, 2) of features of two images, each given as directions (K, 2), as (x, y) at depth 1, and descriptors (K, D)."""
+    if len(first[0]) == 0 or len(second[0]) == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    focal = math.sqrt(camera.fx * camera.fy)
+    a, b = (np.asarray(directions * focal, dtype=np.float32) for directions, _ in (first, second))
+    away = [np.square(a[:, None, axis] - b[None, :, axis]) for axis in (0, 1)]
+    reach = (RADIUS * max(camera.width, camera.height)) ** 2
+    found = match(first[1], second[1], binary=binary, allowed=away[0] + away[1] < reach).indices
+    if len(found) < FEWEST:
+        return found
+    return found[_of_one_geometry(a[found[:, 0]], b[found[:, 1]], focal)]
+
+
+def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
+    """Which of M pairs of pixels (M, 2), from the principal point, obey the epipolar geometry that most of them do."""
+    matrix = np.diag((focal, focal, 1.0))
+    try:
+        _, inliers = cv2.findEssentialMat(first, second, matrix, cv2.USAC_FAST, CONFIDENCE, EPIPOLAR, DRAWS)
+    except cv2.error:  # USAC of OpenCV 5.0 fails now and then where a camera hardly moves
+        inliers = None
+    return np.ones(len(first), dtype=bool) if inliers is None else np.asarray(inliers.ravel() != 0)
