@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from benchmarking.report import Options, Report, pooled, spread_cell
 
 from factorgraph_loc.calibration.rfid_learn import learn_rfid
 from factorgraph_loc.calibration.rfid_tempering import tempered
@@ -17,7 +18,6 @@ from factorgraph_loc.log import Log, cut
 from factorgraph_loc.readers import load
 from factorgraph_loc.rig import Rig, read_rig, write_rig
 from factorgraph_loc.trajectory import Trajectory
-from rfid_benchmark.report import Options, Report, pooled, spread_cell
 
 RUNS = (13, 16)
 SEEDS = 5

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarking.report import Options, Report, pooled
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.motion import Motion
@@ -28,7 +29,6 @@ from factors.odometry import OdometryFactor
 from factors.rfid_factor import RfidFactor
 from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
-from rfid_benchmark.report import Options, Report, pooled
 
 SEEDS = 10
 FIRST = 3000

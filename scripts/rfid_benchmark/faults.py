@@ -8,13 +8,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from benchmarking.report import Options, Report, pooled
 
 from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.log import Log
 from factorgraph_loc.simulation.settings import preset
 from factors import se2
-from rfid_benchmark.report import Options, Report, pooled
 
 SEEDS = 5
 FIRST = 2000

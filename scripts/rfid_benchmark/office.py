@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from benchmarking.report import Options, Report, pooled, ratio_cells, together
 
 from factorgraph_loc.evaluation.ensembles import share_in_band
 from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble, stacked
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation.settings import preset
-from rfid_benchmark.report import Options, Report, pooled, ratio_cells, together
 
 NOISE = ", constants as noise"
 STATES = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}

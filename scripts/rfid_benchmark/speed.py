@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from benchmarking.report import Options, Report
 
 from factorgraph_loc.calibration.calibrate import calibrate
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
-from rfid_benchmark.report import Options, Report
 
 SCANS, RATE = 5000, 10.0  # of all eight antennas; 1/s
 WORLD = {"world": {"tags": 20}, "rounds_per_second": RATE, "drive": {"duration": SCANS / RATE}}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from benchmarking.report import Options, Report, share_text
 
 from factorgraph_loc.experiments.simulated_trials import SimulatedTrial, SimulatedTrialJob, run_simulated_trials
 from factorgraph_loc.simulation.settings import preset
-from rfid_benchmark.report import Options, Report, share_text
 
 SEEDS = 100
 CHUNK = 10  # trials of one process
