@@ -1,0 +1,156 @@
+"""Points that no map has: their sightings wait until they tell where the point is.
+
+That needs sightings from :data:`FEWEST` keyframes whose rays enclose an angle wide enough (a parallax test), that meet in front
+of the camera, and that are seen where the place that they give says. A sighting that contradicts the others is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from factors import reprojection
+from factors.reprojection import CameraModel
+from factors.se2 import Array
+
+FEWEST, MAX_WAITING = 3, 10  # sightings of one point
+MIN_PARALLAX = 0.035  # rad, between the outermost rays
+NEAREST = 0.3  # m of depth
+ITERATIONS = 4
+GATE = 0.999  # probability of the residuals to be that small, if all sightings are right
+PATIENCE = 20  # keyframes that a point waits without being seen again
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A point seen from a keyframe, by its number, at ``pixel`` (2,)."""
+
+    keyframe: int
+    pixel: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a keyframe is: its ``pose`` (3,), and how far off in the image its error may put points, ``slack`` [px]."""
+
+    pose: Array
+    slack: float
+
+
+@dataclass(frozen=True, slots=True)
+class Triangulated:
+    """A point's ``position`` (3,), its ``covariance`` (3, 3) with exact poses, and the squared whitened residuals (M,) of its
+    sightings."""
+
+    position: Array
+    covariance: Array
+    squared: Array
+
+
+class NewPoints:
+    """The sightings that wait, by the name or number of their point."""
+
+    def __init__(self, model: CameraModel) -> None:
+        self._model = model
+        self._waiting: dict[Hashable, list[Sighting]] = {}
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def count(self, name: Hashable) -> int:
+        """How many sightings of a point wait."""
+        return len(self._waiting.get(name, ()))
+
+    def add(self, name: Hashable, sighting: Sighting) -> None:
+        """One more sighting; the oldest ones do not wait for ever."""
+        waiting = self._waiting.setdefault(name, [])
+        waiting.append(sighting)
+        del waiting[:-MAX_WAITING]
+
+    def forget(self, keyframe: int) -> None:
+        """Give up the points that were last seen long before a keyframe."""
+        self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
+
+    def ready(
+        self, names: Iterable[Hashable], places: Callable[[int], Place | None]
+    ) -> list[tuple[Hashable, Triangulated, list[Sighting]]]:
+        """Those of ``names`` whose place is told by now, with the sightings that tell it; they wait no longer. ``places``: of
+        keyframes, None for one that nothing can be added to."""
+        found = []
+        known: dict[int, Place | None] = {}
+        for name in names:
+            waiting = self._waiting.get(name, [])
+            if len(waiting) < FEWEST:
+                continue
+            for sighting in waiting:
+                if sighting.keyframe not in known:
+                    known[sighting.keyframe] = places(sighting.keyframe)
+            seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
+            result = self._agreed([s for s, _ in seen], [p for _, p in seen])
+            if result is not None:
+                del self._waiting[name]
+                found.append((name, *result))
+        return found
+
+    def _agreed(self, seen: list[Sighting], places: list[Place]) -> tuple[Triangulated, list[Sighting]] | None:
+        while len(seen) >= FEWEST:
+            poses, pixels = np.array([p.pose for p in places]), np.array([s.pixel for s in seen])
+            sigmas = np.array([np.hypot(self._model.sigma, p.slack) for p in places])
+            result = triangulate(self._model, poses, pixels, sigmas)
+            if result is None:
+                return None
+            if result.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
+                return result, seen
+            worst = int(np.argmax(result.squared))
+            del seen[worst], places[worst]
+        return None
+
+
+def triangulate(model: CameraModel, poses: Array, pixels: Array, sigmas: Array) -> Triangulated | None:
+    """The point seen from ``poses`` (M, 3) of the robot at ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) [px]; None
+    where the rays are too nearly parallel, or do not meet in front of the camera.
+
+    It begins where the rays come nearest to each other, and minimises the squared residuals in the images.
+    """
+    cameras = [reprojection.camera_pose(model, pose) for pose in poses]
+    centres, turns = np.array([c for c, _ in cameras]), np.array([r for _, r in cameras])
+    rays = np.column_stack((reprojection.undistorted(model, pixels), np.ones(len(pixels))))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays = np.einsum("mij,mj->mi", turns, rays)
+    if np.min(rays @ rays.T) > np.cos(MIN_PARALLAX):
+        return None
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    point = np.linalg.solve(across.sum(axis=0), np.einsum("mij,mj->i", across, centres))
+    for i in range(ITERATIONS + 1):
+        local = np.einsum("mji,mj->mi", turns, point - centres)
+        if not np.all(local[:, 2] > NEAREST):
+            return None
+        # a point in the frame of a camera is as one of the world seen by a camera that is not moved
+        seen, _, by_local = reprojection.linearize_in_space(model, np.zeros(3), np.eye(3), local)
+        residual = (seen - pixels) / sigmas[:, None]
+        jacobian = (by_local @ turns.transpose(0, 2, 1) / sigmas[:, None, None]).reshape(-1, 3)
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        if i < ITERATIONS:
+            point = point - covariance @ (jacobian.T @ residual.ravel())
+    return Triangulated(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))
+
+
+def spread_out(pixels: Array, priority: Sequence[int], count: int, width: int, height: int) -> list[int]:
+    """At most ``count`` of ``pixels`` (K, 2), spread over an image of ``width`` x ``height``: cell by cell of a grid in turn, of
+    each cell those with the highest ``priority`` (K,) first."""
+    if len(pixels) <= count:
+        return list(range(len(pixels)))
+    side = np.sqrt(width * height / count)
+    cells = np.floor(pixels / side).astype(int)
+    order = sorted(range(len(pixels)), key=lambda i: -priority[i])
+    taken: dict[tuple[int, int], int] = {}
+    turns = []
+    for i in order:
+        cell = (int(cells[i, 0]), int(cells[i, 1]))
+        taken[cell] = taken.get(cell, 0) + 1
+        turns.append(taken[cell])
+    ranked = sorted(range(len(order)), key=lambda j: turns[j])
+    return sorted(order[j] for j in ranked[:count])
