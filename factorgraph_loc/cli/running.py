@@ -186,6 +186,11 @@ def _print_events(result: RunResult) -> None:
 def _print_effort(scores: Mapping[str, Any]) -> None:
     counts = ", ".join(f"{scores[f'{kind}.total']} {kind}" for kind in ("ignored", "rejected", "late"))
     typer.echo(f"measurements: {counts}")
+    if images := scores["timing.images"]:
+        seconds = scores["timing.frontend_seconds"]
+        typer.echo(
+            f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} a second, the cache included"
+        )
     final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
     if scores["time_to_localized"] is None:  # it only collected what came
         typer.echo(f"time: {final}")

@@ -249,4 +249,6 @@ def _timing(timings: Timings) -> dict[str, Any]:
         "timing.real_time_factor": timings.real_time_factor,
         "timing.final_seconds": timings.final_seconds,
         "timing.peak_memory_mb": timings.peak_memory_mb,
+        "timing.images": timings.images,
+        "timing.frontend_seconds": timings.frontend_seconds,
     }

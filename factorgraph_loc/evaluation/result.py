@@ -20,7 +20,8 @@ class Timings:
     ``update_t`` (M,) [s from the log's start]: stamps with an exteroceptive measurement; ``update_ms`` (M,): what each took,
     the ``estimate()`` after it included. ``causal_seconds``: the whole causal loop, odometry and ticks included;
     ``real_time_factor``: the log's span over that. ``final_seconds``: the making of the final trajectory.
-    ``peak_memory_mb``: the largest resident memory of the process so far, in 10^6 bytes.
+    ``peak_memory_mb``: the largest resident memory of the process so far, in 10^6 bytes. ``frontend_seconds``: before the loop,
+    how long it took until the features of ``images`` were there, found or from the cache.
     """
 
     update_t: Array
@@ -29,6 +30,8 @@ class Timings:
     real_time_factor: float
     final_seconds: float
     peak_memory_mb: float
+    images: int = 0
+    frontend_seconds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import comparison_cells, markdown
+from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
 from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.processes import run_each
@@ -76,6 +77,9 @@ def compare(
     _check(logs, configs)
     _prepare(out, overwrite)
     work = [_Job(log, config, _folder(out, log.name, config)) for log in logs for config in configs]
+    for log in logs:
+        if any(CAMERA in (config.sensors or log.rig.sensors) and takes_pixels(config.estimator) for config in configs):
+            fill_cache(log)
     outcomes: dict[int, _Outcome | Exception] = {}
     for i, outcome in run_each(_execute, work, jobs or os.cpu_count() or 1):
         outcomes[i] = outcome

@@ -21,6 +21,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate, PosePrior
 from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
@@ -57,7 +58,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
     its velocity holds on; other measurements older than the prior are counted as ignored. With an unknown start the grid begins at
     the first measurement, and the final trajectory, empty if nothing told the pose, where the estimator began to believe
-    something. ``progress`` is given the share done.
+    something. ``progress`` is given the share done; where features of images are looked for first, that is its first half.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
     Whatever the estimator itself raises is passed on.
@@ -74,7 +75,10 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
             f"expected a prior {EXPECTED}"
         )
 
-    loop = _Loop(estimator, log, sensors, prior, progress or (lambda _: None))
+    report = progress or (lambda _: None)
+    prepared = prepare(log, sensors, config.estimator, lambda share: report(0.5 * share))
+    before = 0.5 if prepared.images else 0.0
+    loop = _Loop(estimator, prepared.log, sensors, prior, lambda share: report(before + (1.0 - before) * share))
     loop.run()
     started = perf_counter()
     final = estimator.trajectory()
@@ -103,12 +107,13 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
         final=final,
         diagnostics=estimator.diagnostics,
         learnt=estimator.learnt(),
-        timings=loop.timings(final_seconds),
+        timings=loop.timings(final_seconds, prepared),
         versions=versions,
         warnings=(
             *log.warnings,
             *_doubts(log, sensors),
             *unread,
+            *prepared.warnings,
             *_without_tags(log, config.estimator, estimator.diagnostics),
             *_never_localized(log, loop.estimates, final),
         ),
@@ -177,8 +182,8 @@ class _Loop:
         self._seconds = perf_counter() - started
         self._progress(1.0)
 
-    def timings(self, final_seconds: float) -> Timings:
-        """The times of the loop, with that of the final trajectory."""
+    def timings(self, final_seconds: float, prepared: Prepared) -> Timings:
+        """The times of the loop, with those of what came before and of the final trajectory."""
         return Timings(
             update_t=np.array(self._update_t),
             update_ms=np.array(self._update_s) * 1e3,
@@ -186,6 +191,8 @@ class _Loop:
             real_time_factor=self._span / self._seconds,
             final_seconds=final_seconds,
             peak_memory_mb=_peak_memory_mb(),
+            images=prepared.images,
+            frontend_seconds=prepared.seconds,
         )
 
     def _measurements(self) -> Iterator[Measurement]:
@@ -234,12 +241,19 @@ def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
                 raise InputError(f"{log.name}: has no sensor {sensor!r}: none of its reads has a value of it")
             if sensor not in there:
                 raise InputError(f"{log.name}: has no sensor {sensor!r}{nearest(sensor, list(there))}")
-    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in there)
+            if sensor in OF_CAMERA and log.rig.camera is None:
+                raise InputError(f"{log.name}: {sensor} needs [camera] in the rig, and {log.rig.name} has none")
+    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in there and s not in _blind(log))
     if not sensors:
         raise InputError(
             f"{log.name}: has none of the rig's sensors {', '.join(log.rig.sensors)}{nearest('', list(there))}"
         )
     return sensors
+
+
+def _blind(log: Log) -> tuple[str, ...]:
+    """Sensors of the log that tell nothing, as the rig has no camera."""
+    return () if log.rig.camera is not None else tuple(s for s in OF_CAMERA if s in log.streams)
 
 
 def _is_read(log: Log, sensor: str) -> bool:
@@ -270,6 +284,8 @@ def _readable(log: Log, sensors: tuple[str, ...]) -> tuple[World, tuple[str, ...
 def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     missing = [s for s in log.rig.sensors if s not in log.streams and not (s in OF_READS and _is_read(log, s))]
     doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in missing]
+    if blind := [s for s in _blind(log) if s in log.rig.sensors]:
+        doubts.append(f"{log.name}: {', '.join(blind)} left out, as the rig {log.rig.name} has no [camera]")
     if "odometry" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)

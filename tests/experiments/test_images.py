@@ -1,0 +1,150 @@
+"""What a run does with images: features before the loop, timed apart; and what it does without them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments import compare as comparing
+from factorgraph_loc.experiments import images
+from factorgraph_loc.experiments.compare import compare
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import ImageStream, SightingStream
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.vision import frontend
+
+CAMERA = CameraSettings(
+    width=80, height=60, fx=75.0, fy=75.0, cx=39.5, cy=29.5, frontend={"feature": "orb", "count": 30}
+)
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("FGLOC_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def seeing(log, tmp_path):
+    """The short log with a camera and eight images, the first of them 0.1 s after its begin."""
+    rng = np.random.default_rng(1)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (60, 120), dtype=np.uint8), (0, 0), 1.5)
+    files = [tmp_path / f"{k}.png" for k in range(8)]
+    for k, file in enumerate(files):
+        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 80])
+    rig = log.rig.model_copy(update={"camera": CAMERA, "sensors": ("odometry", "camera")})
+    return replace(log, rig=rig, streams=dict(log.streams) | {"camera": ImageStream(0.1 + 0.2 * np.arange(8), files)})
+
+
+@pytest.fixture
+def sees(fake, monkeypatch):
+    """The estimator of the tests as one that takes pixels."""
+    monkeypatch.setattr(fake, "takes_pixels", True, raising=False)
+    return fake
+
+
+def in_this_process(function, jobs, _):
+    """In place of a process for each job."""
+    for i, job in enumerate(jobs):
+        try:
+            yield i, function(job)
+        except InputError as error:
+            yield i, error
+
+
+def frames_fed(fake):
+    return [t for kind, t in fake.made.calls if kind == "CameraFrame"]
+
+
+def test_features_are_found_before_the_loop_and_timed_apart(seeing, sees):
+    shares = []
+    result = run(seeing, RunConfig("fake"), shares.append)
+    assert frames_fed(sees) == pytest.approx(0.1 + 0.2 * np.arange(8))
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert result.timings.images == 8
+    assert result.timings.frontend_seconds > 0.0
+    scores = score(result, seeing)
+    assert scores["timing.images"] == 8
+    assert scores["timing.frontend_seconds"] == result.timings.frontend_seconds
+
+
+def test_what_is_wrong_with_images_is_a_warning_of_the_run(seeing, sees):
+    seeing.streams["camera"].file[3].write_bytes(b"no image")
+    result = run(seeing, RunConfig("fake"))
+    assert any("1 of 8 images cannot be read" in warning for warning in result.warnings)
+    assert len(frames_fed(sees)) == 8
+
+
+def test_an_estimator_that_takes_no_pixels_waits_for_no_features(seeing, fake, monkeypatch):
+    monkeypatch.setattr(frontend, "with_features", lambda *_: pytest.fail("features were looked for"))
+    result = run(seeing, RunConfig("fake"))
+    assert result.timings.images == 0
+    assert len(frames_fed(fake)) == 8
+    assert "straight: fake takes no images: all 8 are ignored" in result.warnings
+
+
+def test_images_that_are_not_used_are_left_alone(seeing, sees):
+    result = run(seeing, RunConfig("fake", sensors=("odometry",)))
+    assert result.timings.images == 0
+    assert frames_fed(sees) == []
+
+
+@pytest.mark.usefixtures("sees")
+def test_a_calibration_of_another_resolution_is_an_error(seeing):
+    other = CAMERA.model_copy(update={"width": 160, "height": 120})
+    log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
+    with pytest.raises(InputError, match="calibrated for images of 160 x 120 px, those of the log have 80 x 60 px"):
+        run(log, RunConfig("fake"))
+
+
+def test_a_rig_without_camera_leaves_images_out_unless_they_are_asked_for(seeing, sees):
+    rig = seeing.rig.model_copy(update={"camera": None, "sensors": ("odometry", "camera", "sightings")})
+    pixels = SightingStream(np.array([0.3]), ["door"], np.array([1.0]), np.array([2.0]))
+    log = replace(seeing, rig=rig, streams=dict(seeing.streams) | {"sightings": pixels})
+    result = run(log, RunConfig("fake"))
+    assert sees.made.setup.sensors == ("odometry",)
+    assert "straight: camera, sightings left out, as the rig rig has no [camera]" in result.warnings
+    for sensor in ("camera", "sightings"):
+        with pytest.raises(InputError, match=f"straight: {sensor} needs \\[camera\\] in the rig, and rig has none"):
+            run(log, RunConfig("fake", sensors=("odometry", sensor)))
+
+
+def test_the_feature_is_that_of_the_map(seeing):
+    assert images.frontend_of(seeing) == FrontendSettings(feature="orb", count=30)
+    nothing = np.zeros((1, 3))
+    points = PointMap(
+        ("a",), nothing, np.zeros((1, 3, 3)), "sift", np.array([0]), np.zeros((1, 128)), nothing, np.ones(1)
+    )
+    world = seeing.world.model_copy(update={"points": points})
+    assert images.frontend_of(replace(seeing, world=world)) == FrontendSettings(feature="sift", count=30)
+    named = seeing.world.model_copy(update={"points": PointMap.of(["a"], nothing)})
+    assert images.frontend_of(replace(seeing, world=named)) == FrontendSettings(feature="orb", count=30)
+
+
+def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
+    found = []
+    find = frontend._find
+
+    def noted(file, *rest):
+        found.append(file.name)
+        return find(file, *rest)
+
+    monkeypatch.setattr(frontend, "_find", noted)
+    monkeypatch.setattr(comparing, "run_each", in_this_process)
+    monkeypatch.setattr(sees, "deterministic", False)
+    rows = compare([seeing], [RunConfig("fake", seed=k) for k in range(3)], tmp_path / "out").rows
+    assert [row["timing.images"] for row in rows] == [8, 8, 8]
+    assert sorted(found) == [f"{k}.png" for k in range(8)]
+
+
+@pytest.mark.usefixtures("sees")
+def test_a_comparison_of_a_log_that_cannot_be_used_is_a_failed_run(seeing, tmp_path, monkeypatch):
+    monkeypatch.setattr(comparing, "run_each", in_this_process)
+    other = CAMERA.model_copy(update={"width": 160, "height": 120})
+    log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
+    (failure,) = compare([log], [RunConfig("fake")], tmp_path / "out").failures
+    assert "calibrated for images of 160 x 120 px" in failure
