@@ -9,6 +9,7 @@ is not read.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -28,9 +29,11 @@ from factors.se2 import Array
 IMAGES = ("color.jpg", "color.png")
 POSE = "pose.txt"
 ORTHONORMAL = 2e-3  # what a rotation in the files may be off: they are written from single precision
-# nominal focal length of the colour camera; 585 is that of the depth camera
+# the robot's frame is the camera's, and its focal length the nominal one; 585 is that of the depth camera
 RIG = Rig(
-    name="kinect", sensors=("camera",), camera=CameraSettings(width=640, height=480, fx=525, fy=525, cx=320, cy=240)
+    name="kinect",
+    sensors=("camera",),
+    camera=CameraSettings(width=640, height=480, fx=525, fy=525, cx=320, cy=240, pitch=-math.pi / 2, yaw=math.pi / 2),
 )
 
 

@@ -44,6 +44,9 @@ def test_frames_count_in_the_order_of_their_names(scene, one):
     products = np.einsum("nji,njk->nik", log.reference3.rotations, log.reference3.rotations)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (3, 3, 3)), atol=1e-12)
     assert (log.rig.camera.fx, log.rig.camera.cx, log.rig.camera.cy) == (525.0, 320.0, 240.0)
+    np.testing.assert_allclose(
+        log.rig.camera.model().rotation, np.eye(3), atol=1e-12
+    )  # the robot's frame is the camera's
     assert log.reference is None
 
 
