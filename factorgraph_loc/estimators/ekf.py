@@ -18,16 +18,18 @@ from factorgraph_loc.estimators.base import Learnt, LearntPoint, PoseEstimate, P
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, together
 from factorgraph_loc.estimators.mapping import NewLandmarks
+from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import update_state
 from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, KnownPoints, Predicted
-from factorgraph_loc.measurements import BearingRange, CameraFrame, PixelSightings
+from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range import TIME_OFFSET
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment, recalibrated
+from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
 
@@ -105,6 +107,8 @@ class Ekf(Filter):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
         self._points = KnownPoints(setup, self.diagnostics, self._camera_constants)
+        self._finder = PixelFinder(self._points, self._motion)
+        self.supports_unknown_start = self._points.known
         # where the constants lie in the state's rest, and where the landmarks begin
         middle = len(self._odometry_constants.names)
         end = middle + len(self._sensor_constants.names)
@@ -198,8 +202,37 @@ class Ekf(Filter):
             spread = prior.covariance[3 + part.start : size, 3 + part.start : size]
             predicted = replace(predicted, constants=prior.rest[part], spread=spread)
         factor = self._points.factor(m, predicted, None, twist)
-        if factor is None:
-            return
+        if factor is not None:
+            self._correct_by_pixels(m.t, factor, size)
+        pose, covariance = self._state.pose, self._state.covariance[:3, :3]
+        since = self._finder.refuted_since(m, self._odometry, pose, covariance)
+        found = self._finder.best
+        if since is not None and found is not None:
+            self.diagnostics.events.append((m.t, f"lost: {MISSED} since {since:.1f} s; goes on at another place"))
+            self._jump(found)
+
+    def _seek(self, m: Exteroceptive) -> _State | None:
+        if not isinstance(m, PixelSightings | CameraFrame) or not self._finder.look(m, self._odometry):
+            return None
+        found = self._finder.best
+        if found is None:
+            return None
+        self._finder.clear()
+        self.diagnostics.events.append((m.t, "localized"))
+        return self._start(found)
+
+    def _jump(self, found: PosePrior) -> None:
+        """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before."""
+        self._finder.clear()
+        s, body = self._state, se2.world_to_body(found.pose, found.covariance)
+        covariance = s.covariance.copy()
+        covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
+        self._state = replace(s, pose=np.array(found.pose), covariance=covariance)
+        self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
+
+    def _correct_by_pixels(self, t: float, factor: ReprojectionFactor, size: int) -> None:
+        """Update pose and camera's constants, the first ``size`` components of the error state up to the last of them."""
+        prior, part = self._state, self._camera_part
 
         def linearize(delta: Array) -> tuple[Array, Array]:
             state = prior.plus(delta, prior.covariance)
@@ -212,7 +245,7 @@ class Ekf(Filter):
             return residual, jacobian
 
         update = update_state(linearize, prior.covariance, factor.weight, ITERATIONS, factor.dof(), SETTLED)
-        self._points.report(m.t, factor, update)
+        self._points.report(t, factor, update)
         self._state = prior.plus(update.delta, update.covariance)
 
     def _correct(self, t: float, seen: Sequence[tuple[BearingRangeFactor, slice | None]]) -> None:

@@ -8,7 +8,7 @@ little too small where landmarks tell next to nothing of them: resampling moves 
 
 Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what landmarks tell of it
 (:mod:`~factorgraph_loc.estimators.landmark_tracker`), or where no landmarks are used from what scans of RFID tags tell
-(:mod:`~factorgraph_loc.estimators.scan_tracker`).
+(:mod:`~factorgraph_loc.estimators.scan_tracker`). A camera tells it by itself (:mod:`~factorgraph_loc.estimators.pixel_tracker`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, s
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
+from factorgraph_loc.estimators.pixel_finder import MISSED
 from factorgraph_loc.estimators.pixel_tracker import PixelTracker
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.scan_monitor import Silence
 from factorgraph_loc.estimators.scan_tracker import ScanTracker
-from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings, RfidScan
+from factorgraph_loc.estimators.seen_points import Pixels
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
@@ -77,7 +79,7 @@ class ParticleFilter(Filter):
         self._odometry_part = slice(0, middle)  # where they lie in the constants of the particles
         self._landmarks = LandmarkTracker(setup, self._motion, self.diagnostics, self._sensor_constants, first=middle)
         self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
-        self._pixels = PixelTracker(setup, self.diagnostics)
+        self._pixels = PixelTracker(setup, self._motion, self.diagnostics)
         self._lost = False
 
     def belief(self) -> Belief:
@@ -120,7 +122,12 @@ class ParticleFilter(Filter):
     def _seek(self, m: Exteroceptive) -> Cloud | None:
         if isinstance(m, RfidScan):
             return self._sought() if self._scans.seek(m, self._odometry) else None
-        seen = self._landmarks.factor(m) if isinstance(m, BearingRange) else None
+        if isinstance(m, Pixels):
+            if not self._pixels.seek(m, self._odometry):
+                return None
+            poses, clear = self._pixels.sought(self._settings.particles)
+            return replace(self._cloud(poses), localized=clear)
+        seen = self._landmarks.factor(m)
         if seen is None:
             return None
         self._landmarks.seek(seen, self._odometry)
@@ -182,10 +189,28 @@ class ParticleFilter(Filter):
                 self._state = replace(self._state, localized=True)
                 self._event("recovered" if self._lost else "localized")
 
-    def _look(self, m: PixelSightings | CameraFrame) -> None:
-        seen = self._pixels.factor(m, self._state) if self._state.localized else None
+    def _look(self, m: Pixels) -> None:
+        if not self._state.localized:
+            if self._pixels.seek(m, self._odometry):
+                self._go_on_seen("localized")
+            return
+        seen = self._pixels.factor(m, self._state)
         if seen is not None:
             self._weigh(lambda cloud: self._pixels.log_likelihood(seen, cloud))
+        since = self._pixels.refuted_since(m, self._odometry, self._state)
+        if since is not None:
+            self._records = [r.lost() if r.t >= since else r for r in self._records]
+            self._event(f"lost: {MISSED} since {since:.1f} s")
+            self._go_on_seen("recovered")
+
+    def _go_on_seen(self, what: str) -> None:
+        """Go on where a frame leads to; ``what`` that is, if it is one place."""
+        poses, clear = self._pixels.sought(self._settings.particles)
+        if clear or not self._scans.finds:
+            self._state = replace(self._cloud(poses), localized=clear)
+        if clear:
+            self._scans.start(found=True)
+            self._event(what)
 
     def _scan(self, m: RfidScan) -> None:
         if not self._state.localized and self._scans.finds:

@@ -1,6 +1,7 @@
 """What a camera sees of known points as a particle filter takes it in.
 
-Which points are seen is decided once, at the mean of the cloud; what they tell weighs the particles. The constants of the camera
+Where the place is not known, or is refuted by what is seen, frames tell it (:mod:`~factorgraph_loc.estimators.pixel_finder`). Else
+which points are seen is decided once, at the mean of the cloud; what they tell weighs the particles. The constants of the camera
 are those of the rig.
 """
 
@@ -10,10 +11,13 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.cloud import Cloud
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.pixel_finder import PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels, Predicted, pixel_update
 from factorgraph_loc.rig import NOTHING
 from factors import reprojection, se2
+from factors.odometry import ChainState
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
@@ -21,8 +25,27 @@ from factors.se2 import Array
 class PixelTracker:
     """What pixels make of a cloud whose place is known; see the module."""
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+    def __init__(self, setup: Setup, motion: Motion, diagnostics: Diagnostics) -> None:
         self._points = KnownPoints(setup, diagnostics, NOTHING)
+        self._finder = PixelFinder(self._points, motion)
+        self._rng = setup.rng
+
+    def seek(self, m: Pixels, odometry: ChainState) -> bool:
+        """Take a frame while the place is not known; False where it tells nothing."""
+        return self._finder.look(m, odometry)
+
+    def sought(self, count: int) -> tuple[Array, bool]:
+        """Poses (N, 3) drawn from what the last frame told, and whether it is one place."""
+        clear = self._finder.best is not None
+        poses = self._finder.sample(self._rng, count)
+        if clear:
+            self._finder.clear()
+        return poses, clear
+
+    def refuted_since(self, m: Pixels, odometry: ChainState, cloud: Cloud) -> float | None:
+        """Since when the robot must have been elsewhere, after a frame that was taken; None where nothing tells that."""
+        mean, covariance = cloud.moments
+        return self._finder.refuted_since(m, odometry, mean, se2.world_to_body(mean, covariance))
 
     def factor(self, m: Pixels, cloud: Cloud) -> ReprojectionFactor | None:
         """What was seen of points of the map; None where that is nothing. Reports the innovation."""

@@ -3,7 +3,7 @@
 Before the start the last sightings are kept until they tell one place; then they are taken in from their first on. On the
 way, landmarks that are persistently not where they are expected make a suspicion, and a place that explains them much better
 a certainty: the graph goes back to where the suspicion began, and goes on at the new place after a step of unknown length.
-Where no landmarks are used, scans of RFID tags do the same.
+Where no landmarks are used, scans of RFID tags do the same. A camera tells the place by itself, whatever else is used.
 """
 
 from __future__ import annotations
@@ -20,13 +20,16 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstim
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
+from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
 from factorgraph_loc.estimators.scan_finder import ScanFinder
 from factorgraph_loc.estimators.scan_monitor import ScanMonitor
+from factorgraph_loc.estimators.seen_points import Pixels
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, Measurement, Odometry, RfidScan, Tick
+from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.tag_map import extent
 from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
@@ -58,6 +61,7 @@ class RelocatingGraph(MeasuringGraph):
             self._monitor = ScanMonitor()
         # what is seen before the start is counted when it is taken in
         self._sought = KnownLandmarks(setup, Diagnostics())
+        self._camera = PixelFinder(self._points, self._motion)
         self._searched: ChainState | None = None
         self._recent: deque[Exteroceptive | Tick] = deque()
 
@@ -70,7 +74,9 @@ class RelocatingGraph(MeasuringGraph):
         else:
             self._remember(measurement)
             super().process(measurement)
-            if not isinstance(measurement, Tick) and self._monitor.suspicious_since is not None:
+            if isinstance(measurement, Pixels):
+                self._watch(measurement)
+            elif not isinstance(measurement, Tick) and self._monitor.suspicious_since is not None:
                 self._doubt(self._monitor.suspicious_since)
 
     def estimate(self) -> PoseEstimate:
@@ -92,10 +98,13 @@ class RelocatingGraph(MeasuringGraph):
         return super().belief() if self._prior is not None else Belief(tuple(self._modes()))
 
     def _modes(self) -> list[Mode]:
-        if self._searched is None:
-            return []
-        since = self._motion.relative(self._searched, self._motion.state(self._t))
         found = self._relocalizer.hypotheses if self._finder is None else self._finder.hypotheses
+        at = self._searched
+        if self._camera.newest is not None:
+            found, at = self._camera.hypotheses, self._camera.newest
+        if at is None:
+            return []
+        since = self._motion.relative(at, self._motion.state(self._t))
         return [
             Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
             for h in found
@@ -103,6 +112,8 @@ class RelocatingGraph(MeasuringGraph):
 
     def _best(self) -> PosePrior | None:
         """The place that was found, at the time of the last search."""
+        if (seen := self._camera.best) is not None:
+            return seen
         return self._relocalizer.best if self._finder is None else self._finder.best
 
     def _remember(self, m: Exteroceptive | Tick) -> None:
@@ -114,8 +125,8 @@ class RelocatingGraph(MeasuringGraph):
         """Before the start: see whether what was seen tells one place by now, and start there."""
         self._t = max(self._t, m.t)
         looked = not isinstance(m, Tick) and self._look(m)
-        if not looked and self._searched is None:
-            return  # the run begins with the first landmark or scan
+        if not looked and self._searched is None and self._camera.newest is None:
+            return  # the run begins with the first landmark, scan or image that tells something
         self._remember(m)
         if not looked or self._best() is None:
             return
@@ -128,13 +139,15 @@ class RelocatingGraph(MeasuringGraph):
     def _look(self, m: Exteroceptive) -> bool:
         """Search with one more measurement; False if it tells nothing."""
         state = self._motion.state(m.t)
+        if isinstance(m, Pixels):
+            return self._camera.look(m, state)
         if isinstance(m, RfidScan):
             looks = self._scans.tags.looks(m, count=False)
             if looks is None or self._finder is None:
                 return False
             self._finder.add(state, looks)
         else:
-            seen = self._sought.factor(m) if isinstance(m, BearingRange) else None
+            seen = self._sought.factor(m)
             if seen is None or self._finder is not None:
                 return False
             self._relocalizer.add(state, seen)
@@ -160,9 +173,24 @@ class RelocatingGraph(MeasuringGraph):
         self._searched = now
         if refuted:
             what = "landmarks were not where" if self._finder is None else "tags were not read as"
-            event = f"lost: {what} they were expected since {since:.1f} s; goes on at another place"
-            self.diagnostics.events.append((now.t, event))
+            what += " they were expected"
+            self._lose(what, since)
             self._go_on(since if self._finder is None else self._finder.change(self._placed))
+
+    def _watch(self, m: Pixels) -> None:
+        """See whether the camera sees what is expected, and go on where it sees the robot if that is elsewhere."""
+        if m.t < self._t:
+            return
+        moved = self._since(self._keyframes[-1], m.t)
+        track = se2.compose(self._pose, moved.delta), propagate(self._covariance, moved)
+        since = self._camera.refuted_since(m, self._motion.state(m.t), *track)
+        if since is not None:
+            self._lose(MISSED, since)
+            self._go_on(since)
+
+    def _lose(self, what: str, since: float) -> None:
+        event = f"lost: {what} since {since:.1f} s; goes on at another place"
+        self.diagnostics.events.append((self._t, event))
 
     def _go_on(self, since: float) -> None:
         """Take back what was added since then, and add it once more at the place that was found."""
@@ -193,6 +221,7 @@ class RelocatingGraph(MeasuringGraph):
 
     def _replay(self, measurements: list[Exteroceptive | Tick]) -> None:
         self._monitor.clear()
+        self._camera.clear()
         if self._finder is not None:
             self._finder.start()
         for m in measurements:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.landmarks import MapUse
 from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import Update, robust_update
@@ -16,6 +17,7 @@ from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Estimated
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
+from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factors import reprojection, se2
 from factors.odometry import Increment
 from factors.reprojection import FOCAL, TIME_OFFSET, CameraModel
@@ -24,6 +26,8 @@ from factors.se2 import Array
 
 DISAGREES = "camera: does not agree with the others"  # why a sighting is rejected
 CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
+FEW_SHARE = 0.3  # of named points, and
+FEW, MANY = 6, 20  # of points that are found by what they look like, where so many are expected: they are missed
 EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
 # A pixel is so sharp that one step from a poor prediction does not lead to the optimum
 ITERATIONS, SETTLED = 8, 1e-3  # m, rad: a step that needs no further one
@@ -45,19 +49,24 @@ class Predicted:
 class KnownPoints:
     """Turns what a camera sees into factors; what the map or the rig lacks is counted as ignored, what cannot be right as rejected.
 
-    ``estimated``: the camera's constants that are estimated.
+    ``estimated``: the camera's constants that are estimated. ``use``: see
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
     """
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics, estimated: Estimated) -> None:
+    def __init__(self, setup: Setup, diagnostics: Diagnostics, estimated: Estimated, use: MapUse = "known") -> None:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
         self.model: CameraModel | None = None if settings is None else settings.model()
-        self.map = PointMap.of((), np.empty((0, 3))) if setup.world.points is None else setup.world.points
+        self.map = PointMap.of((), np.empty((0, 3)))
+        if setup.world.points is not None and use != "unknown":
+            self.map = setup.world.points
+        self._others_matter = use != "known"
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
         if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
             self.associator = Associator(self.map, self.model)
+        self.missed = False  # whether points of the map were not where they were expected in the last image
         self._map_matters = False
         if settings is not None and len(self.map):
             worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
@@ -79,7 +88,7 @@ class KnownPoints:
             self._diagnostics.ignore("camera", len(m.pixels))
             return None
         rows = [i for i, name in enumerate(m.points) if name in self.map.index]
-        if len(rows) < len(m.points):
+        if len(rows) < len(m.points) and not self._others_matter:
             self._diagnostics.ignore("point not in the map", len(m.points) - len(rows))
         if not rows:
             return None
@@ -107,9 +116,28 @@ class KnownPoints:
         if isinstance(m, CameraFrame):
             return self._found(m, factor, here.model, camera, focal)
         right = _agreeing(here, camera, focal)
+        self.missed = bool(np.count_nonzero(right) < FEW_SHARE * len(right))
         if not right.all():
             self._diagnostics.reject(DISAGREES, int(np.count_nonzero(~right)))
         return _rows(factor, right) if right.any() else None
+
+    def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
+        """The pose that an image tells without a prediction, None where it tells none, and how many points it seemed to show."""
+        if self.model is None or not self.known:
+            return None, 0
+        if isinstance(m, PixelSightings):
+            rows = [i for i, name in enumerate(m.points) if name in self.map.index]
+            points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
+            spreads = self.map.covariances[points] if self._map_matters else None
+            return found_on_floor(self.model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
+        found = None if self.associator is None else self.associator.relocalized(m)
+        if found is None:
+            return None, 0
+        position, rotation, covariance, seen = found
+        spreads = self.map.covariances[seen.points] if self._map_matters else None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        camera = CameraPose(position, rotation, covariance)
+        return on_floor(self.model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
 
     def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
         """Record the innovation of an update at time ``t``."""
@@ -138,6 +166,7 @@ class KnownPoints:
         """A factor of the points that are found in a frame."""
         assert self.associator is not None
         seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        self.missed = len(seen) < FEW and min(seen.expected, len(m.pixels)) >= MANY
         if seen.rejected:
             self._diagnostics.reject(DISAGREES, seen.rejected)
         if len(seen) == 0:

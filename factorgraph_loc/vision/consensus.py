@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from factors import reprojection
 from factors.reprojection import CameraModel
@@ -44,12 +45,9 @@ class CameraPose:
 def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> bool:
     """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], lie
     together as near to what is predicted as they should."""
-    whiteners = np.linalg.inv(np.linalg.cholesky(spreads))
-    residual, jacobian = _whitened(model, camera.position, camera.rotation, points, pixels, whiteners)
-    flat = (jacobian @ _root(camera)).reshape(-1, 6)
-    pull = residual.ravel() @ flat
-    joint = float(np.vdot(residual, residual) - pull @ np.linalg.solve(np.eye(6) + flat.T @ flat, pull))
-    return bool(joint < chi2.ppf(JOINT, 2 * len(points)))
+    predicted, jacobian, _ = reprojection.linearize_in_space(model, camera.position, camera.rotation, points)
+    joint = _joint(predicted - pixels, jacobian, spreads, camera.covariance)
+    return bool(joint < chdtri(2 * len(points), 1.0 - JOINT))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
@@ -107,6 +105,26 @@ def _best_of_samples(
             break
     assert best is not None
     return best[1:]
+
+
+@numba.njit(cache=True)
+def _joint(residual: Array, jacobian: Array, spreads: Array, covariance: Array) -> float:
+    """The normalised square of innovations (K, 2) with Jacobians (K, 2, 6) and noise (K, 2, 2), under a covariance (6, 6)."""
+    information, pull, total = np.zeros((6, 6)), np.zeros(6), 0.0
+    for i in range(len(residual)):
+        a, b, c = spreads[i, 0, 0], spreads[i, 0, 1], spreads[i, 1, 1]
+        determinant = a * c - b * b
+        u, v = residual[i]
+        wu, wv = (c * u - b * v) / determinant, (a * v - b * u) / determinant
+        total += u * wu + v * wv
+        for j in range(6):
+            ju, jv = jacobian[i, 0, j], jacobian[i, 1, j]
+            pull[j] += ju * wu + jv * wv
+            xu, xv = (c * ju - b * jv) / determinant, (a * jv - b * ju) / determinant
+            for m in range(6):
+                information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
+    # by the matrix inversion lemma, in a form that takes a singular covariance
+    return float(total - pull @ (covariance @ np.linalg.solve(np.eye(6) + information @ covariance, pull)))
 
 
 def _root(camera: CameraPose) -> Array:
