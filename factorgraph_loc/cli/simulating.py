@@ -12,6 +12,7 @@ from factorgraph_loc.cli.options import DataRoot, LogOptions, key_and_value, par
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
+    from factorgraph_loc.log import Log
     from factorgraph_loc.simulation import SimulationSettings
 
 
@@ -40,15 +41,26 @@ def simulate(
         str | None,
         typer.Option(metavar="LOG", help="Draw each read from those of this recording, with its antennas (semi-real)."),
     ] = None,
+    images: Annotated[
+        bool, typer.Option("--images", help="With what a camera sees: the building is rendered.")
+    ] = False,
+    image_rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Images per second; that of the presets is 5.")
+    ] = None,
+    world_seed: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="Of the world alone, for several drives through one; else --seed."),
+    ] = None,
     data_root: DataRoot = None,
 ) -> None:
-    """Make logs with known truth: a world, a drive, and what odometry and RFID antennas report on it."""
+    """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc.readers import write_native
     from factorgraph_loc.simulation import recorded_looks
     from factorgraph_loc.simulation import simulate as make
 
-    settings = _settings(what, _changes(duration, tags, set_ or []))
+    named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
+    settings = _settings(what, _changes(named, set_ or []))
     looks = None
     if recorded is not None:
         looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
@@ -58,10 +70,32 @@ def simulate(
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         try:
-            write_native(log, folder)
+            if images:
+                _write_with_images(log, settings, number, folder)
+            else:
+                write_native(log, folder)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
         typer.echo(f"wrote {folder}")
+
+
+def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path) -> None:
+    """The images go to a folder beside the log's first, so that there is a whole log or none."""
+    import os
+    import tempfile
+
+    from factorgraph_loc.readers import write_native
+    from factorgraph_loc.readers.native import require_new
+    from factorgraph_loc.simulation import with_images
+
+    require_new(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside,
+        show.progress(log.name, counted=True) as tell,
+    ):
+        workers = os.cpu_count() or 1
+        write_native(with_images(log, settings, seed, Path(beside), workers=workers, tell=tell), folder)
 
 
 def _settings(what: str, changes: dict[str, Any]) -> SimulationSettings:
@@ -73,11 +107,11 @@ def _settings(what: str, changes: dict[str, Any]) -> SimulationSettings:
     return preset(what, changes)
 
 
-def _changes(duration: float | None, tags: int | None, texts: list[str]) -> dict[str, Any]:
+def _changes(named: dict[str, float | None], texts: list[str]) -> dict[str, Any]:
     """The options as nested tables; the named ones go before ``--set``."""
     changes: dict[str, Any] = {}
     pairs = [key_and_value(text, "--set") for text in texts]
-    pairs += [(key, value) for key, value in (("drive.duration", duration), ("world.tags", tags)) if value is not None]
+    pairs += [(key, value) for key, value in named.items() if value is not None]
     for name, value in pairs:
         *tables, key = name.split(".")
         inner = changes

@@ -201,8 +201,7 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
     written, and of a start's deviations in x and y only the larger one. Images are links to those of ``log`` where the file
     system has links; features that were found in images cannot be written: InputError.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
+    require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -212,6 +211,12 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
         content.replace(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def require_new(folder: Path) -> None:
+    """InputError if ``folder`` holds something."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:

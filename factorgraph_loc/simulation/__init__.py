@@ -1,7 +1,18 @@
 """Logs that are made, not recorded: worlds, drives through them, and what sensors would have reported."""
 
+from factorgraph_loc.simulation.film import Film, film, with_images
 from factorgraph_loc.simulation.recorded import recorded_looks
 from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, preset, read_settings
 from factorgraph_loc.simulation.simulate import simulate
 
-__all__ = ["PRESETS", "SimulationSettings", "preset", "read_settings", "recorded_looks", "simulate"]
+__all__ = [
+    "PRESETS",
+    "Film",
+    "SimulationSettings",
+    "film",
+    "preset",
+    "read_settings",
+    "recorded_looks",
+    "simulate",
+    "with_images",
+]

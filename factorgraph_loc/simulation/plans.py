@@ -24,12 +24,14 @@ LOWEST_BOX = 1.4  # m: no furniture and no shelf is lower
 
 @dataclass(frozen=True)
 class Plan:
-    """Outline and inner walls, and ``boxes`` (furniture or shelves) by their corners (x1, y1, x2, y2), all in metres."""
+    """Outline and inner walls, ``boxes`` (furniture or shelves) by their corners (x1, y1, x2, y2), and the gaps in walls that are
+    ``doors``, all in metres."""
 
     width: float
     depth: float
     walls: tuple[Segment, ...]
     boxes: tuple[Segment, ...]
+    doors: tuple[Segment, ...] = ()
 
     def segments(self) -> Array:
         """Everything that nobody drives or sees through: (S, 4)."""
@@ -37,12 +39,7 @@ class Plan:
 
     def faces(self) -> tuple[Array, Array]:
         """The sides of walls and of boxes as segments (F, 4), the free side on the left of each. Inner walls have two."""
-        walls = [
-            face
-            for x1, y1, x2, y2 in self.walls
-            for face in ((x1, y1, x2, y2), (x2, y2, x1, y1))
-            if self._is_inside(face)
-        ]
+        walls = [face for wall in self.walls for face in both_sides(wall) if self._is_inside(face)]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
         return np.array(walls).reshape(-1, 4), np.array(boxes).reshape(-1, 4)
 
@@ -67,6 +64,12 @@ class Plan:
         return 0.0 < x < self.width and 0.0 < y < self.depth
 
 
+def both_sides(segment: Segment) -> tuple[Segment, Segment]:
+    """The segment and its reverse."""
+    x1, y1, x2, y2 = segment
+    return segment, (x2, y2, x1, y1)
+
+
 def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
     """The plan that ``settings`` names; doors and furniture are drawn."""
     width, depth = settings.width, settings.depth
@@ -87,13 +90,15 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
     edges = np.linspace(0.0, width, rooms + 1)
     walls: list[Segment] = list(outline)
     boxes: list[Segment] = []
+    doors: list[Segment] = []
     for inner, outer in ((low, 0.0), (high, depth)):
         for left, right in pairwise(edges.tolist()):
             door = float(rng.uniform(left + 0.6, right - 0.6 - DOOR_WIDTH))
             walls += [(left, inner, door, inner), (door + DOOR_WIDTH, inner, right, inner)]
+            doors.append((door, inner, door + DOOR_WIDTH, inner))
             boxes += _furniture((left, right), inner, outer, rng)
         walls += [(float(x), inner, float(x), outer) for x in edges[1:-1]]
-    return Plan(width, depth, tuple(walls), tuple(boxes))
+    return Plan(width, depth, tuple(walls), tuple(boxes), tuple(doors))
 
 
 def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:

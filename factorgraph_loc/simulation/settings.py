@@ -97,6 +97,19 @@ class PixelSettings(FileModel):
     wrong: Share = 0.0
 
 
+class ImageSettings(FileModel):
+    """Images of the rendered building: ``rate`` of them, ``exposure`` time, noise of the variance ``read_noise``^2 + ``shot_noise``
+    times the value of a pixel (0 to 255), brightness that wanders by the share ``gain_drift`` over some ten seconds, and the
+    share ``vignetting`` of it that is lost at the corners."""
+
+    rate: Hertz = 5.0
+    exposure: Annotated[float, Field(ge=0.0, le=0.2, description="s")] = 0.006
+    read_noise: Annotated[float, Field(ge=0.0, le=50.0, description="of 255")] = 1.5
+    shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1
+    vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
+
+
 class Fading(FileModel):
     """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
 
@@ -157,6 +170,7 @@ class SimulationSettings(FileModel):
     phase: PhaseSettings | None = None
     sightings: SightingSettings = SightingSettings()
     pixels: PixelSettings = PixelSettings()
+    images: ImageSettings = ImageSettings()
     faults: FaultSettings = FaultSettings()
     rig: Rig
 

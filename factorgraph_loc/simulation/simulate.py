@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -52,11 +53,11 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         "rfid": _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7], rngs[8])),
     }
     if world.landmarks and rig.bearing_range is not None:
-        times = _ticks(settings.sightings.rate, truth)
+        times = ticks(settings.sightings.rate, truth)
         model = rig.bearing_range.model()
         streams["bearing_range"] = sighting_stream(model, world, times, truth.at(times), settings.sightings, rngs[4])
     if world.points is not None and rig.camera is not None:
-        times = _ticks(settings.pixels.rate, truth)
+        times = ticks(settings.pixels.rate, truth)
         seen = pixel_stream(rig.camera.model(), world, times, truth.at(times), settings.pixels, rngs[9])
         streams["sightings"] = replace(seen, t=seen.t - rig.camera.time_offset)
     surveyed, misplaced = _surveyed(world, settings.faults, of_world[5])
@@ -75,7 +76,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         metadata["misplaced"] = ", ".join(misplaced)
     return Log(
         name=f"{settings.name}-{seed}",
-        rig=_with_sensors(rig, streams),
+        rig=with_sensors(rig, streams),
         world=surveyed,
         streams=streams,
         reference=truth,
@@ -86,9 +87,9 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
 
 
 def generators(seed: int) -> list[np.random.Generator]:
-    """Those of: world, drive, odometry, reads, landmarks, survey, start, strengths, phases, points. More of them may follow: the
-    first ones stay what they are."""
-    return np.random.default_rng(seed).spawn(10)
+    """Those of: world, drive, odometry, reads, landmarks, survey, start, strengths, phases, points, look of the world, camera. More
+    of them may follow: the first ones stay what they are."""
+    return np.random.default_rng(seed).spawn(12)
 
 
 def _reads(
@@ -102,7 +103,7 @@ def _reads(
     rfid = rig.rfid
     assert rfid is not None, "the settings have been checked"
     tags = tag_map(world, rig.survey)
-    times = _ticks(settings.rounds_per_second, truth)
+    times = ticks(settings.rounds_per_second, truth)
     poses = truth.at(times)
     # recorded outcomes are probabilities of zero and one
     p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rngs[0])
@@ -117,7 +118,7 @@ def _reads(
     return rfid_stream(names, epcs, times, hits, settings.faults, signals)
 
 
-def _ticks(rate: float, truth: Trajectory) -> Array:
+def ticks(rate: float, truth: Trajectory) -> Array:
     """Times (N,) of a sensor, the first after one period."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
@@ -135,7 +136,7 @@ def _surveyed(world: World, faults: FaultSettings, rng: np.random.Generator) -> 
     return world.model_copy(update={"tags": tags}), [names[i] for i in sorted(chosen.tolist())]
 
 
-def _with_sensors(rig: Rig, streams: dict[str, Stream]) -> Rig:
+def with_sensors(rig: Rig, streams: Mapping[str, Stream]) -> Rig:
     """The rig, whose estimators use by default what the log has."""
     sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
     return rig.model_copy(update={"sensors": sensors})

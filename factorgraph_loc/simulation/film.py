@@ -1,0 +1,166 @@
+"""The images that the camera of a simulated robot takes on its drive, one by one or as files of a log."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.log import ImageStream, Log
+from factorgraph_loc.simulation.plans import make_plan
+from factorgraph_loc.simulation.renderer import Image, Renderer
+from factorgraph_loc.simulation.scene import make_scene
+from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.simulation.simulate import generators, ticks, with_sensors
+from factorgraph_loc.simulation.trajectories import drive
+from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.trajectory import Trajectory
+from factors import reprojection, se2
+from factors.se2 import Array
+
+# a PNG is five times as large and takes ten times as long; colours at full resolution, as features look at them
+JPEG = (
+    cv2.IMWRITE_JPEG_QUALITY,
+    95,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+)
+MOMENT = 0.02  # s to either side, over which the velocity of the robot is taken
+PERIODS = (8.0, 13.0, 29.0)  # s, in which the brightness wanders
+FEW = 40  # images, for which it does not pay to start processes
+LOOK = 0.3  # s between two looks at how many images there are
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """N images: ``film[i]`` (H, W, 3) BGR, the same however often and in whatever order they are asked for.
+
+    ``times`` (N,) [s]: of the middle of the exposure; ``stamps`` (N,): the same by the camera's clock. ``truth``: of the robot.
+    ``renderer``: what takes them, and knows what each pixel shows.
+    """
+
+    renderer: Renderer
+    truth: Trajectory
+    times: Array
+    stamps: Array
+    seed: int
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, i: int) -> Image:
+        t = float(self.times[i])
+        model = self.renderer.model
+        pose, speed = self.truth.at(np.array((t,)))[0], self._velocity(t)
+        position, rotation = reprojection.camera_pose(model, pose)
+        arm = position[:2] - pose[:2]
+        velocity = np.array((speed[0] - speed[2] * arm[1], speed[1] + speed[2] * arm[0], 0.0))
+        noise = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(11, i)))
+        turn = np.array((0.0, 0.0, speed[2]))
+        return self.renderer.image(position, rotation, velocity=velocity, turn=turn, gain=self._gain(t), rng=noise)
+
+    def __iter__(self) -> Iterator[tuple[float, Image]]:
+        """Stamps and images."""
+        for i, stamp in enumerate(self.stamps.tolist()):
+            yield stamp, self[i]
+
+    def _velocity(self, t: float) -> Array:
+        """In the world's frame (3,) [m/s, m/s, rad/s]."""
+        a, b = max(t - MOMENT, float(self.truth.t[0])), min(t + MOMENT, float(self.truth.t[-1]))
+        before, after = self.truth.at(np.array((a, b)))
+        change = after - before
+        change[2] = se2.wrap_scalar(change[2])
+        return np.asarray(change / (b - a))
+
+    def _gain(self, t: float) -> float:
+        phases = generators(self.seed)[11].uniform(0.0, 2.0 * np.pi, len(PERIODS))
+        wave = sum(math.sin(2.0 * math.pi * t / period + phase) for period, phase in zip(PERIODS, phases, strict=True))
+        return math.exp(self.renderer.settings.gain_drift * wave)
+
+
+def film(settings: SimulationSettings, seed: int) -> Film:
+    """The images of the log that :func:`~factorgraph_loc.simulation.simulate` makes of the same settings and seed.
+
+    InputError if the rig has no camera.
+    """
+    camera = settings.rig.camera
+    if camera is None:
+        raise InputError(f"rig {settings.rig.name}: has no camera, expected one to take images with")
+    world_seed = seed if settings.world_seed is None else settings.world_seed
+    of_world = generators(world_seed)
+    world = make_world(settings.world, of_world[0])
+    plan = make_plan(settings.world, generators(world_seed)[0])
+    scene = make_scene(plan, list(world.tags.values()), of_world[10])
+    truth = drive(world, settings.drive, generators(seed)[1])
+    times = ticks(settings.images.rate, truth)
+    return Film(Renderer(scene, camera.model(), settings.images), truth, times, times - camera.time_offset, seed)
+
+
+def with_images(
+    log: Log,
+    settings: SimulationSettings,
+    seed: int,
+    folder: Path,
+    *,
+    workers: int = 1,
+    tell: Callable[[float, float], None] = lambda _done, _total: None,
+) -> Log:
+    """``log``, which was simulated with the same settings and seed, with images that are written to ``folder``.
+
+    ``workers`` processes are spawned where that pays, so a script needs the usual ``if __name__ == "__main__"``; ``tell`` is
+    told how many images there are, of how many. InputError as of :func:`film`.
+    """
+    assert log.reference is not None, "a simulated log has one"
+    times = ticks(settings.images.rate, log.reference)
+    count = len(times)
+    if workers == 1 or count <= FEW:
+        _write(settings, seed, folder, range(count), lambda done: tell(done, count))
+    else:
+        _write_in_parallel(settings, seed, folder, count, workers, tell)
+    offset = settings.rig.camera.time_offset if settings.rig.camera else 0.0
+    streams = {**log.streams, "camera": ImageStream(times - offset, [folder / _name(i) for i in range(count)])}
+    return replace(log, streams=streams, rig=with_sensors(log.rig, streams))
+
+
+def _write_in_parallel(
+    settings: SimulationSettings,
+    seed: int,
+    folder: Path,
+    count: int,
+    workers: int,
+    tell: Callable[[float, float], None],
+) -> None:
+    """Each process makes the scene for itself, and every n-th image."""
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        jobs = {pool.submit(_write, settings, seed, folder, range(i, count, workers)) for i in range(workers)}
+        while jobs:
+            done, jobs = wait(jobs, LOOK)
+            tell(sum(1 for _ in folder.glob("*.jpg")), count)
+            for job in done:
+                job.result()
+
+
+def _write(
+    settings: SimulationSettings,
+    seed: int,
+    folder: Path,
+    indices: range,
+    tell: Callable[[float], None] = lambda _done: None,
+) -> None:
+    cv2.setNumThreads(1)
+    images = film(settings, seed)
+    for done, i in enumerate(indices):
+        _, content = cv2.imencode(".jpg", images[i], JPEG)
+        (folder / _name(i)).write_bytes(content.tobytes())
+        tell(done + 1)
+
+
+def _name(i: int) -> str:
+    return f"{i:06d}.jpg"

@@ -1,0 +1,295 @@
+"""Rays through a building of upright faces, and the colours that they meet.
+
+From one place, what a ray may meet first is narrowed down by its direction in the plan: each of :data:`BINS` directions has a list
+of the faces there, nearest first. A surface seen at a slant is sampled several times along the slant, each time from the mip
+level whose texels are about as large as the step.
+
+What is called for each ray is inlined, as numba counts the references to arrays at each call, which would double the time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.simulation.scene import LEVELS
+from factors.se2 import Array
+
+BINS = 2048  # of the directions in the plan
+TAPS = 4  # samples of a texture at a slant, at most
+SLACK = 1e-9  # m, by which faces that meet overlap
+NEAREST = 1e-3  # m from a face's plane: a camera in it sees nothing of it
+
+# columns of a table of faces, relative to a camera: unit normal, distance from the plane (below zero behind it), unit vector along,
+# where the foot of the camera is on it, length, heights, the nearest point's distance in the plan, number in the scene,
+# and one over length and height
+NX, NY, AWAY, AX, AY, FOOT, LENGTH, BOTTOM, TOP, DISTANCE, FACE, PER_LENGTH, PER_HEIGHT = range(13)
+GROUND, CEILING, NOTHING = -1, -2, -3  # in place of a row of the table
+
+Ints = NDArray[np.int64]
+
+
+class Surroundings(NamedTuple):
+    """What can be seen from one place ``origin`` (3,): a ``table`` (M, 13) of faces, of which ``items[starts[b] : starts[b + 1]]``
+    may be met in the direction b; ``size`` (5,): width, depth and height of the building, and one over
+    the first two."""
+
+    origin: Array
+    table: Array
+    starts: Ints
+    items: Ints
+    size: Array
+
+
+@numba.njit(cache=True, error_model="numpy")
+def surroundings(
+    faces: Array, bottoms: Array, tops: Array, closed: NDArray[np.bool_], origin: Array, size: Array
+) -> Surroundings:
+    """The faces that can be seen from ``origin`` (3,), for :func:`cast`."""
+    table = np.empty((len(faces), 13))
+    lows, highs = np.empty(len(faces)), np.empty(len(faces))
+    m = 0
+    for i in range(len(faces)):
+        x1, y1 = faces[i, 0] - origin[0], faces[i, 1] - origin[1]
+        x2, y2 = faces[i, 2] - origin[0], faces[i, 3] - origin[1]
+        length = math.hypot(x2 - x1, y2 - y1)
+        ax, ay = (x2 - x1) / length, (y2 - y1) / length
+        away = -(x1 * -ay + y1 * ax)
+        # the far sides of a box matter to a ray that came in through its top
+        if away < NEAREST and not (closed[i] and away < -NEAREST and origin[2] > tops[i]):
+            continue
+        foot = -(x1 * ax + y1 * ay)
+        beyond = max(-foot, foot - length, 0.0)
+        row = table[m]
+        row[NX], row[NY], row[AWAY], row[AX], row[AY], row[FOOT], row[LENGTH] = -ay, ax, away, ax, ay, foot, length
+        row[BOTTOM], row[TOP], row[DISTANCE], row[FACE] = bottoms[i], tops[i], math.hypot(away, beyond), i
+        row[PER_LENGTH], row[PER_HEIGHT] = 1.0 / length, 1.0 / (tops[i] - bottoms[i])
+        right, left = _direction(x1, y1), _direction(x2, y2)
+        if away < 0.0:
+            right, left = left, right
+        lows[m] = right - 1e-9
+        highs[m] = left + 1e-9 + (BINS if left < right else 0.0)
+        m += 1
+    order = np.argsort(table[:m, DISTANCE])
+    starts = np.zeros(BINS + 1, dtype=np.int64)
+    for j in order:
+        for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
+            starts[b % BINS + 1] += 1
+    starts = np.cumsum(starts)
+    items, used = np.empty(starts[BINS], dtype=np.int64), starts[:-1].copy()
+    for k in range(m):
+        j = order[k]
+        for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
+            items[used[b % BINS]] = k
+            used[b % BINS] += 1
+    return Surroundings(origin, table[order], starts, items, size)
+
+
+@numba.njit(inline="always", error_model="numpy")
+def cast(
+    table: Array, starts: Ints, items: Ints, z0: float, top: float, dx: float, dy: float, dz: float
+) -> tuple[int, float]:
+    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`, and how
+    far away in lengths of the ray."""
+    best, found = np.inf, NOTHING
+    if dz < -1e-12:
+        best, found = -z0 / dz, GROUND
+    elif dz > 1e-12:
+        best, found = (top - z0) / dz, CEILING
+    flat = math.sqrt(dx * dx + dy * dy)
+    b = int(_direction(dx, dy)) & (BINS - 1)
+    for k in range(starts[b], starts[b + 1]):
+        i = items[k]
+        if table[i, DISTANCE] > best * flat:
+            break
+        away = table[i, AWAY]
+        towards = table[i, NX] * dx + table[i, NY] * dy
+        if towards * away >= 0.0:
+            continue
+        t = -away / towards
+        s = table[i, FOOT] + t * (table[i, AX] * dx + table[i, AY] * dy)
+        if s < -SLACK or s > table[i, LENGTH] + SLACK:
+            continue
+        z = z0 + t * dz
+        if z > table[i, TOP] + SLACK or z < table[i, BOTTOM] - SLACK:
+            continue
+        if away < 0.0:
+            t = (table[i, TOP] - z0) / dz
+        if t < best:
+            best, found = t, i
+    return found, best
+
+
+@numba.njit(cache=True, error_model="numpy")
+def cast_all(around: Surroundings, rays: Array) -> Array:
+    """Distances (K,) in lengths of ``rays`` (K, 3), infinite where nothing is met."""
+    distance = np.empty(len(rays))
+    table, starts, items, z0, top = around.table, around.starts, around.items, around.origin[2], around.size[2]
+    for i in range(len(rays)):
+        _, distance[i] = cast(table, starts, items, z0, top, rays[i, 0], rays[i, 1], rays[i, 2])
+    return distance
+
+
+@numba.njit(cache=True, error_model="numpy")
+def expose(
+    around: Surroundings,
+    texels: NDArray[np.uint8],
+    layout: Ints,
+    directions: Array,
+    rotation: Array,
+    pixel_at_one: float,
+    found: NDArray[np.int16],
+    out: NDArray[np.float32],
+) -> None:
+    """Add to ``out`` (H, W, 3) what pixels that look along ``directions`` (H, W, 2), at depth 1 in the camera's frame, see of the
+    building; where two surfaces meet in a pixel, the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels.
+    ``found`` (H, W): room to work in."""
+    height, width = directions.shape[:2]
+    table, starts, items, origin, size = around.table, around.starts, around.items, around.origin, around.size
+    place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
+    for i in range(height):
+        for j in range(width):
+            x, y = directions[i, j, 0], directions[i, j, 1]
+            found[i, j], blue, green, red = _look(
+                table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
+            )
+            out[i, j, 0] += blue
+            out[i, j, 1] += green
+            out[i, j, 2] += red
+    quarter = np.float32(0.25)
+    for i in range(height):
+        for j in range(width):
+            here = found[i, j]
+            left, right, up, down = max(j - 1, 0), min(j + 1, width - 1), max(i - 1, 0), min(i + 1, height - 1)
+            if found[i, left] == here == found[i, right] and found[up, j] == here == found[down, j]:
+                continue
+            x, y = directions[i, j, 0], directions[i, j, 1]
+            _, blue, green, red = _look(table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one)
+            out[i, j, 0] -= blue
+            out[i, j, 1] -= green
+            out[i, j, 2] -= red
+            for k in range(4):
+                a, b = (0.5 * (k % 2) - 0.25) / (right - left), (0.5 * (k // 2) - 0.25) / (down - up)
+                sx = x + a * (directions[i, right, 0] - directions[i, left, 0])
+                sy = y + b * (directions[down, j, 1] - directions[up, j, 1])
+                _, blue, green, red = _look(table, starts, items, place, texels, layout, sx, sy, rotation, pixel_at_one)
+                out[i, j, 0] += quarter * blue
+                out[i, j, 1] += quarter * green
+                out[i, j, 2] += quarter * red
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _look(
+    table: Array,
+    starts: Ints,
+    items: Ints,
+    place: tuple[float, float, float, float, float, float],
+    texels: NDArray[np.uint8],
+    layout: Ints,
+    x: float,
+    y: float,
+    rotation: Array,
+    pixel_at_one: float,
+) -> tuple[int, np.float32, np.float32, np.float32]:
+    """What is seen along (x, y, 1) in the camera's frame, as :func:`cast` has it, and its colour (blue, green, red) there."""
+    x0, y0, z0, top, per_width, per_depth = place
+    dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+    dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
+    dz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
+    found, depth = cast(table, starts, items, z0, top, dx, dy, dz)
+    blue = green = red = np.float32(0.0)
+    if found == NOTHING:
+        return found, blue, green, red
+    flat = math.sqrt(dx * dx + dy * dy)
+    along_x, along_y = 1.0, 0.0  # of the slant, on the texture
+    if found >= 0:
+        number = int(table[found, FACE])
+        s = table[found, FOOT] + depth * (table[found, AX] * dx + table[found, AY] * dy)
+        u = 1.0 - s * table[found, PER_LENGTH]
+        v = (table[found, TOP] - z0 - depth * dz) * table[found, PER_HEIGHT]
+        slant = flat / abs(table[found, NX] * dx + table[found, NY] * dy)
+    else:
+        number = layout.shape[0] - (2 if found == GROUND else 1)
+        u = (x0 + depth * dx) * per_width
+        v = (y0 + depth * dy) * per_depth
+        slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
+        along_x, along_y = dx / flat, dy / flat
+    pixel = depth * pixel_at_one  # the size of a pixel there, in texels, across the slant
+    taps = 1
+    if slant * pixel > 1.0 and slant >= 1.5:
+        taps = min(int(slant + 0.5), TAPS)
+    step = slant * pixel / taps
+    size, level = max(step, pixel), 0
+    while size > 1.41 and level < LEVELS - 1:
+        size *= 0.5
+        level += 1
+    first, width, height = layout[number, level, 0], layout[number, level, 1], layout[number, level, 2]
+    if taps == 1:
+        blue, green, red = _sample(texels, first, u * width, v * height, width, height)
+        return found, blue, green, red
+    shrunk = step / (1 << level)
+    column, line = u * width, v * height
+    for k in range(taps):
+        offset = (k - 0.5 * (taps - 1)) * shrunk
+        b, g, r = _sample(texels, first, column + offset * along_x, line + offset * along_y, width, height)
+        blue, green, red = blue + b, green + g, red + r
+    share = np.float32(1.0) / np.float32(taps)
+    return found, share * blue, share * green, share * red
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _sample(
+    texels: NDArray[np.uint8], first: int, x: float, y: float, width: int, height: int
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Blue, green and red of a picture at ``x`` and ``y`` from its upper left corner in texels, between the texels around."""
+    x = min(max(x - 0.5, 0.0), width - 1.0)
+    y = min(max(y - 0.5, 0.0), height - 1.0)
+    i, j = int(y), int(x)
+    a, b = np.float32(y - i), np.float32(x - j)
+    p = first + i * width + j
+    q = p + (width if i + 1 < height else 0)
+    right = 1 if j + 1 < width else 0
+    one = np.float32(1.0)
+    w00, w01, w10, w11 = (one - a) * (one - b), (one - a) * b, a * (one - b), a * b
+    blue = w00 * np.float32(texels[p, 0]) + w01 * np.float32(texels[p + right, 0])
+    blue += w10 * np.float32(texels[q, 0]) + w11 * np.float32(texels[q + right, 0])
+    green = w00 * np.float32(texels[p, 1]) + w01 * np.float32(texels[p + right, 1])
+    green += w10 * np.float32(texels[q, 1]) + w11 * np.float32(texels[q + right, 1])
+    red = w00 * np.float32(texels[p, 2]) + w01 * np.float32(texels[p + right, 2])
+    red += w10 * np.float32(texels[q, 2]) + w11 * np.float32(texels[q + right, 2])
+    return blue, green, red
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _direction(x: float, y: float) -> float:
+    """A direction in the plan as a number in [0, BINS) that grows counter-clockwise, without the angle's cost."""
+    total = abs(x) + abs(y)
+    if total == 0.0:
+        return 0.0
+    share = y / total
+    return (BINS / 4.0) * ((1.0 + share) if x >= 0.0 else (3.0 - share))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def develop(
+    light: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    read: float,
+    shot: float,
+) -> NDArray[np.uint8]:
+    """The picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with ``noise`` (H, W, 3) of deviation 1 made as large as
+    a sensor's: of the variance read^2 + shot * value."""
+    height, width = gain.shape
+    out = np.empty((height, width, 3), dtype=np.uint8)
+    for i in range(height):
+        for j in range(width):
+            for c in range(3):
+                value = light[i, j, c] * gain[i, j]
+                value += math.sqrt(read * read + shot * value) * noise[i, j, c]
+                out[i, j, c] = int(min(max(value + 0.5, 0.0), 255.0))
+    return out

@@ -1,0 +1,129 @@
+"""A building that can be looked at: upright faces with textures, floor and ceiling.
+
+A face is a rectangle above a segment in the plan, seen from the segment's left side alone. Furniture is lower than the room.
+Textures are kept with their halvings (mip levels; Williams, "Pyramidal parametrics", SIGGRAPH 1983).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.simulation import textures
+from factorgraph_loc.simulation.pictures import Canvas, paste
+from factorgraph_loc.simulation.plans import LOWEST_BOX, Plan, both_sides
+from factorgraph_loc.world import Tag
+from factors.se2 import Array
+
+ROOM_HEIGHT = 2.7  # m
+DOOR_HEIGHT = 2.05
+HIGHEST_BOX = 2.0
+TEXEL = 0.005  # m; larger in a building whose textures would need more than MOST_TEXELS
+MOST_TEXELS = 50e6  # a byte each of three colours, and a third more for the mip levels
+LEVELS = 7  # of each texture, the first included
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """``faces`` (F, 4) [m]: segments whose left side is seen; ``bottoms`` and ``tops`` (F,) [m] of them; ``closed`` (F,): faces
+    of a box, on whose upper side at ``tops`` one may look down.
+
+    ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout``
+    (F + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face to its
+    right as one looks at it, rows downwards; on floor and ceiling along x and y. ``texel`` [m].
+    """
+
+    faces: Array
+    bottoms: Array
+    tops: Array
+    closed: NDArray[np.bool_]
+    width: float
+    depth: float
+    height: float
+    texels: NDArray[np.uint8]
+    layout: NDArray[np.int64]
+    texel: float
+
+
+def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Scene:
+    """The building of a plan; textures and heights of furniture are drawn, and tags with a facing are seen as small labels."""
+    walls, boxes = plan.faces()
+    doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
+    faces = np.concatenate((walls, boxes, doors))
+    w, b, d = len(walls), len(boxes), len(doors)
+    bottoms = np.concatenate((np.zeros(w + b), np.full(d, DOOR_HEIGHT)))
+    of_boxes = rng.uniform(LOWEST_BOX, HIGHEST_BOX, b // 4).round(2).repeat(4)
+    tops = np.concatenate((np.full(w, ROOM_HEIGHT), of_boxes, np.full(d, ROOM_HEIGHT)))
+    lengths = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    area = float(lengths @ (tops - bottoms)) + 2.0 * plan.width * plan.depth
+    texel = max(TEXEL, math.sqrt(area / MOST_TEXELS))
+    sizes = [(max(round(z / texel), 8), max(round(x / texel), 8)) for z, x in zip(tops - bottoms, lengths, strict=True)]
+    across = round(plan.depth / texel), round(plan.width / texel)
+
+    def drawn() -> Iterator[Canvas]:
+        for i, size in enumerate(sizes):
+            if i < w:
+                canvas = textures.wall(rng, *size, texel, windows=_outer(plan, faces[i]))
+            elif i < w + b:
+                canvas = textures.furniture(rng, *size)
+            else:
+                canvas = textures.lintel(rng, *size, texel)
+            for x, z in _places(tags, faces[i]):
+                label = textures.label(rng, texel)
+                row = (tops[i] - z) / texel - label.shape[0] / 2
+                paste(canvas, label, round(x / texel - label.shape[1] / 2), round(row))
+            yield canvas
+        yield textures.floor(rng, *across, texel)
+        yield textures.ceiling(rng, *across, texel)
+
+    texels, layout = _stored([*sizes, across, across], drawn())
+    closed = (np.arange(len(faces)) >= w) & (np.arange(len(faces)) < w + b)
+    size3 = plan.width, plan.depth, ROOM_HEIGHT
+    return Scene(faces, bottoms, tops, closed, *size3, texels, layout, texel)
+
+
+def _outer(plan: Plan, face: Array) -> bool:
+    """Whether a face is on the outline of the plan."""
+    x1, y1, x2, y2 = face.tolist()
+    return (x1 == x2 and x1 in {0.0, plan.width}) or (y1 == y2 and y1 in {0.0, plan.depth})
+
+
+def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
+    """How far from the left end of a face, and how high, are the tags [m] that hang just before it."""
+    along = face[2:] - face[:2]
+    length = math.hypot(*along)
+    along = along / length
+    normal = np.array((-along[1], along[0]))
+    for tag in tags:
+        offset = np.array((tag.x, tag.y)) - face[:2]
+        s, away = float(offset @ along), float(offset @ normal)
+        if tag.facing is None or not 0.0 <= s <= length or not 0.0 <= away < 0.05:
+            continue
+        if normal @ (math.cos(tag.facing), math.sin(tag.facing)) > 0.9:
+            # the left end of what one sees is the segment's end, on whose left side one stands
+            yield length - s, tag.z
+
+
+def _stored(
+    sizes: Sequence[tuple[int, int]], canvases: Iterable[Canvas]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Canvases of these sizes and their mip levels in one array."""
+    layout = np.empty((len(sizes), LEVELS, 3), dtype=np.int64)
+    total = 0
+    for i, (height, width) in enumerate(sizes):
+        for k in range(LEVELS):
+            layout[i, k] = total, max(width >> k, 1), max(height >> k, 1)
+            total += int(layout[i, k, 1] * layout[i, k, 2])
+    texels = np.empty((total, 3), dtype=np.uint8)
+    for levels, canvas in zip(layout.tolist(), canvases, strict=True):
+        level = canvas
+        for k, (first, width, height) in enumerate(levels):
+            if k:
+                level = np.asarray(cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            texels[first : first + width * height] = level.reshape(-1, 3)
+    return texels, layout
