@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from benchmarking.report import Report, pooled, ratio_text, rmses, together
+
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.evaluation.ensembles import rmse_ratio, share_in_band
 from factorgraph_loc.evaluation.metrics import score
@@ -31,7 +31,7 @@ NOTHING = "–"
 
 @dataclass(frozen=True)
 class Attempt:
-    """A run: its ``errors``, its ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``."""
+    """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``."""
 
     errors: RunErrors | None
     figures: Mapping[str, Any]

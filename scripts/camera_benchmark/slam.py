@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from benchmarking.report import Report
+
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import (
     ACCURACY,
@@ -55,8 +55,8 @@ def section(options: CameraOptions) -> Report:
     found = {jobs[i].seed: outcome for i, outcome in outcomes.items()}
     failures(report, found)
     report.say(
-        f"Identified points: {len(found)} worlds of `office` with {POINTS} points that no map has, {duration:.0f} s each, images at "
-        "5 Hz with at most 20 points; the start is known to 0.1 m and 0.05 rad. *Aligned*: after the trajectory is laid on the "
+        f"Identified points: {len(found)} worlds of `office` with {POINTS} points that no map has, {duration:.0f} s each, images "
+        "at 5 Hz with at most 20 points; the start is known to 0.1 m and 0.05 rad. *Aligned*: after the trajectory is laid on the "
         f"reference, which takes the error of the start away. Target: {TARGET} m"
     )
     table(report, found, CONFIGS)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from benchmarking.report import Report
+
 from camera_benchmark.options import CameraOptions
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation import preset, simulate
