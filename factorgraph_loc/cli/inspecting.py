@@ -23,6 +23,7 @@ from factorgraph_loc.cli.options import (
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
+    from factorgraph_loc.evaluation.inspect_camera import ImageSummary, PixelSummary
     from factorgraph_loc.evaluation.inspect_rfid import RfidSummary
     from factorgraph_loc.log import Log
 
@@ -118,6 +119,10 @@ def _print(log: Log, found: Inspection) -> None:
     typer.echo()
     if found.rfid is not None:
         _print_rfid(found.rfid)
+    if found.images is not None:
+        _print_images(found.images)
+    if found.pixels is not None:
+        _print_pixels(found.pixels)
     if not found.problems:
         typer.echo("nothing looks wrong")
     for problem in found.problems:
@@ -134,6 +139,23 @@ def _print_rfid(found: RfidSummary) -> None:
         for name, a in found.antennas.items()
     ]
     show.table(header, rows)
+    typer.echo()
+
+
+def _print_images(found: ImageSummary) -> None:
+    sizes = ", ".join(found.sizes) or "unknown"
+    typer.echo(
+        f"images: {found.images}, of {sizes} px; {found.readable} of the {found.looked_at} looked at can be read, "
+        f"with {found.features:.0f} {found.feature} features (median)"
+    )
+    typer.echo()
+
+
+def _print_pixels(found: PixelSummary) -> None:
+    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
+    typer.echo(
+        f"identified pixels: {found.rows} in {found.frames} images, of {found.known} points of the map and {unknown}"
+    )
     typer.echo()
 
 
@@ -157,5 +179,7 @@ def _document(log: Log, found: Inspection) -> dict[str, Any]:
         "unknown": dict(found.unknown),
         "suspects": [asdict(suspect) | {"offset": suspect.offset.tolist()} for suspect in found.suspects],
         "rfid": None if found.rfid is None else asdict(found.rfid),
+        "images": None if found.images is None else asdict(found.images),
+        "pixels": None if found.pixels is None else asdict(found.pixels),
         "problems": found.problems,
     }

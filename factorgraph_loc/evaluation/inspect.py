@@ -15,6 +15,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.evaluation.inspect_camera import (
+    ImageSummary,
+    PixelSummary,
+    camera_problems,
+    summarize_images,
+    summarize_pixels,
+)
 from factorgraph_loc.evaluation.inspect_rfid import RfidSummary, rfid_problems, summarize_rfid
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.world import World
@@ -58,7 +65,7 @@ class Suspect:
 @dataclass(frozen=True)
 class Inspection:
     """What a log holds. ``unseen``: landmarks of the map without a sighting; ``unknown``: sightings by name that the map lacks.
-    ``rfid``: None where the log has no reads of tags."""
+    ``rfid``, ``images``, ``pixels``: None where the log has no reads of tags, no images, no identified pixels."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
@@ -67,6 +74,8 @@ class Inspection:
     suspects: tuple[Suspect, ...]
     problems: tuple[str, ...]
     rfid: RfidSummary | None = None
+    images: ImageSummary | None = None
+    pixels: PixelSummary | None = None
 
 
 def inspect(log: Log) -> Inspection:
@@ -87,7 +96,9 @@ def inspect(log: Log) -> Inspection:
     rfid = summarize_rfid(log)
     if rfid is not None:
         problems += rfid_problems(log, rfid)
-    return Inspection(streams, reference, unseen, unknown, suspects, tuple(problems), rfid)
+    images, pixels = summarize_images(log), summarize_pixels(log)
+    problems += camera_problems(log, images, pixels)
+    return Inspection(streams, reference, unseen, unknown, suspects, tuple(problems), rfid, images, pixels)
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:

@@ -18,7 +18,7 @@ from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision import frontend
 
 CAMERA = CameraSettings(
-    width=80, height=60, fx=75.0, fy=75.0, cx=39.5, cy=29.5, frontend={"feature": "orb", "count": 30}
+    width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}
 )
 
 
@@ -31,10 +31,10 @@ def _cache(tmp_path, monkeypatch):
 def seeing(log, tmp_path):
     """The short log with a camera and eight images, the first of them 0.1 s after its begin."""
     rng = np.random.default_rng(1)
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (60, 120), dtype=np.uint8), (0, 0), 1.5)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (120, 200), dtype=np.uint8), (0, 0), 1.5)
     files = [tmp_path / f"{k}.png" for k in range(8)]
     for k, file in enumerate(files):
-        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 80])
+        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 160])
     rig = log.rig.model_copy(update={"camera": CAMERA, "sensors": ("odometry", "camera")})
     return replace(log, rig=rig, streams=dict(log.streams) | {"camera": ImageStream(0.1 + 0.2 * np.arange(8), files)})
 
@@ -95,9 +95,9 @@ def test_images_that_are_not_used_are_left_alone(seeing, sees):
 
 @pytest.mark.usefixtures("sees")
 def test_a_calibration_of_another_resolution_is_an_error(seeing):
-    other = CAMERA.model_copy(update={"width": 160, "height": 120})
+    other = CAMERA.model_copy(update={"width": 320, "height": 240})
     log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
-    with pytest.raises(InputError, match="calibrated for images of 160 x 120 px, those of the log have 80 x 60 px"):
+    with pytest.raises(InputError, match="calibrated for images of 320 x 240 px, those of the log have 160 x 120 px"):
         run(log, RunConfig("fake"))
 
 
@@ -144,7 +144,7 @@ def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("sees")
 def test_a_comparison_of_a_log_that_cannot_be_used_is_a_failed_run(seeing, tmp_path, monkeypatch):
     monkeypatch.setattr(comparing, "run_each", in_this_process)
-    other = CAMERA.model_copy(update={"width": 160, "height": 120})
+    other = CAMERA.model_copy(update={"width": 320, "height": 240})
     log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
     (failure,) = compare([log], [RunConfig("fake")], tmp_path / "out").failures
-    assert "calibrated for images of 160 x 120 px" in failure
+    assert "calibrated for images of 320 x 240 px" in failure

@@ -1,0 +1,104 @@
+"""What ``inspect`` says about images and identified pixels."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.evaluation import inspect_camera
+from factorgraph_loc.evaluation.inspect import inspect
+from factorgraph_loc.log import ImageStream, Log, SightingStream, VelocityStream
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import World
+
+CAMERA = CameraSettings(
+    width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}
+)
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Fifty images, and two points that are seen twice."""
+    picture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (120, 160), dtype=np.uint8), (0, 0), 1.5)
+    files = [tmp_path / f"{k}.png" for k in range(50)]
+    for file in files:
+        cv2.imwrite(str(file), picture)
+    t = np.arange(50) * 0.2
+    seen = np.repeat((1.0, 2.0), 2)
+    pixels = SightingStream(
+        seen, ["door", "lamp"] * 2, np.array((1.0, 40.0, 2.0, 41.0)), np.array((5.0, 6.0, 5.0, 6.0))
+    )
+    return Log(
+        "room",
+        Rig(camera=CAMERA, sensors=("odometry", "camera", "sightings")),
+        World(points=PointMap.of(("door", "lamp"), np.zeros((2, 3)))),
+        {"odometry": VelocityStream(t, t, t), "camera": ImageStream(t, files), "sightings": pixels},
+    )
+
+
+def test_counts(log):
+    found = inspect(log)
+    assert found.problems == ()
+    assert (found.images.images, found.images.looked_at, found.images.readable) == (50, 40, 40)
+    assert found.images.sizes == {"160x120": 40}
+    assert found.images.feature == "orb"
+    assert 10 <= found.images.features <= 30
+    assert (found.pixels.rows, found.pixels.frames, found.pixels.known, found.pixels.unknown) == (4, 2, 2, {})
+    assert found.streams["camera"].rate == pytest.approx(5.0)
+
+
+def test_images_that_cannot_be_read(log):
+    for file in log.streams["camera"].file[20:]:
+        file.write_bytes(b"no image")
+    found = inspect(log)
+    assert found.images.readable == 16
+    (problem,) = found.problems
+    assert problem.startswith("24 of the 40 images looked at cannot be read: ")
+    assert "is not an image" in problem
+
+
+def test_sizes(log):
+    files = log.streams["camera"].file
+    for file in files[:25]:
+        cv2.imwrite(str(file), cv2.resize(cv2.imread(str(file)), (320, 240)))
+    assert inspect(log).problems == ("images have several sizes: 320x240, 160x120",)
+    doubled = replace(
+        log, streams=dict(log.streams) | {"camera": ImageStream(log.streams["camera"].t[:25], files[:25])}
+    )
+    assert inspect(doubled).problems == (
+        "the camera is calibrated for images of 160x120 px, those of the log have 320x240 px",
+    )
+
+
+def test_black_images(log):
+    for file in log.streams["camera"].file:
+        cv2.imwrite(str(file), np.zeros((120, 160), dtype=np.uint8))
+    assert inspect(log).problems == ("half of the images looked at, or more, show no orb features",)
+
+
+def test_a_rig_without_camera(log):
+    problems = inspect(replace(log, rig=log.rig.model_copy(update={"camera": None}))).problems
+    assert problems == (
+        "the log has images, but its rig has no [camera]: they are not used",
+        "the log has identified pixels, but its rig has no [camera]: they are not used",
+    )
+
+
+def test_points_that_the_map_lacks_and_pixels_outside(log):
+    s = log.streams["sightings"]
+    pixels = SightingStream(s.t, ["door", "chair"] * 2, s.u + np.array((0.0, 0.0, 0.0, 200.0)), s.v)
+    found = inspect(replace(log, streams=dict(log.streams) | {"sightings": pixels}))
+    assert found.problems == (
+        "2 sightings are of 1 points that the map lacks: chair",
+        "1 of 4 sightings lie outside of the camera's image",
+    )
+
+
+def test_no_images(log):
+    nothing = replace(log, streams=dict(log.streams) | {"camera": ImageStream(np.empty(0), [])})
+    found = inspect(nothing)
+    assert found.images == inspect_camera.ImageSummary(0, 0, 0, {}, "orb", 0.0, None)
+    assert found.problems == ("camera is empty",)
