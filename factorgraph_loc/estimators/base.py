@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from factorgraph_loc.measurements import Measurement
+from factorgraph_loc.points import PointMap
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -78,11 +79,12 @@ class Learnt:
 
     ``values``: constants, name to (value, standard deviation), SI units. Those of the odometry have plain names
     (``scale_distance``), those of another sensor its name before them (``bearing_range.x``). ``landmarks``: by the map's or the
-    measurements' name.
+    measurements' name. ``points``: those in space that the map lacks, None without any.
     """
 
     values: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     landmarks: Mapping[str, LearntPoint] = field(default_factory=dict)
+    points: PointMap | None = None
 
 
 @dataclass

@@ -62,11 +62,14 @@ class Batch(RelocatingGraph):
 
     def _begin_again(self, newest: Keyframe) -> None:
         kept = {k.key for k in self._keyframes}
-        self._guesses = {key: value for key, value in self._guesses.items() if key in kept}
+        self._guesses = {key: value for key, value in self._guesses.items() if key in kept or key in self._constants}
         self._guesses[newest.key] = self._pose
 
     def _pose_of(self, keyframe: int) -> Array:
         return self._guesses[pose_key(keyframe)]
+
+    def _current(self, key: int) -> Array:
+        return self._guesses[key]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         self._pose, self._covariance = addition.values[keyframe.key], spread

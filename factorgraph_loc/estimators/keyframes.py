@@ -6,6 +6,7 @@ import bisect
 import math
 from abc import ABC, abstractmethod
 
+import gtsam
 import numpy as np
 
 from factorgraph_loc.estimators.base import (
@@ -21,6 +22,7 @@ from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Gues
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.unknown_points import UnknownPoints
 from factorgraph_loc.estimators.variables import (
     CAMERA_KEY,
     ODOMETRY_KEY,
@@ -56,6 +58,9 @@ class KeyframeGraph(ABC):
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
+        self._unknown: UnknownPoints | None = None
+        # points that have left the graph: estimate and covariance
+        self._departed: tuple[Values, Values] = {}, {}
         # all variables but the poses: estimate and covariance
         self._constants, self._spreads = self._constant_priors()
         self._keyframes: list[Keyframe] = []
@@ -118,7 +123,10 @@ class KeyframeGraph(ABC):
             name: LearntPoint(self._constants[landmark_key(i)], self._spreads[landmark_key(i)])
             for name, i in self._places.items()
         }
-        return Learnt(values, points)
+        if self._unknown is None:
+            return Learnt(values, points)
+        positions, covariances = self._departed[0] | self._constants, self._departed[1] | self._spreads
+        return Learnt(values, points, self._unknown.learnt(positions, covariances))
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
@@ -197,6 +205,7 @@ class KeyframeGraph(ABC):
         which have many optima, where that is more than once."""
         assert self._prior is not None
         body = se2.world_to_body(self._prior.pose, self._prior.covariance)
+        natives: list[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = []
         factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(self._prior.pose, body), (pose_key(0),))]
         means, spreads = self._constant_priors()
         factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
@@ -205,11 +214,14 @@ class KeyframeGraph(ABC):
             for node in keyframe.nodes:
                 assert node.factor is not None
                 factor = node.factor
+                if node.native is not None:
+                    natives.append((factor, node.keys, node.native))
+                    continue
                 if isinstance(factor, BearingRangeFactor):
                     factor = factor.widened(width)
                 if width == 1.0 or not (isinstance(factor, RfidFactor) and factor.is_phase):
                     factors.append((factor, node.keys))
-        return Problem(factors)
+        return Problem(factors, natives)
 
     def _settle(self, problem: Problem, values: Values) -> Array:
         """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""

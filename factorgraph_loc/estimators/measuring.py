@@ -10,6 +10,7 @@ factor, which enters the graph with the next keyframe; until then the newest pos
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from dataclasses import replace
 
@@ -25,10 +26,11 @@ from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels, Predicted, pixel_update
 from factorgraph_loc.estimators.tags import TagUpdate
+from factorgraph_loc.estimators.unknown_points import GraphView, UnknownPoints
 from factorgraph_loc.estimators.variables import CAMERA_KEY, ODOMETRY_KEY, SENSOR_KEY, Node, landmark_key, pose_key
 from factorgraph_loc.estimators.waiting_scans import WaitingScans
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan, Tick
-from factors import se2
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, PixelSightings, RfidScan, Tick
+from factors import reprojection, se2
 from factors.bearing_range import TIME_OFFSET
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment
@@ -49,7 +51,11 @@ class MeasuringGraph(KeyframeGraph):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
-        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants)
+        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, settings.landmarks)
+        if settings.landmarks != "known" and self._points.model is not None:
+            constants = self._camera_constants.indices
+            self._unknown = UnknownPoints(self._points.model, self.diagnostics, constants)
+        self._pixels_taken = -math.inf
         self._scans = WaitingScans(setup, self.diagnostics)
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
 
@@ -84,6 +90,10 @@ class MeasuringGraph(KeyframeGraph):
         """The causal estimate (3,) of a keyframe."""
 
     @abstractmethod
+    def _current(self, key: int) -> Array:
+        """The newest estimate of a variable that is in the graph."""
+
+    @abstractmethod
     def _refine(self, newest: Keyframe, guess: Guess) -> None:
         """Take over pose and covariance of the newest keyframe from scans that are not yet in the graph."""
 
@@ -104,7 +114,9 @@ class MeasuringGraph(KeyframeGraph):
 
     def _see(self, m: BearingRange | Pixels) -> None:
         newest = self._keyframes[-1]
-        if m.t - newest.t >= self._interval:
+        # unknown points need keyframes of their own, whatever others stand there for scans
+        due = self._unknown is not None and isinstance(m, Pixels) and m.t - self._pixels_taken >= self._interval
+        if m.t - newest.t >= self._interval or (due and m.t > newest.t):
             self._add_keyframe(m.t, m)
             return
         before = self._keyframe_before(m.t)
@@ -243,16 +255,33 @@ class MeasuringGraph(KeyframeGraph):
         predicted = Predicted(pose, covariance, *constants, *(self._spreads[key] for key in shared))
         factor = self._points.factor(m, predicted, offset, twist)
         if factor is None:
-            return guess
+            return guess if guess is None else self._spot_others(keyframe, m, guess, addition)
         node = Node((keyframe.key, *shared), factor, 2 * len(factor.points))
         keyframe.nodes.append(node)
         addition.nodes.append(node)
         if guess is None:
             return None
-        here = factor.fixed(constants, None)
-        update = pixel_update(here, *guess)
-        self._points.report(m.t, here, update)
-        return se2.compose(guess[0], se2.exp(update.delta)), update.covariance
+        update = pixel_update(factor, predicted)
+        self._points.report(m.t, factor, update)
+        guess = se2.compose(guess[0], se2.exp(update.delta[:3])), update.covariance[:3, :3]
+        return self._spot_others(keyframe, m, guess, addition)
+
+    def _spot_others(self, keyframe: Keyframe, m: Pixels, guess: Guess, addition: Addition) -> Guess:
+        """Take in the points of an image that the map lacks; returned is the guess of the pose, placed by them."""
+        if self._unknown is None or keyframe is not self._keyframes[-1] or m.t != keyframe.t:
+            return guess
+        self._pixels_taken = m.t
+        rows = list(range(len(m.pixels)))
+        if isinstance(m, PixelSightings):
+            rows = [i for i in rows if m.points[i] not in self._points.map.index]
+        shared = (CAMERA_KEY,) if self._camera_constants.names else ()
+        changes = None
+        if shared:
+            changes = self._camera_constants.full(self._constants[CAMERA_KEY], len(reprojection.PARAMETERS))
+        graph = GraphView(
+            self._keyframes, self._constants, self._spreads, self._current, self._is_open, shared, changes
+        )
+        return self._unknown.take(m, rows, keyframe, guess, graph, addition)
 
     def _meet(
         self, name: str, factor: BearingRangeFactor, keyframe: Keyframe, guess: Guess, addition: Addition

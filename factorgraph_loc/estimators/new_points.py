@@ -1,12 +1,14 @@
 """Points that no map has: their sightings wait until they tell where the point is.
 
-That needs sightings from :data:`FEWEST` keyframes whose rays enclose an angle wide enough (a parallax test), that meet in front
-of the camera, and that are seen where the place that they give says. A sighting that contradicts the others is dropped.
+That needs sightings from :data:`FEWEST` keyframes whose rays enclose an angle wide enough (a parallax test) for the errors of
+pixels and poses, that meet in front of the camera, and that are seen where the place that they give says. A sighting that
+contradicts the others is dropped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+import math
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,27 +19,44 @@ from factors.reprojection import CameraModel
 from factors.se2 import Array
 
 FEWEST, MAX_WAITING = 3, 10  # sightings of one point
-MIN_PARALLAX = 0.035  # rad, between the outermost rays
+MIN_PARALLAX = 0.03  # rad, between the outermost rays
+MAX_SPREAD = 0.15  # standard deviation of a place that is good enough to begin with, as a share of the least depth
 NEAREST = 0.3  # m of depth
-ITERATIONS = 4
+ITERATIONS, SETTLED = 4, 1e-3  # m: a step that needs no further one
 GATE = 0.999  # probability of the residuals to be that small, if all sightings are right
 PATIENCE = 20  # keyframes that a point waits without being seen again
+ORIGIN, UNTURNED = np.zeros(3), np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A point seen from a keyframe, by its number, at ``pixel`` (2,)."""
+    """A point seen from a keyframe, by its number, at ``pixel`` (2,): in the direction ``ray`` (3,) of the camera's frame."""
 
     keyframe: int
     pixel: Array
+    ray: Array
+
+
+def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sighting]:
+    """Of ``pixels`` (K, 2) seen from a keyframe."""
+    rays = np.column_stack((reprojection.undistorted(model, pixels), np.ones(len(pixels))))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return [Sighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a keyframe is: its ``pose`` (3,), and how far off in the image its error may put points, ``slack`` [px]."""
+    """Where the camera of a keyframe is: ``centre`` (3,) and ``rotation`` (3, 3) in the world; and how far off in the image its
+    error may put points, ``slack`` [px]."""
 
-    pose: Array
+    centre: Array
+    rotation: Array
     slack: float
+
+    @classmethod
+    def of(cls, model: CameraModel, pose: Array, slack: float) -> Place:
+        """Of the robot at ``pose`` (3,)."""
+        return cls(*reprojection.camera_pose(model, pose), slack)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +82,10 @@ class NewPoints:
     def count(self, name: Hashable) -> int:
         """How many sightings of a point wait."""
         return len(self._waiting.get(name, ()))
+
+    def waiting(self) -> Mapping[Hashable, Sequence[Sighting]]:
+        """All that wait."""
+        return self._waiting
 
     def add(self, name: Hashable, sighting: Sighting) -> None:
         """One more sighting; the oldest ones do not wait for ever."""
@@ -97,9 +120,7 @@ class NewPoints:
 
     def _agreed(self, seen: list[Sighting], places: list[Place]) -> tuple[Triangulated, list[Sighting]] | None:
         while len(seen) >= FEWEST:
-            poses, pixels = np.array([p.pose for p in places]), np.array([s.pixel for s in seen])
-            sigmas = np.array([np.hypot(self._model.sigma, p.slack) for p in places])
-            result = triangulate(self._model, poses, pixels, sigmas)
+            result = triangulate(self._model, seen, places)
             if result is None:
                 return None
             if result.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
@@ -109,32 +130,38 @@ class NewPoints:
         return None
 
 
-def triangulate(model: CameraModel, poses: Array, pixels: Array, sigmas: Array) -> Triangulated | None:
-    """The point seen from ``poses`` (M, 3) of the robot at ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) [px]; None
-    where the rays are too nearly parallel, or do not meet in front of the camera.
+def triangulate(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float = MAX_SPREAD
+) -> Triangulated | None:
+    """The point ``seen`` M times from ``places``; None where the rays are too nearly parallel, do not meet in front of the camera,
+    or tell the place worse than to the share ``spread`` of its least depth.
 
     It begins where the rays come nearest to each other, and minimises the squared residuals in the images.
     """
-    cameras = [reprojection.camera_pose(model, pose) for pose in poses]
-    centres, turns = np.array([c for c, _ in cameras]), np.array([r for _, r in cameras])
-    rays = np.column_stack((reprojection.undistorted(model, pixels), np.ones(len(pixels))))
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    rays = np.einsum("mij,mj->mi", turns, rays)
-    if np.min(rays @ rays.T) > np.cos(MIN_PARALLAX):
+    centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
+    rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
+    if (rays @ rays.T).min() > math.cos(MIN_PARALLAX):
         return None
+    pixels, sigmas = np.array([s.pixel for s in seen]), np.array([math.hypot(model.sigma, p.slack) for p in places])
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    point = np.linalg.solve(across.sum(axis=0), np.einsum("mij,mj->i", across, centres))
+    point = np.linalg.solve(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])
     for i in range(ITERATIONS + 1):
-        local = np.einsum("mji,mj->mi", turns, point - centres)
-        if not np.all(local[:, 2] > NEAREST):
+        local = ((point - centres)[:, None, :] @ turns)[:, 0]
+        if not local[:, 2].min() > NEAREST:
             return None
         # a point in the frame of a camera is as one of the world seen by a camera that is not moved
-        seen, _, by_local = reprojection.linearize_in_space(model, np.zeros(3), np.eye(3), local)
-        residual = (seen - pixels) / sigmas[:, None]
+        at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
+        residual = (at - pixels) / sigmas[:, None]
         jacobian = (by_local @ turns.transpose(0, 2, 1) / sigmas[:, None, None]).reshape(-1, 3)
         covariance = np.linalg.inv(jacobian.T @ jacobian)
+        # at first it need not be that good
+        if np.linalg.eigvalsh(covariance)[-1] > ((2.0 if i == 0 else 1.0) * spread * local[:, 2].min()) ** 2:
+            return None
         if i < ITERATIONS:
-            point = point - covariance @ (jacobian.T @ residual.ravel())
+            step = covariance @ (jacobian.T @ residual.ravel())
+            point = point - step
+            if np.abs(step).max() < SETTLED:
+                break
     return Triangulated(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))
 
 

@@ -6,6 +6,7 @@ because each callback from GTSAM would copy all of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -33,14 +34,27 @@ class Solution:
 
 
 class Problem:
-    """Factors of ours, each with the keys of its variables."""
+    """Factors of ours, each with the keys of its variables; ``natives``: more of them, with GTSAM's own that are the same but
+    throw where a point is behind a camera."""
 
-    def __init__(self, factors: Sequence[tuple[Factor, tuple[int, ...]]]) -> None:
-        self._factors = factors
+    def __init__(
+        self,
+        factors: Sequence[tuple[Factor, tuple[int, ...]]],
+        natives: Sequence[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = (),
+    ) -> None:
+        self._factors = list(factors)
+        self._natives = natives
+        self._graph = gtsam.NonlinearFactorGraph()
+        for _, _, native in natives:
+            self._graph.add(native)
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
         """The optimum found from a guess, or where ``max_iterations`` lead."""
         damping, cost = INITIAL_DAMPING, self.cost(values)
+        if not math.isfinite(cost) and len(self._natives):
+            self._factors += [(factor, keys) for factor, keys, _ in self._natives]
+            self._natives, self._graph = (), gtsam.NonlinearFactorGraph()
+            cost = self.cost(values)
         iteration = 0
         while iteration < max_iterations and damping < MAX_DAMPING:
             iteration += 1
@@ -61,14 +75,22 @@ class Problem:
         return Solution(values, cost, iteration)
 
     def cost(self, values: Values) -> float:
-        """The robust cost."""
-        return sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
+        """The robust cost, infinite where one of GTSAM's factors throws."""
+        ours = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
+        if not self._graph.size():
+            return ours
+        try:
+            return ours + float(self._graph.error(to_gtsam(values)))
+        except RuntimeError:
+            return math.inf
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised with their robust weights."""
         graph = gtsam.GaussianFactorGraph()
         for factor, keys in self._factors:
             graph.add(jacobian_factor(factor, keys, gather(values, keys)))
+        if self._graph.size():
+            graph.push_back(self._graph.linearize(to_gtsam(values)))
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> dict[int, Array]:

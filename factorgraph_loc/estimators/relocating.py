@@ -11,7 +11,7 @@ from __future__ import annotations
 import bisect
 import math
 from abc import abstractmethod
-from collections import deque
+from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyfram
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
 from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.estimators.new_points import FEWEST
 from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocalization import DURATION, Relocalizer
@@ -29,6 +30,7 @@ from factorgraph_loc.estimators.scan_monitor import ScanMonitor
 from factorgraph_loc.estimators.seen_points import Pixels
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
+from factorgraph_loc.estimators.variables import is_point
 from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.tag_map import extent
 from factors import se2
@@ -209,8 +211,21 @@ class RelocatingGraph(MeasuringGraph):
         self._keyframe_times.append(t)
         self._pose, self._covariance = pose, UNKNOWN
         self._scans.clear()
+        self._forget_points()
         self._begin_again(keyframe)
         self._replay(replay)
+
+    def _forget_points(self) -> None:
+        """Give up the points that the keyframes that are left do not tell."""
+        if self._unknown is None:
+            return
+        seen = Counter(key for k in self._keyframes for node in k.nodes for key in node.keys if is_point(key))
+        kept = {key for key, count in seen.items() if count >= FEWEST}
+        for k in self._keyframes:
+            k.nodes = [node for node in k.nodes if all(key in kept or not is_point(key) for key in node.keys)]
+        for key in [key for key in self._constants if is_point(key) and key not in kept]:
+            del self._constants[key], self._spreads[key]
+        self._unknown.keep_only(kept)
 
     def _placed(self, t: float) -> Array:
         """Where the robot was at ``t``, from the place that was found and the odometry since."""

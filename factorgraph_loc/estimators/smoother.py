@@ -8,6 +8,7 @@ graph is also kept here, and the solver is rebuilt from it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import gtsam
@@ -19,7 +20,7 @@ from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Gues
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
-from factorgraph_loc.estimators.variables import CAMERA_KEY, ODOMETRY_KEY, SENSOR_KEY, Node, Values
+from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
@@ -83,7 +84,7 @@ class Smoother(RelocatingGraph):
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         self._filtered.append((addition.values[keyframe.key], spread))
-        self._leave(keyframe.t, [key for key in self._constants if key not in addition.values])
+        self._leave(keyframe.t, [k for k in self._constants if k not in addition.values and not is_point(k)])
         self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
@@ -93,6 +94,9 @@ class Smoother(RelocatingGraph):
             self._pose, self._covariance = guess
             return
         self._update(addition.nodes, addition.values)
+
+    def _current(self, key: int) -> Array:
+        return self._solver.value(key)
 
     def _refine(self, newest: Keyframe, guess: Guess) -> None:
         self._filtered[newest.index] = guess
@@ -115,12 +119,12 @@ class Smoother(RelocatingGraph):
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
         """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
 
-        Of the constants the covariance is not needed before the end, and it takes time: only those of landmarks are read.
+        Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
         """
         self._pose, self._covariance = self._marginal(newest.key)
         self._filtered[newest.index] = (self._pose, self._covariance)
         for key in touched:
-            if key in (ODOMETRY_KEY, SENSOR_KEY, CAMERA_KEY):
+            if key in (ODOMETRY_KEY, SENSOR_KEY) or is_point(key):
                 self._constants[key] = self._solver.value(key)
             else:
                 self._constants[key], self._spreads[key] = self._marginal(key)
@@ -151,7 +155,13 @@ class Smoother(RelocatingGraph):
             for key in constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
         except RuntimeError:
-            self._left += [self._filtered[k.index] for k in leaving]
+            self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
+        for key in () if self._unknown is None else self._unknown.leave(now - lag):
+            try:
+                self._departed[0][key], self._departed[1][key] = self._marginal(key)
+            except RuntimeError:
+                self._departed[0][key], self._departed[1][key] = self._constants[key], self._spreads[key]
+            del self._constants[key], self._spreads[key]
 
     def _rebuild(self, newest: Keyframe) -> None:
         try:
@@ -186,6 +196,8 @@ class Smoother(RelocatingGraph):
             nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
         for keyframe in others:
             nodes += [self._odometry_node(keyframe), *keyframe.nodes]
+        # of those that are both, ours never throw
+        nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
         guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
         self._solver.update(nodes, guesses, newest.t)
         self._read(newest, self._constants)

@@ -13,7 +13,7 @@ from typing import Any, Protocol, cast
 import gtsam
 import numpy as np
 
-from factorgraph_loc.estimators.variables import Node, Values, gather, is_pose, read, to_gtsam
+from factorgraph_loc.estimators.variables import Node, Values, gather, is_point, is_pose, read, to_gtsam
 from factors import se2
 from factors.graph import custom_factor, jacobian_factor, read_pose, read_vector
 from factors.se2 import Array
@@ -106,7 +106,9 @@ class Window:
         for node in nodes:
             graph.add(node.native if node.native is not None else self._custom(node))
         stamps: dict[int, float] = dict.fromkeys(values, t)
-        stamps |= dict.fromkeys(self._sizes, t)  # what is constant never leaves the window
+        # what is constant never leaves the window, points do when they are seen no more
+        stamps |= dict.fromkeys((key for key in self._sizes if not is_point(key)), t)
+        stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
         self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
     def value(self, key: int) -> Array:

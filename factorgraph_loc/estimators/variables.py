@@ -1,6 +1,6 @@
 """The variables of a graph by GTSAM's keys, and what hangs on them.
 
-A variable is a pose (3,), or a vector: constants of a sensor that are estimated, or the position (2,) of a landmark.
+A variable is a pose (3,), or a vector: constants of a sensor that are estimated, or the position of a landmark (2,) or point (3,).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Values = dict[int, Array]
 ODOMETRY_KEY = int(gtsam.symbol("c", 0))  # constants of the odometry
 SENSOR_KEY = int(gtsam.symbol("s", 0))  # constants of the sensor of landmarks
 CAMERA_KEY = int(gtsam.symbol("k", 0))  # constants of the camera
-_POSE = ord("x")
+_POSE, _POINT = ord("x"), ord("p")
 _CHARACTER = 56  # bits of a key below its character
 
 
@@ -34,6 +34,16 @@ def landmark_key(index: int) -> int:
     return int(gtsam.symbol("l", index))
 
 
+def point_key(index: int) -> int:
+    """The key of the point in space that was taken in as number ``index``."""
+    return int(gtsam.symbol("p", index))
+
+
+def is_point(key: int) -> bool:
+    """Whether the variable is a point in space."""
+    return key >> _CHARACTER == _POINT
+
+
 def is_pose(key: int) -> bool:
     """Whether the variable is a pose."""
     return key >> _CHARACTER == _POSE
@@ -41,7 +51,8 @@ def is_pose(key: int) -> bool:
 
 @dataclass(frozen=True)
 class Node:
-    """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, or GTSAM's own (``native``)."""
+    """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),
+    or both, which are the same."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None

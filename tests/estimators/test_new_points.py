@@ -10,6 +10,8 @@ from factorgraph_loc.estimators.new_points import (
     NewPoints,
     Place,
     Sighting,
+    Triangulated,
+    sightings_of,
     spread_out,
     triangulate,
 )
@@ -43,9 +45,19 @@ def pixels_of(poses: Array, point: Array = POINT) -> Array:
     return np.array([predict(MODEL, pose, point[None])[0][0] for pose in poses])
 
 
+def located(poses: Array, pixels: Array, model: CameraModel = MODEL) -> Triangulated | None:
+    """The point seen from poses (M, 3) at pixels (M, 2)."""
+    seen = [sightings_of(model, k, pixel[None])[0] for k, pixel in enumerate(pixels)]
+    return triangulate(model, seen, [Place.of(model, pose, 0.0) for pose in poses])
+
+
+def seen_at(keyframe: int, pixel: Array) -> Sighting:
+    return sightings_of(MODEL, keyframe, np.asarray(pixel)[None])[0]
+
+
 def test_exact_sightings_give_the_exact_place() -> None:
     poses = along(np.array((0.0, 0.5, 1.0)))
-    found = triangulate(MODEL, poses, pixels_of(poses), np.full(3, 0.7))
+    found = located(poses, pixels_of(poses))
     assert found is not None
     np.testing.assert_allclose(found.position, POINT, atol=1e-6)
 
@@ -57,7 +69,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     exact = pixels_of(poses)
     squared = []
     for _ in range(400):
-        found = triangulate(MODEL, poses, exact + rng.normal(0.0, 0.7, exact.shape), np.full(4, 0.7))
+        found = located(poses, exact + rng.normal(0.0, 0.7, exact.shape))
         assert found is not None
         error = found.position - POINT
         squared.append(error @ np.linalg.solve(found.covariance, error))
@@ -67,20 +79,20 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
 def test_without_parallax_there_is_no_place() -> None:
     for steps in ((0.0, 0.0, 0.0), (0.0, 0.01, 0.02)):
         poses = along(np.array(steps))
-        assert triangulate(MODEL, poses, pixels_of(poses), np.full(3, 0.7)) is None
+        assert located(poses, pixels_of(poses)) is None
     turning = np.array(((0.0, 0.0, 0.0), (0.0, 0.0, 0.1), (0.0, 0.0, 0.2)))
     still = CameraModel(500.0, 500.0, 319.5, 239.5, 640, 480, position=np.array((0.0, 0.0, 0.8)))
     seen = np.array([predict(still, pose, POINT[None])[0][0] for pose in turning])
-    assert triangulate(still, turning, seen, np.full(3, 0.7)) is None
+    assert located(turning, seen, still) is None
 
 
 def test_rays_that_meet_behind_the_camera_are_no_point() -> None:
     poses = along(np.array((0.0, 0.5, 1.0)))
-    assert triangulate(MODEL, poses, pixels_of(poses)[::-1], np.full(3, 0.7)) is None
+    assert located(poses, pixels_of(poses)[::-1]) is None
 
 
 def places(poses: Array, slack: float = 0.0):
-    return lambda k: Place(poses[k], slack)
+    return lambda k: Place.of(MODEL, poses[k], slack)
 
 
 def test_a_point_waits_for_three_sightings_and_for_parallax() -> None:
@@ -88,7 +100,7 @@ def test_a_point_waits_for_three_sightings_and_for_parallax() -> None:
     waiting = NewPoints(MODEL)
     for k, pixel in enumerate(pixels_of(poses)):
         assert waiting.ready(["a"], places(poses)) == []
-        waiting.add("a", Sighting(k, pixel))
+        waiting.add("a", seen_at(k, pixel))
     ((name, found, sightings),) = waiting.ready(["a", "b"], places(poses))
     assert name == "a"
     assert [s.keyframe for s in sightings] == [0, 1, 2, 3, 4]
@@ -102,7 +114,7 @@ def test_a_wrong_sighting_is_left_out() -> None:
     pixels[2] += (60.0, -40.0)
     waiting = NewPoints(MODEL)
     for k, pixel in enumerate(pixels):
-        waiting.add(7, Sighting(k, pixel))
+        waiting.add(7, seen_at(k, pixel))
     ((_, found, sightings),) = waiting.ready([7], places(poses))
     assert [s.keyframe for s in sightings] == [0, 1, 3, 4]
     np.testing.assert_allclose(found.position, POINT, atol=1e-5)
@@ -113,18 +125,18 @@ def test_sightings_that_contradict_each_other_wait() -> None:
     poses = along(np.array((0.0, 0.4, 0.8)))
     waiting = NewPoints(MODEL)
     for k in range(3):
-        waiting.add("a", Sighting(k, rng.uniform((0.0, 0.0), (640.0, 480.0))))
+        waiting.add("a", seen_at(k, rng.uniform((0.0, 0.0), (640.0, 480.0))))
     assert waiting.ready(["a"], places(poses)) == []
 
 
 def test_poses_that_are_not_well_known_widen_the_gate() -> None:
-    poses = along(np.array((0.0, 0.4, 0.8, 1.2)))
+    poses = along(np.array((0.0, 0.7, 1.4, 2.1)))
     pixels = pixels_of(poses)
-    off = poses + np.array((0.0, 0.0, 0.02)) * np.array((0, 1, -1, 1))[:, None]
-    for slack, count in ((0.0, 0), (15.0, 1)):
+    off = poses + np.array((0.0, 0.0, 0.01)) * np.array((0, 1, -1, 1))[:, None]
+    for slack, count in ((0.0, 0), (6.0, 1)):
         waiting = NewPoints(MODEL)
         for k, pixel in enumerate(pixels):
-            waiting.add("a", Sighting(k, pixel))
+            waiting.add("a", seen_at(k, pixel))
         found = waiting.ready(["a"], places(off, slack))
         assert len(found) == count
         if found:
@@ -135,16 +147,16 @@ def test_sightings_from_keyframes_that_are_gone_do_not_count() -> None:
     poses = along(np.array((0.0, 0.5, 1.0)))
     waiting = NewPoints(MODEL)
     for k, pixel in enumerate(pixels_of(poses)):
-        waiting.add("a", Sighting(k, pixel))
-    assert waiting.ready(["a"], lambda k: Place(poses[k], 0.0) if k else None) == []
+        waiting.add("a", seen_at(k, pixel))
+    assert waiting.ready(["a"], lambda k: Place.of(MODEL, poses[k], 0.0) if k else None) == []
 
 
 def test_what_waits_is_bounded() -> None:
     waiting = NewPoints(MODEL)
     for k in range(40):
-        waiting.add("always", Sighting(k, np.zeros(2)))
+        waiting.add("always", seen_at(k, np.zeros(2)))
     assert waiting.count("always") == MAX_WAITING
-    waiting.add("once", Sighting(0, np.zeros(2)))
+    waiting.add("once", seen_at(0, np.zeros(2)))
     waiting.forget(40)
     assert waiting.count("once") == 0
     assert waiting.count("always") >= FEWEST

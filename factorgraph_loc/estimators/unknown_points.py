@@ -1,0 +1,233 @@
+"""Points that the map lacks, as variables of a graph.
+
+Pixels of one enter the graph at keyframes alone. First its sightings wait (:mod:`.new_points`); with its place it becomes a
+variable, with all of them as factors. Then its pixels place the newest keyframe, those that agree with the others, and become
+factors too. A point whose pixels disagree :data:`STRIKES` times in a row is another one from then on: whoever followed it went
+astray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.estimators.local_bundle import bundled
+from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
+from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of, spread_out
+from factorgraph_loc.estimators.seen_points import lifted, pixel_update
+from factorgraph_loc.estimators.variables import Node, Values, point_key
+from factorgraph_loc.measurements import CameraFrame, PixelSightings
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.vision.consensus import FEWEST, Truths, agreeing
+from factors import reprojection, se2
+from factors.point_sighting import PointSightings
+from factors.reprojection import CameraModel, recalibrated
+from factors.reprojection_factor import ReprojectionFactor
+from factors.se2 import Array
+
+PER_KEYFRAME = 40  # points, those that wait included
+STRIKES = 2
+ANCHORED = 6  # points of the graph that place a keyframe well: to SLACK pixels
+SLACK = 2.0  # px
+HORIZON, BUNDLE = 60, 8  # keyframes back that sightings may wait, and that are adjusted together
+
+
+@dataclass
+class _Point:
+    """A point of the graph: when it was last seen, what its sightings tell of it with exact poses (3, 3), and how many of
+    the last ones disagreed."""
+
+    key: int
+    last: float
+    information: Array
+    strikes: int = 0
+
+
+@dataclass(frozen=True)
+class GraphView:
+    """What :class:`UnknownPoints` sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
+    (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; keys of the camera's
+    constants (``shared``), and their ``changes`` (8,)."""
+
+    keyframes: Sequence[Keyframe]
+    values: Values
+    spreads: Values
+    current: Callable[[int], Array]
+    is_open: Callable[[int], bool]
+    shared: tuple[int, ...] = ()
+    changes: Array | None = None
+
+
+@dataclass
+class UnknownPoints:
+    """The points of a graph by name, and those that wait. ``estimated``: constants of the camera that are variables."""
+
+    model: CameraModel
+    diagnostics: Diagnostics
+    estimated: tuple[int, ...] = ()
+    _points: dict[Hashable, _Point] = field(default_factory=dict)
+    _astray: list[_Point] = field(default_factory=list)  # in the graph, but seen no more under their name
+    _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
+    _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
+
+    def __post_init__(self) -> None:
+        self._new = NewPoints(self.model)
+        self._sightings = PointSightings(self.model)
+
+    def take(
+        self,
+        m: PixelSightings | CameraFrame,
+        rows: Sequence[int],
+        keyframe: Keyframe,
+        guess: Guess,
+        graph: GraphView,
+        addition: Addition,
+    ) -> Guess:
+        """Turn ``rows`` of what is seen from a new keyframe into factors and variables; returned is the guess of its pose, placed
+        by the points. Its covariance stays: the points are known no better than the poses that saw them."""
+        names: list[Hashable] = (
+            [m.points[i] for i in rows] if isinstance(m, PixelSightings) else m.tracks[list(rows)].tolist()
+        )
+        pixels = m.pixels[list(rows)]
+        priority = [len(names) if name in self._points else self._new.count(name) for name in names]
+        chosen = spread_out(pixels, priority, PER_KEYFRAME, self.model.width, self.model.height)
+        names, pixels = [names[i] for i in chosen], pixels[chosen]
+        model = self.model if graph.changes is None else recalibrated(self.model, graph.changes)
+        old = [i for i, name in enumerate(names) if name in self._points]
+        guess, right = self._placed(model, [self._points[names[i]] for i in old], pixels[old], guess, graph)
+        for i, agrees in zip(old, right.tolist(), strict=True):
+            self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
+        self._anchored[keyframe.index] = int(np.count_nonzero(right)) >= ANCHORED
+        sightings = sightings_of(self.model, keyframe.index, pixels)
+        fresh = [name for name in names if name not in self._points]
+        for name, sighting in zip(names, sightings, strict=True):
+            if name not in self._points:
+                self._new.add(name, sighting)
+        self._new.forget(keyframe.index)
+        places, pose = self._places(keyframe, guess[0], graph)
+        for name, found, seen in self._new.ready(fresh, places.get):
+            key = point_key(len(self._names))
+            self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
+            self._points[name] = _Point(key, keyframe.t, np.asarray(np.linalg.inv(found.covariance), dtype=float))
+            addition.values[key] = found.position
+            graph.values[key], graph.spreads[key] = found.position, found.covariance
+            for sighting in seen:
+                self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
+        return pose, guess[1]
+
+    def leave(self, t: float) -> list[int]:
+        """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+        gone = [point.key for point in (*self._points.values(), *self._astray) if point.last < t]
+        self._points = {name: point for name, point in self._points.items() if point.last >= t}
+        self._astray = [point for point in self._astray if point.last >= t]
+        return gone
+
+    def keep_only(self, keys: set[int]) -> None:
+        """Give up the points of the graph but those with these ``keys``, and all that wait."""
+        self._points = {name: point for name, point in self._points.items() if point.key in keys}
+        self._new = NewPoints(self.model)
+
+    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
+        """All points that were ever in the graph, those that were met under several keys under the first of them."""
+        keys: dict[str, int] = {}
+        for key, name in self._names.items():
+            if key in values:
+                keys.setdefault(name, key)
+        if not keys:
+            return None
+        positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
+        return PointMap.of(tuple(keys), positions, covariances)
+
+    def _placed(
+        self, model: CameraModel, points: list[_Point], pixels: Array, guess: Guess, graph: GraphView
+    ) -> tuple[Guess, Truths]:
+        """The guess placed by points of the graph, and which of these agree."""
+        if not points:
+            return guess, np.zeros(0, dtype=bool)
+        positions = np.array([graph.current(point.key) for point in points])
+        spreads = np.linalg.inv(np.array([point.information for point in points]))
+        camera = lifted(model, *guess)
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
+        noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        right = agreeing(model, camera, positions, pixels, noise)
+        if np.count_nonzero(right) < FEWEST:
+            return guess, right
+        factor = ReprojectionFactor(model, positions[right], pixels[right], point_covariances=spreads[right])
+        update = pixel_update(factor, *guess)
+        return (se2.compose(guess[0], se2.exp(update.delta)), guess[1]), right
+
+    def _again(
+        self,
+        name: Hashable,
+        pixel: Array,
+        agrees: bool,
+        keyframe: Keyframe,
+        pose: Array,
+        model: CameraModel,
+        graph: GraphView,
+        addition: Addition,
+    ) -> None:
+        """A point of the graph is seen again."""
+        point = self._points[name]
+        if not agrees:
+            self.diagnostics.reject("camera: does not agree with the others")
+            point.strikes += 1
+            if point.strikes >= STRIKES:
+                self._astray.append(self._points.pop(name))
+            return
+        position = graph.current(point.key)
+        _, depth = reprojection.predict(model, pose, position[None])
+        if depth[0] < reprojection.NEAREST:
+            return
+        point.strikes, point.last = 0, keyframe.t
+        _, _, by_point, _ = reprojection.linearize(model, pose, position[None])
+        point.information += by_point[0].T @ by_point[0] / model.sigma**2
+        self._hang(keyframe, point.key, pixel, graph, addition)
+
+    def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
+        shared = graph.shared
+        native = None if shared else self._sightings.factor(keyframe.key, key, pixel)
+        factor = ReprojectionFactor(self.model, np.zeros((1, 3)), pixel[None], estimated=self.estimated, free=True)
+        node = Node((keyframe.key, *shared, key), factor, 2, native)
+        keyframe.nodes.append(node)
+        addition.nodes.append(node)
+
+    def _places(self, newest: Keyframe, pose: Array, graph: GraphView) -> tuple[dict[int, Place], Array]:
+        """Where the last keyframes are, by number, and how well their pixels fit to those of the newest; and its pose (3,).
+
+        Between keyframes that points of the graph have placed they do; else that goes with the turn that odometry alone tells
+        between them, or with the adjustment of both where that is possible.
+        """
+        places: dict[int, Place] = {}
+        poses: dict[int, Array] = {}
+        to_anchor = since = (
+            0.0  # variance of the turn from the newest to the first one that is anchored, and from that on
+        )
+        reached = False
+        for index in range(newest.index, max(-1, newest.index - HORIZON), -1):
+            if not graph.is_open(index):
+                break
+            if self._anchored.get(index, False):
+                reached, since = True, 0.0
+            slack = math.hypot(SLACK, self.model.fx * math.sqrt(to_anchor + since))
+            poses[index] = pose if index == newest.index else graph.current(graph.keyframes[index].key)
+            places[index] = Place.of(self.model, poses[index], slack)
+            step = graph.keyframes[index].from_previous
+            if step is None:
+                break
+            variance = float(step.covariance[2, 2])
+            to_anchor, since = (to_anchor, since + variance) if reached else (to_anchor + variance, since)
+        last = sorted(poses)[-BUNDLE:]
+        if self._anchored[newest.index] or len(last) < FEWEST_SIGHTINGS:
+            return places, pose
+        keyframes = [graph.keyframes[index] for index in last]
+        slacks = [places[index].slack for index in last]
+        found = bundled(self.model, keyframes, [poses[index] for index in last], slacks, self._new.waiting())
+        if found is None:
+            return places, pose
+        return {i: Place.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
