@@ -272,7 +272,17 @@ def cut(log: Log, start: float, end: float) -> Log:
         keep = inside(reference.t)
         covariances = None if reference.covariances is None else reference.covariances[keep]
         reference = replace(reference, t=reference.t[keep], poses=reference.poses[keep], covariances=covariances)
-    return replace(log, streams=streams, reference=reference if reference and len(reference) else None, start=None)
+    in_space = log.reference3
+    if in_space is not None:
+        keep = inside(in_space.t)
+        in_space = Trajectory3(in_space.t[keep], in_space.positions[keep], in_space.rotations[keep])
+    return replace(
+        log,
+        streams=streams,
+        reference=reference if reference and len(reference) else None,
+        reference3=in_space if in_space and len(in_space) else None,
+        start=None,
+    )
 
 
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:

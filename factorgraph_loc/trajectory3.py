@@ -13,11 +13,13 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Trajectory3:
-    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world's frame."""
+    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world's frame;
+    ``covariances`` (N, 6, 6) of an estimate: of the perturbation in the robot's frame, turn first, then shift."""
 
     t: Array
     positions: Array
     rotations: Array
+    covariances: Array | None = None
 
     def __post_init__(self) -> None:
         if self.positions.shape != (len(self.t), 3) or self.rotations.shape != (len(self.t), 3, 3):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from factorgraph_loc.measurements import Measurement
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 Status = Literal["unlocalized", "ambiguous", "localized"]
@@ -18,11 +19,13 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What is known of the start: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame."""
+    """What is known of the start: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame;
+    ``space``: of a robot that is not on a floor."""
 
     t: float
     pose: Array
     covariance: Array
+    space: SpacePose | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,14 @@ class Estimator(Protocol):
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
+
+
+@runtime_checkable
+class SpaceEstimator(Protocol):
+    """An estimator of a robot that need not be on a floor: its causal estimates hold ``space``."""
+
+    def space_trajectory(self) -> Trajectory3:
+        """:meth:`Estimator.trajectory` in space, with covariances (N, 6, 6)."""
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:

@@ -21,9 +21,12 @@ ESTIMATORS = {
     "ekf": ("ekf", "Ekf", "EkfSettings"),
     "particle_filter": ("particle_filter", "ParticleFilter", "ParticleFilterSettings"),
     "switching": ("switching", "Switching", "SwitchingSettings"),
+    "monoslam": ("monoslam", "Monoslam", "MonoslamSettings"),
     "smoother": ("smoother", "Smoother", "SmootherSettings"),
     "batch": ("batch", "Batch", "BatchSettings"),
 }
+
+IN_SPACE = ("monoslam", "space_batch")  # those of a robot that need not be on a floor
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt
-from factorgraph_loc.evaluation import alignment
+from factorgraph_loc.evaluation import alignment, space
 from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.log import Log
@@ -96,7 +96,8 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
 
     ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
     a reference. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
-    ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
+    ``causal.space_*`` and ``final.space_*`` (see :func:`~factorgraph_loc.evaluation.space.accuracy`) are None but for estimators
+    that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
     ``learnt.NAME.sigma`` are there for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` are always there.
@@ -108,6 +109,9 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     scores: dict[str, Any] = {}
     for kind, trajectory in (("causal", causal), ("final", final)):
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference)
+        scores |= {f"{kind}.{name}": value for name, value in figures.items()}
+    for kind, in_space in (("causal", result.causal_space), ("final", result.final_space)):
+        figures = space.accuracy(in_space, log.reference3)
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:

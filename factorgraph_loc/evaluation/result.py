@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt, Status
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 
@@ -40,7 +41,8 @@ class RunResult:
 
     ``config``: the effective configuration as plain values, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3),
     ``covariances`` (N, 3, 3) in the world's frame and ``status`` (N) are the causal estimates on the grid of ticks;
-    ``final`` is the best estimate of the whole past.
+    ``final`` is the best estimate of the whole past. ``causal_space``, ``final_space``: the same in space, of an estimator that
+    knows it.
     """
 
     log: str
@@ -55,6 +57,8 @@ class RunResult:
     timings: Timings
     versions: Mapping[str, str]
     warnings: tuple[str, ...] = ()
+    causal_space: Trajectory3 | None = None
+    final_space: Trajectory3 | None = None
 
     def first_localized(self) -> int | None:
         """Index of the first causal estimate that is localized, or None if none is."""

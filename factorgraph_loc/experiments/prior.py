@@ -7,8 +7,10 @@ import math
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.estimators.base import PosePrior, SpacePose
+from factorgraph_loc.estimators.space_pose import planar_estimate
 from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory3 import Trajectory3
 
 # of a start read from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
@@ -31,7 +33,8 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     Raises InputError if the log lacks what is asked for, or ``prior`` is none of these.
     """
     if prior is None:
-        prior = "log" if log.start is not None else "reference" if log.reference is not None else "unknown"
+        has_reference = log.reference is not None or log.reference3 is not None
+        prior = "log" if log.start is not None else "reference" if has_reference else "unknown"
     if prior == "unknown":
         return None, prior
     if prior == "log":
@@ -59,6 +62,8 @@ def first_odometry(log: Log) -> float:
 
 
 def _from_reference(log: Log) -> PosePrior:
+    if log.reference is None and log.reference3 is not None:
+        return _in_space(log.reference3)
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference to start from, expected a prior {EXPECTED}")
     start = first_odometry(log)
@@ -70,6 +75,14 @@ def _from_reference(log: Log) -> PosePrior:
     sigma = REFERENCE_HEADING_SIGMA if log.reference.has_heading else VAGUE_HEADING_SIGMA
     covariance = _covariance(REFERENCE_POSITION_SIGMA, sigma)
     return PosePrior(float(log.reference.t[after]), np.array(log.reference.poses[after]), covariance)
+
+
+def _in_space(reference: Trajectory3) -> PosePrior:
+    """The first pose of a robot that is not on a floor."""
+    covariance = np.diag(np.repeat(np.square((REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA)), 3))
+    pose = SpacePose(reference.positions[0], reference.rotations[0], covariance)
+    seen = planar_estimate(float(reference.t[0]), pose)
+    return PosePrior(seen.t, seen.pose, seen.covariance, pose)
 
 
 def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:

@@ -19,7 +19,7 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate, PosePrior, SpaceEstimator
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
@@ -27,6 +27,7 @@ from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
@@ -69,6 +70,11 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     world, unread = _readable(log, sensors)
     setup = registry.Setup(log.rig, world, sensors, np.random.default_rng(config.seed))
     estimator = registry.create(config.estimator, setup, settings)
+    if "odometry" not in log.streams and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
+        raise InputError(
+            f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
+            f"expected one of {', '.join(registry.IN_SPACE)}"
+        )
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
@@ -117,6 +123,8 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
             *_without_tags(log, config.estimator, estimator.diagnostics),
             *_never_localized(log, loop.estimates, final),
         ),
+        causal_space=_in_space(loop.estimates),
+        final_space=estimator.space_trajectory() if isinstance(estimator, SpaceEstimator) else None,
     )
 
 
@@ -218,8 +226,18 @@ class _Loop:
             raise RunFailedError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")
         # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
         self.estimates.append(
-            PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status)
+            PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
         )
+
+
+def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
+    """The poses in space of localized estimates; None where there is none."""
+    rows = [(e.t, e.space) for e in estimates if e.space is not None and e.status == "localized"]
+    if not rows:
+        return None
+    t, poses = zip(*rows, strict=True)
+    parts = (np.array([getattr(p, name) for p in poses]) for name in ("position", "rotation", "covariance"))
+    return Trajectory3(np.array(t), *parts)
 
 
 def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:

@@ -1,0 +1,328 @@
+"""The paper's EKF (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3), which is that of monoSLAM: Davison et al., 2007.
+
+The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world's frame and its
+turn rate w^R in its own; points that are not in the map follow. The error state has 12, as an orientation has three degrees of
+freedom. The camera sits on R by the rig's extrinsic, so R stands in for the paper's camera frame.
+
+Odometry is read before the prediction that uses it and replaces the constant-velocity noise of x, y and heading; height, roll and
+pitch stay near those of a robot on the floor. A motion measured in space (``twist``) replaces all six. Without either, velocity
+is constant up to impulses. Points of the map are looked for where they are expected (:mod:`.monoslam_search`); others come into
+the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.estimators.base import Learnt, LearntPoint, PoseEstimate, PosePrior, SpacePose
+from factorgraph_loc.estimators.filtering import Filter, FilterSettings
+from factorgraph_loc.estimators.landmarks import MapUse
+from factorgraph_loc.estimators.monoslam_map import counted, pruned, settled, with_point
+from factorgraph_loc.estimators.monoslam_sighting import Looker, Match
+from factorgraph_loc.estimators.monoslam_state import Eye, Innovation, MapPoint, SlamState, squared, widening
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.space_motion import (
+    PLANAR,
+    ROBOT,
+    UPRIGHT,
+    Origin,
+    RobotState,
+    Step,
+    TwistChain,
+    about_z,
+    constant_velocity,
+    measured,
+    on_the_floor,
+    planar,
+    standstill,
+)
+from factorgraph_loc.estimators.space_pose import planar_estimate, planar_trajectory
+from factorgraph_loc.measurements import BearingRange, CameraFrame, Measurement, PixelSightings, Twist
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.vision.consensus import CameraPose
+from factorgraph_loc.vision.relocalization import FLOATS, TILTS
+from factors import se2
+from factors.odometry import Increment
+from factors.reprojection import huber_weight
+from factors.se2 import Array
+
+SETTLED = 1e-3  # m, rad: a step of the iterated update that needs no further one
+HORIZON = 5.0  # s of measured motion that are kept
+VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s of the start
+LOST_AFTER = 5  # images in a row in which nothing is where it is expected
+VAGUE = 0.5  # m, rad: standard deviations beyond which a place is not known
+
+
+class MonoslamSettings(FilterSettings):
+    """``acceleration``, ``angular_acceleration``: standard deviations of the constant-velocity model, as published.
+
+    ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``. ``landmarks``: use of the map's points, as of
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``max_points``: in the state; ``per_image``: how many of them
+    are wanted in an image before new ones are taken in. ``iterations``: 1 is the published update, more linearise again.
+    ``smooth``: the final trajectory of a run in a known map is smoothed; with points in the state it is the causal one.
+    """
+
+    planar: bool = True
+    acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="m/s^2")] = 4.0
+    angular_acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="rad/s^2")] = 6.0
+    height_sigma: Annotated[float, Field(gt=0.0, le=1.0, description="m")] = 0.005
+    tilt_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad")] = 0.005
+    landmarks: MapUse = "known"
+    max_points: Annotated[int, Field(ge=1, le=1000)] = 100
+    per_image: Annotated[int, Field(ge=1, le=1000)] = 20
+    iterations: Annotated[int, Field(ge=1, le=20)] = 3
+
+
+@dataclass(frozen=True)
+class _Record:
+    """``step`` led here from the record before; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the
+    place was found in the map, whatever was before."""
+
+    t: float
+    step: Step
+    predicted: Array
+    robot: RobotState
+    covariance: Array
+    anew: bool = False
+
+
+class Monoslam(Filter):
+    """The filter; see the module."""
+
+    takes_pixels = True
+    _state: SlamState
+
+    def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
+        super().__init__(setup, settings)
+        self._settings = settings
+        self._looker = Looker(setup, self.diagnostics, settings.landmarks)
+        twist = setup.rig.twist if "twist" in setup.sensors else None
+        self._twists = None if twist is None else TwistChain(twist, HORIZON)
+        self._by_odometry = settings.planar and "odometry" in setup.sensors
+        self._step: Step | None = None
+        self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
+        # without a map nothing tells of the start: its uncertainty is kept out of the state, where it would shrink as the
+        # linearization moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        self._origin: Origin | None = None
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if isinstance(measurement, Twist) and self._twists is not None:
+            if not self._twists.add(measurement.t, measurement.v, measurement.w):
+                self.diagnostics.drop_late("twist")
+        else:
+            super().process(measurement)
+
+    def learnt(self) -> Learnt:
+        """Points in the state, as seen from above; those whose depth is unknown are left out."""
+        points = {}
+        if self._state is not None:
+            for point, start in zip(self._state.points, self._state.starts().tolist(), strict=True):
+                if not point.ray:
+                    part = slice(ROBOT + start, ROBOT + start + 3)
+                    position, spread = self._state.values[start : start + 3], self._state.covariance[part, part]
+                    if self._origin is not None:
+                        spread = spread + self._origin.of_point(position)
+                    points[point.name] = LearntPoint(position[:2], spread[:2, :2])
+        return Learnt(landmarks=points)
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past, seen from above; see :meth:`space_trajectory`."""
+        return planar_trajectory(self.space_trajectory())
+
+    def space_trajectory(self) -> Trajectory3:
+        """The poses in space at the stamps of the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or with
+        ``smooth`` off, the causal ones."""
+        records: list[_Record] = self._records
+        smooth = self._smooth and self._settings.landmarks == "known"
+        newest = records[-1]
+        robots, covariances = [newest.robot], [newest.covariance]
+        for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
+            robot, covariance = here.robot, here.covariance
+            if smooth and not after.anew:
+                robot, covariance = _smoothed(here, after, robots[-1], covariances[-1])
+            robots.append(robot)
+            covariances.append(covariance)
+        ticks = np.unique(np.array(self._ticks))
+        rows = np.searchsorted([r.t for r in records], ticks, side="right") - 1
+        chosen = [(robots[-1 - i], covariances[-1 - i]) for i in rows.tolist()]
+        return Trajectory3(
+            ticks,
+            np.array([r.position for r, _ in chosen]).reshape(-1, 3),
+            np.array([r.rotation for r, _ in chosen]).reshape(-1, 3, 3),
+            np.array([self._spread(r, c) for r, c in chosen]).reshape(-1, 6, 6),
+        )
+
+    def _start(self, prior: PosePrior) -> SlamState:
+        s = self._settings
+        covariance = _starting()
+        if prior.space is not None:
+            position, rotation = prior.space.position, prior.space.rotation
+            covariance[:6, :6] = prior.space.covariance
+        else:
+            position, rotation = np.array((*prior.pose[:2], 0.0)), about_z(float(prior.pose[2]))
+            covariance[np.ix_(PLANAR, PLANAR)] = se2.world_to_body(prior.pose, prior.covariance)
+            covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
+        if s.landmarks == "unknown":
+            free = PLANAR if s.planar else list(range(6))
+            spread = np.zeros((6, 6))
+            spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
+            self._origin = Origin(robot, spread)
+            covariance[free] = covariance[:, free] = 0.0
+        return SlamState(robot, covariance)
+
+    def _predict(self, increment: Increment) -> None:
+        s, robot, dt = self._settings, self._state.robot, increment.duration
+        if self._twists is not None:
+            step = measured(robot, self._twists.between(self._t, self._t + dt), dt)
+        elif self._by_odometry:
+            step = measured(robot, planar(increment), dt)
+        else:
+            free = np.ones(3)
+            impulse, turning = s.acceleration * dt * free, s.angular_acceleration * dt * free
+            if s.planar:
+                impulse[2] = turning[0] = turning[1] = 0.0
+            step = constant_velocity(robot, dt, impulse, turning)
+        if s.planar:
+            step = on_the_floor(step, dt, s.height_sigma, s.tilt_sigma)
+        self._step = step
+        self._state = self._state.moved(step)
+        self._predicted = self._state.covariance[:ROBOT, :ROBOT]
+
+    def _update(self, m: BearingRange) -> None:
+        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+
+    def _look(self, m: PixelSightings | CameraFrame) -> None:
+        eye = self._looker.eye(m)
+        if eye is None:
+            self.diagnostics.ignore("camera", len(m.pixels))
+            return
+        match = self._looker.match(m, self._state, eye)
+        state, self._anew = self._relocated(m, self._state, eye, match)
+        if len(match.pixels) and not self._anew and not self._vague(state):
+            state = self._corrected(m, state, eye, match)
+        if not self._anew and self._settings.landmarks != "known":
+            state = self._managed(m, state, eye, match)
+        self._state = state
+
+    def _corrected(self, m: PixelSightings | CameraFrame, prior: SlamState, eye: Eye, match: Match) -> SlamState:
+        """The Kalman update, iterated; pixels far off have their noise widened, then are weighted by Huber's loss."""
+        points, spreads = match.points, match.spreads
+        zero = np.zeros(len(prior.covariance))
+        sights = eye.all(prior, match.mapped, points, spreads)
+        innovation = Innovation.of(sights, prior.covariance)
+        residual = match.pixels - sights.pixels
+        noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
+        self._report(m, residual, innovation, sights.noise)
+        delta, root, spread = zero, np.empty(0), np.empty(0)
+        for i in range(self._settings.iterations):
+            if i:
+                moved = prior.plus(delta, prior.covariance)
+                sights = eye.all(moved, match.mapped, points, spreads)
+                innovation = Innovation.of(sights, prior.covariance)
+                residual = match.pixels - sights.pixels
+                weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
+                noise = sights.noise / weight[:, None, None]
+            root, spread = innovation.gain(noise)
+            whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
+            before, delta = delta, spread.T @ whitened
+            if np.abs((delta - before)[:6]).max() < SETTLED:
+                break
+        return prior.plus(delta, prior.covariance - spread.T @ spread)
+
+    def _report(self, m: PixelSightings | CameraFrame, residual: Array, innovation: Innovation, noise: Array) -> None:
+        sensor = "camera_right" if isinstance(m, PixelSightings) and m.right else "camera"
+        root, _ = innovation.gain(noise)
+        whitened = np.linalg.solve(root, residual.ravel())
+        self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
+        for i, name in enumerate("uv"):
+            self.diagnostics.residuals.setdefault(f"{sensor}.{name}", []).extend(residual[:, i].tolist())
+
+    def _relocated(
+        self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match
+    ) -> tuple[SlamState, bool]:
+        """Where nothing is found where it is expected, image after image, or where the pose is hardly known, the place is looked
+        for in the whole map; whether it was found. Points in the state are given up with the old place."""
+        lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
+        camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
+        found = None if camera is None else self._standing(camera, eye)
+        if found is None:
+            return replace(state, lost=lost), False
+        self.diagnostics.events.append((m.t, "camera: found its place in the map"))
+        return found, True
+
+    def _vague(self, state: SlamState) -> bool:
+        """Whether the place in a known map is so little known that nothing can be linearised there."""
+        return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
+
+    def _standing(self, camera: CameraPose, eye: Eye) -> SlamState | None:
+        """The state of a robot whose ``camera`` was found; None if it would float or tilt on a floor."""
+        s, model = self._settings, eye.model
+        rotation = camera.rotation @ model.rotation.T
+        position = camera.position - rotation @ model.position
+        robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
+        covariance = _starting()
+        back = np.linalg.inv(eye.lift)
+        covariance[:6, :6] = back @ camera.covariance @ back.T
+        if s.planar:
+            if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
+                return None
+            covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        return SlamState(robot, covariance)
+
+    def _managed(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match) -> SlamState:
+        """Points counted, deleted, made x, y, z, and taken in where there are too few."""
+        state = counted(state, match.expected, frozenset(match.mapped), m.t)
+        state, failed = pruned(state, self._settings.max_points)
+        if failed:
+            self.diagnostics.reject("camera: points that were not found again", failed)
+        state = settled(state, eye)
+        room = min(self._settings.per_image - len(match.mapped), self._settings.max_points - len(state.points))
+        frame = m if isinstance(m, CameraFrame) else None
+        for row in self._looker.new(m, state, eye, match, state.tracks)[: max(0, room)]:
+            name = m.points[row] if isinstance(m, PixelSightings) else f"met{state.met}"
+            descriptor = None if frame is None else frame.descriptors[row]
+            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
+            state = replace(grown, met=state.met + 1)
+        tracks = frozenset() if frame is None else frozenset(frame.tracks.tolist())
+        return replace(state, tracks=tracks)
+
+    def _estimate(self) -> PoseEstimate:
+        robot = self._state.robot
+        spread = self._spread(robot, self._state.covariance)
+        return planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
+
+    def _spread(self, robot: RobotState, covariance: Array) -> Array:
+        """The covariance (6, 6) of a pose, that of the start included."""
+        own = covariance[:6, :6]
+        return own if self._origin is None else own + self._origin.of_pose(robot)
+
+    def _record(self) -> _Record:
+        s = self._state
+        step, predicted = self._step or standstill(s.robot), self._predicted
+        if self._step is None:  # a second measurement of the same time
+            predicted = self._records[-1].covariance if self._records else s.covariance[:ROBOT, :ROBOT]
+            step = standstill(self._records[-1].robot if self._records else s.robot)
+        self._step, anew, self._anew = None, self._anew, False
+        return _Record(self._t, step, predicted.copy(), s.robot, s.covariance[:ROBOT, :ROBOT].copy(), anew)
+
+
+def _starting() -> Array:
+    """The covariance (12, 12) of a start, without that of the pose."""
+    return np.diag(np.square([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3))
+
+
+def _smoothed(here: _Record, after: _Record, robot: RobotState, covariance: Array) -> tuple[RobotState, Array]:
+    """The robot of a record given what came later: ``robot`` and ``covariance`` (12, 12) are the smoothed ones of ``after``."""
+    carried = after.step.transition @ here.covariance
+    # what is not known apart before the step (a velocity that was measured) has no inverse
+    gain = (np.linalg.pinv(after.predicted, rcond=1e-12, hermitian=True) @ carried).T
+    smoothed = here.covariance + gain @ (covariance - after.predicted) @ gain.T
+    return here.robot.plus(gain @ robot.minus(after.step.robot)), 0.5 * (smoothed + smoothed.T)

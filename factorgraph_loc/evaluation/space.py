@@ -1,0 +1,107 @@
+"""How far poses in space are from the reference, whether their covariances say so, and where known points are seen from them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
+from factorgraph_loc.log import Log, SightingStream
+from factorgraph_loc.trajectory import Integers
+from factorgraph_loc.trajectory3 import Trajectory3
+from factors.reprojection import CameraModel, linearize_in_space
+from factors.se2 import Array
+
+DOF = 6
+CONFIDENCE = 0.95
+FIGURES = (
+    "space_position_rmse",
+    "space_position_max",
+    "space_rotation_rmse",
+    "space_anees",
+    "space_coverage_95",
+    "space_scored",
+)
+
+
+def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None) -> dict[str, Any]:
+    """:data:`FIGURES` of a trajectory in space against the reference, without alignment; all None without either.
+
+    ``space_position_*`` [m]; ``space_rotation_rmse`` [rad]: of the angle between estimated and true orientation. ``space_anees``:
+    mean squared error of the pose in units of its covariance, ideally 6; ``space_coverage_95``: share of the times at which that
+    is below the 95 % quantile. ``space_scored``: how many poses have a reference.
+    """
+    figures: dict[str, Any] = dict.fromkeys(FIGURES)
+    if found is None or reference is None or not len(found):
+        return figures
+    after = np.searchsorted(reference.t, found.t).clip(1, len(reference) - 1)
+    inside = (found.t >= reference.t[0]) & (found.t <= reference.t[-1])
+    near = np.minimum(found.t - reference.t[after - 1], reference.t[after] - found.t) <= MAX_REFERENCE_GAP
+    rows = np.flatnonzero(inside & near)
+    if not len(rows):
+        return figures | {"space_scored": 0}
+    errors = pose_errors(_rows(found, rows), reference.at(found.t[rows]))
+    distance = np.linalg.norm(errors[:, 3:], axis=1)
+    figures["space_position_rmse"], figures["space_position_max"] = rms(distance), float(distance.max())
+    figures["space_rotation_rmse"] = rms(np.linalg.norm(errors[:, :3], axis=1))
+    figures["space_scored"] = len(rows)
+    if found.covariances is not None:
+        spread = found.covariances[rows]
+        good = np.linalg.eigvalsh(spread)[:, 0] > 0.0
+        if good.any():
+            nees = np.einsum("ni,ni->n", errors[good], np.linalg.solve(spread[good], errors[good, :, None])[..., 0])
+            figures["space_anees"] = float(nees.mean())
+            figures["space_coverage_95"] = float(np.mean(nees < chi2.ppf(CONFIDENCE, DOF)))
+    return figures
+
+
+def pose_errors(found: Trajectory3, truth: Trajectory3) -> Array:
+    """The perturbations (N, 6), turn first, then shift, in the estimate's frame, that lead from estimated to true poses at the same
+    times."""
+    back = found.rotations.transpose(0, 2, 1)
+    turns = Rotation.from_matrix(back @ truth.rotations).as_rotvec()
+    return np.column_stack((turns, np.einsum("nij,nj->ni", back, truth.positions - found.positions)))
+
+
+def reprojection_residuals(found: Trajectory3, log: Log, sensor: str = "sightings") -> Array:
+    """Where the points of the map that a camera names are seen, less where they should be from the trajectory (K, 2) [px].
+
+    ``sensor``: ``sightings`` or ``sightings_right``. Points that the map lacks, and sightings before or after the trajectory, are
+    left out.
+    """
+    stream = log.streams[sensor]
+    settings = log.rig.camera if sensor == "sightings" else log.rig.camera_right
+    assert isinstance(stream, SightingStream)
+    assert settings is not None
+    assert log.world.points is not None
+    model, points, t = settings.model(), log.world.points, stream.t + settings.time_offset
+    known = np.array([name in points.index for name in stream.point], dtype=bool)
+    rows = np.flatnonzero(known & (t >= found.t[0]) & (t <= found.t[-1]))
+    times, which = np.unique(t[rows], return_inverse=True)
+    poses = found.at(times)
+    out = np.empty((len(rows), 2))
+    for k in range(len(times)):
+        here = np.flatnonzero(which == k)
+        seen = points.positions[[points.index[stream.point[i]] for i in rows[here].tolist()]]
+        out[here] = -_pixels(model, poses.positions[k], poses.rotations[k], seen)
+    return out + np.column_stack((stream.u[rows], stream.v[rows]))
+
+
+def spread_of(residuals: Array) -> dict[str, float]:
+    """Median absolute value and root mean square [px] of residuals (K, 2), by coordinate."""
+    figures = {}
+    for i, axis in enumerate("uv"):
+        figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
+        figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
+    return figures
+
+
+def _pixels(model: CameraModel, position: Array, rotation: Array, points: Array) -> Array:
+    return linearize_in_space(model, position + rotation @ model.position, rotation @ model.rotation, points)[0]
+
+
+def _rows(found: Trajectory3, rows: Integers) -> Trajectory3:
+    return Trajectory3(found.t[rows], found.positions[rows], found.rotations[rows])

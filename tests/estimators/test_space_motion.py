@@ -1,0 +1,109 @@
+"""Motion in space: transitions against numerical ones, and what is measured against what is known."""
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators import space_motion
+from factorgraph_loc.estimators.space_motion import Displacement, Origin, RobotState, TwistChain, exp
+from factorgraph_loc.rig import TwistSettings
+from factors.odometry import Increment
+
+ROBOT = RobotState(
+    np.array((1.0, -2.0, 0.3)), exp(np.array((0.2, -0.1, 0.7))), np.array((0.3, 0.1, -0.2)), np.array((0.5, -0.4, 0.6))
+)
+LEVEL = RobotState(
+    np.array((1.0, -2.0, 0.0)), exp(np.array((0.0, 0.0, 0.7))), np.array((0.3, 0.1, 0.0)), np.array((0.0, 0.0, 0.6))
+)
+MOTION = Displacement(exp(np.array((0.1, -0.2, 0.3))), np.array((0.2, 0.1, -0.1)), 1e-4 * np.eye(6))
+DT = 0.1
+NOTHING = np.zeros(3)
+
+
+def numerical(f, at):
+    step = 1e-6
+    reference = f(at)
+    columns = [
+        (f(at.plus(step * e)).minus(reference) - f(at.plus(-step * e)).minus(reference)) / (2 * step)
+        for e in np.eye(12)
+    ]
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        lambda r: space_motion.constant_velocity(r, DT, NOTHING, NOTHING),
+        lambda r: space_motion.measured(r, MOTION, DT),
+    ],
+    ids=["constant velocity", "measured"],
+)
+def test_the_error_is_carried_as_the_state_moves(step):
+    np.testing.assert_allclose(step(ROBOT).transition, numerical(lambda r: step(r).robot, ROBOT), atol=1e-6)
+
+
+def test_the_floor_carries_the_error_of_a_level_robot_as_stated():
+    def step(robot):
+        return space_motion.on_the_floor(space_motion.measured(robot, MOTION_ON_FLOOR, DT), DT, 0.01, 0.01)
+
+    np.testing.assert_allclose(step(LEVEL).transition, numerical(lambda r: step(r).robot, LEVEL), atol=2e-6)
+
+
+MOTION_ON_FLOOR = space_motion.planar(Increment(np.array((0.1, 0.02, 0.05)), np.diag((1e-4, 2e-4, 3e-4)), DT))
+
+
+def test_odometry_replaces_the_noise_of_what_it_measures_and_the_floor_holds_the_rest():
+    """After long at rest with perfect odometry, height and tilt have the floor's deviations, and nothing else is uncertain."""
+    still = space_motion.planar(Increment(np.zeros(3), np.zeros((3, 3)), DT))
+    robot, covariance = LEVEL, np.zeros((12, 12))
+    for _ in range(100):
+        step = space_motion.on_the_floor(space_motion.measured(robot, still, DT), DT, 0.02, 0.03)
+        robot, covariance = step.robot, step.transition @ covariance @ step.transition.T + step.noise
+    np.testing.assert_allclose(np.diag(covariance)[:6], (0.03**2, 0.03**2, 0, 0, 0, 0.02**2), atol=1e-9)
+    moved = space_motion.measured(LEVEL, MOTION_ON_FLOOR, DT)
+    np.testing.assert_allclose(np.diag(moved.noise)[:6], (0, 0, 3e-4, 1e-4, 2e-4, 0), atol=1e-12)
+
+
+def test_impulses_are_those_of_the_published_model():
+    noise = space_motion.constant_velocity(ROBOT, DT, np.full(3, 4.0 * DT), np.full(3, 6.0 * DT)).noise
+    np.testing.assert_allclose(np.diag(noise)[6:], [(4.0 * DT) ** 2] * 3 + [(6.0 * DT) ** 2] * 3)
+    # the shift is that of the impulse held over the step
+    np.testing.assert_allclose(noise[3:6, 3:6], (4.0 * DT * DT) ** 2 * np.eye(3), atol=1e-12)
+
+
+def chain(rows):
+    made = TwistChain(TwistSettings(shift=(0.1, 0.2, 0.3), turn=(0.01, 0.02, 0.03)))
+    for t, v, w in rows:
+        assert made.add(t, np.array(v), np.array(w))
+    return made
+
+
+def test_a_twist_holds_until_the_next_row():
+    made = chain([(0.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), (0.5, (0.0, 2.0, 0.0), (0.0, 0.0, 0.0))])
+    found = made.between(0.25, 0.75)
+    np.testing.assert_allclose(found.shift, (0.25, 0.5, 0.0))
+    np.testing.assert_allclose(np.diag(found.covariance), 0.5 * np.square((0.01, 0.02, 0.03, 0.1, 0.2, 0.3)), rtol=0.2)
+
+
+def test_motion_in_pieces_is_that_in_one():
+    made = chain([(0.0, (1.0, 0.2, 0.1), (0.3, 0.2, 1.0))])
+    whole, first, second = made.between(0.0, 0.2), made.between(0.0, 0.1), made.between(0.1, 0.2)
+    np.testing.assert_allclose(whole.rotation, first.rotation @ second.rotation, atol=1e-9)
+    np.testing.assert_allclose(whole.shift, first.shift + first.rotation @ second.shift, atol=1e-3)
+
+
+def test_motion_that_nobody_measured_is_unknown():
+    made = chain([(0.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    assert not made.add(-0.1, np.zeros(3), np.zeros(3))
+    found = made.between(3.0, 4.0)
+    np.testing.assert_array_equal(found.shift, np.zeros(3))
+    np.testing.assert_allclose(np.diag(found.covariance), space_motion.UNKNOWN**2)
+
+
+def test_the_start_spreads_over_later_poses_and_points():
+    origin = Origin(LEVEL, np.diag((0.0, 0.0, 0.1, 0.2, 0.2, 0.0)) ** 2)
+    later = RobotState(LEVEL.position + np.array((3.0, 4.0, 0.0)), exp(np.array((0.0, 0.0, -1.0))), NOTHING, NOTHING)
+    # a heading error of 0.1 rad moves what is 5 m away by 0.5 m, across
+    assert np.trace(origin.of_pose(later)[3:, 3:]) == pytest.approx(0.5**2 + 2 * 0.2**2)
+    assert np.trace(origin.of_point(later.position)) == pytest.approx(0.5**2 + 2 * 0.2**2)
+    across = np.array((-0.8, 0.6, 0.0))
+    assert across @ origin.of_point(later.position) @ across == pytest.approx(0.5**2 + 0.2**2)
