@@ -261,7 +261,7 @@ class MeasuringGraph(KeyframeGraph):
         addition.nodes.append(node)
         if guess is None:
             return None
-        update = pixel_update(factor, predicted)
+        update = pixel_update(factor, *guess, *constants, *(self._spreads[key] for key in shared))
         self._points.report(m.t, factor, update)
         guess = se2.compose(guess[0], se2.exp(update.delta[:3])), update.covariance[:3, :3]
         return self._spot_others(keyframe, m, guess, addition)

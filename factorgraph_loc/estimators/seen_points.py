@@ -11,7 +11,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.landmarks import MapUse
 from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.robust_update import Update, robust_update
+from factorgraph_loc.estimators.robust_update import Update, robust_update, update_state
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Estimated
@@ -197,9 +197,26 @@ class KnownPoints:
         return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
-def pixel_update(factor: ReprojectionFactor, pose: Array, covariance: Array) -> Update:
-    """Kalman update of ``pose`` (3,), with body-frame ``covariance`` (3, 3), by a factor on it alone, up to the optimum."""
-    return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
+def pixel_update(
+    factor: ReprojectionFactor,
+    pose: Array,
+    covariance: Array,
+    constants: Array | None = None,
+    spread: Array | None = None,
+) -> Update:
+    """Kalman update, up to the optimum, of ``pose`` (3,) with body-frame ``covariance`` (3, 3), then of the changes of the camera's
+    constants (P,), with their ``spread`` (P, P), where they are estimated."""
+    if constants is None or spread is None:
+        return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
+    size = 3 + len(constants)
+    both = np.zeros((size, size))
+    both[:3, :3], both[3:, 3:] = covariance, spread
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), constants + delta[3:]])
+        return residual, np.concatenate(blocks, axis=2)
+
+    return update_state(linearize, both, factor.weight, ITERATIONS, factor.dof(), SETTLED)
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:

@@ -36,13 +36,24 @@ def room(count=160, seed=0):
     return PointMap.of(tuple(f"p{i}" for i in range(count)), np.column_stack((x, y, height)))
 
 
-def drive(seconds, rng):
-    """A circle of 1.5 m radius at 0.3 m/s; the robot slips off what the wheels report by the noise of the rig."""
+def circle(t):
+    """1.5 m radius at 0.3 m/s."""
+    return np.full(len(t), 0.3), np.full(len(t), 0.2)
+
+
+def weave(t):
+    """The same circle, turning now more and now less, now faster and now slower."""
+    return 0.3 + 0.15 * np.sin(0.9 * t), 0.2 + 0.5 * np.sin(1.3 * t)
+
+
+def drive(seconds, rng, speeds=circle):
+    """The robot slips off what the wheels report by the noise of the rig."""
     t = np.arange(round(seconds / ODOMETRY_STEP) + 1) * ODOMETRY_STEP
-    v, w = np.full(len(t), 0.3), np.full(len(t), 0.2)
+    v, w = speeds(t)
     reported = se2.exp(np.column_stack((v, 0.0 * v, w)) * ODOMETRY_STEP)
-    growth = (NOISE.along, NOISE.lateral, NOISE.heading)
-    sigma = np.sqrt([g.model().variance(0.3 * ODOMETRY_STEP, 0.2 * ODOMETRY_STEP, ODOMETRY_STEP) for g in growth])
+    growth = [g.model() for g in (NOISE.along, NOISE.lateral, NOISE.heading)]
+    ways, turns = np.abs(v) * ODOMETRY_STEP, np.abs(w) * ODOMETRY_STEP
+    sigma = np.sqrt([[g.variance(d, r, ODOMETRY_STEP) for g in growth] for d, r in zip(ways, turns, strict=True)])
     steps = se2.compose(reported, se2.exp(rng.standard_normal((len(t), 3)) * sigma))
     poses = np.zeros((len(t), 3))
     poses[0] = (1.0, -1.0, 0.0)
@@ -66,10 +77,10 @@ def sightings(truth, points, t, rng, camera=CAMERA, limit=20):
     return SightingStream(np.array(stamps), names, u, v)
 
 
-def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA):
+def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA, speeds=circle):
     """A log; ``camera``: as it is in truth, which the log's rig need not know."""
     rng = np.random.default_rng(seed)
-    odometry, truth = drive(seconds, rng)
+    odometry, truth = drive(seconds, rng, speeds)
     points = room()
     stream = sightings(truth, points, np.arange(0.13, seconds, 1.0 / rate), rng, camera, limit)
     return Log(
@@ -79,6 +90,16 @@ def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA):
         streams={"odometry": odometry, "sightings": stream},
         reference=truth,
     )
+
+
+def with_sightings(log, keep=None, **columns):
+    """The log with other columns of its sightings, or without some rows."""
+    stream = replace(log.streams["sightings"], **columns)
+    if keep is not None:
+        rows = np.flatnonzero(keep)
+        names = [stream.point[i] for i in rows]
+        stream = SightingStream(stream.t[rows], names, stream.u[rows], stream.v[rows])
+    return replace(log, streams={**log.streams, "sightings": stream})
 
 
 def with_camera(log, **changes):
