@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -50,6 +50,27 @@ class Bundle:
     point_covariances: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Those of the ``points`` (M,) of which a map knows the ``positions`` (M, 3) [m] with ``covariances`` (M, 3, 3)."""
+
+    points: Integers
+    positions: Array
+    covariances: Array
+
+    def kept(self, left: Integers) -> Known:
+        """What is known of the points ``left`` (T',), ascending, by their new numbers."""
+        rows = np.isin(self.points, left)
+        return Known(np.searchsorted(left, self.points[rows]), self.positions[rows], self.covariances[rows])
+
+
+class Motion(Protocol):
+    """What is known of the motion from camera to camera."""
+
+    def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors on the poses ``X(0)``, ``X(1)``, ..."""
+
+
 def adjust(
     model: CameraModel,
     cameras: Cameras,
@@ -57,23 +78,34 @@ def adjust(
     tracks: Tracks,
     points: Array,
     *,
+    known: Known | None = None,
+    motion: Motion | None = None,
     focal: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
     """Adjust ``points`` (T, 3) and the ``cameras``, whose poses are known with ``covariances`` (F, 6, 6), see :class:`Bundle`.
 
+    ``known``: what is known of some of the points, ``motion``: of how the camera moves; the covariances do not tell of the latter.
     ``focal``: the focal lengths are not known. RuntimeError where the graph cannot be solved.
     """
-    start, old = cameras, np.arange(len(points))
-    priors = [gtsam.noiseModel.Gaussian.Covariance(covariance) for covariance in covariances]
+    known = known or Known(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    old = np.arange(len(points))
+    fixed = gtsam.NonlinearFactorGraph()
+    for i, covariance in enumerate(covariances):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        fixed.add(gtsam.PriorFactorPose3(X(i), pose3(cameras.positions[i], cameras.rotations[i]), noise))
+    if motion is not None:
+        motion.add_to(fixed)
     for i in range(ROUNDS):
-        model, cameras, points = _optimized(model, start, priors, cameras, tracks, points, focal=focal)
-        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER)
+        model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, focal=focal)
+        least = np.full(len(points), 2)
+        least[known.points] = 1
+        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER, least)
         progress((i + 1) / ROUNDS)
         if right.all() and i > 0:
             break
         tracks, left = tracks.kept(right)
-        points, old = points[left], old[left]
+        points, old, known = points[left], old[left], known.kept(left)
     errors = reproject(model, cameras, points, tracks)[0]
     of_cameras, of_points = marginals(
         model, cameras, np.asarray(np.linalg.inv(covariances), dtype=float), tracks, points
@@ -81,16 +113,24 @@ def adjust(
     return Bundle(model, cameras, tracks, points, old, errors, of_cameras, of_points)
 
 
-def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Which observations (N,) are at most ``limit`` standard deviations off, of points that then are seen twice or more."""
+def agreeing(
+    model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float, least: Integers
+) -> Truths:
+    """Which observations (N,) are at most ``limit`` standard deviations off, of points that then still are seen as often as
+    ``least`` (T,) says."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     seen = np.bincount(tracks.track[right], minlength=tracks.count)
-    return np.asarray(right & (seen[tracks.track] >= 2))
+    return np.asarray(right & (seen >= least)[tracks.track])
 
 
 def marginals(
-    model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
+    model: CameraModel,
+    cameras: Cameras,
+    information: Array,
+    tracks: Tracks,
+    points: Array,
+    known: Known | None = None,
 ) -> tuple[Array, Array]:
     """Marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised here; ``information`` (F, 6, 6): of the
     cameras' priors."""
@@ -99,6 +139,8 @@ def marginals(
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
     of_points = np.zeros((total, 3, 3))
     np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
+    if known is not None:
+        of_points[known.points] += np.linalg.inv(known.covariances)
     of_cameras = np.array(information)
     np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))
     inverse = np.linalg.inv(of_points)
@@ -131,8 +173,8 @@ def robust_noise(model: CameraModel) -> Any:
 
 def _optimized(
     model: CameraModel,
-    start: Cameras,
-    priors: list[Any],
+    fixed: gtsam.NonlinearFactorGraph,
+    known: Known,
     cameras: Cameras,
     tracks: Tracks,
     points: Array,
@@ -140,12 +182,14 @@ def _optimized(
     focal: bool,
 ) -> tuple[CameraModel, Cameras, Array]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.push_back(fixed)
     calibration = model.calibration()
-    for i, prior in enumerate(priors):
-        graph.add(gtsam.PriorFactorPose3(X(i), pose3(start.positions[i], start.rotations[i]), prior))
+    for i in range(len(cameras)):
         values.insert(X(i), pose3(cameras.positions[i], cameras.rotations[i]))
     for k, point in enumerate(points):
         values.insert(L(k), point)
+    for k, position, covariance in zip(known.points.tolist(), known.positions, known.covariances, strict=True):
+        graph.add(gtsam.PriorFactorPoint3(L(k), position, gtsam.noiseModel.Gaussian.Covariance(covariance)))
     noise = robust_noise(model)
     rows = zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.pixels, strict=True)
     if focal:

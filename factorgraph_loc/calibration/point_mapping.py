@@ -8,7 +8,7 @@ from a few sides.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -105,7 +105,8 @@ def map_points(
         progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
     tracks = chained(posed.frames, matches)
     found = triangulate(model, posed.cameras, tracks)
-    good = found.good(tracks, model, settings.parallax)
+    # the poses' errors are in the rays' too, until all is adjusted
+    good = found.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
     total, (seen, old) = tracks.count, tracks.kept(good[tracks.track])

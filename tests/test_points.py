@@ -1,0 +1,115 @@
+"""Maps of points on disk: what is written comes back, and damaged files are told by a line."""
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.points import PointMap, read_points, write_points
+
+
+def a_map(count, views, feature="sift", seed=0):
+    """A map of ``count`` points of which those in ``views`` are seen, once for each time they stand there."""
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((count, 3, 3))
+    bits = feature == "orb"
+    descriptors = (
+        rng.integers(0, 256, (len(views), 32)).astype(np.uint8)
+        if bits
+        else rng.standard_normal((len(views), 37)).astype(np.float32)
+    )
+    return PointMap(
+        tuple(f"p{i}" for i in range(count)),
+        rng.standard_normal((count, 3)),
+        root @ root.transpose(0, 2, 1),
+        feature,
+        np.array(sorted(views), dtype=np.int64),
+        descriptors,
+        rng.standard_normal((len(views), 3)),
+        rng.uniform(1.0, 9.0, len(views)),
+    )
+
+
+def assert_same(found, points):
+    """Equal, covariances to what symmetry rounds."""
+    for name in ("names", "feature"):
+        assert getattr(found, name) == getattr(points, name)
+    for name in ("positions", "owners", "descriptors", "seen_from", "sizes"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(points, name))
+    np.testing.assert_allclose(found.covariances, points.covariances, rtol=1e-14)
+    assert found.descriptors.dtype == points.descriptors.dtype
+
+
+@given(
+    st.integers(1, 6).flatmap(lambda n: st.tuples(st.just(n), st.lists(st.integers(0, n - 1), min_size=1, max_size=9))),
+    st.sampled_from(["sift", "orb", "colour"]),
+)
+def test_what_is_written_comes_back(tmp_path_factory, counts, feature):
+    points = a_map(*counts, feature)
+    path = tmp_path_factory.mktemp("maps") / "a.points.parquet"
+    write_points(points, path)
+    assert_same(read_points(path), points)
+
+
+def test_points_known_by_name_alone(tmp_path):
+    points = PointMap.of(("b", "a"), np.arange(6.0).reshape(2, 3))
+    write_points(points, tmp_path / "a.points.parquet")
+    found = read_points(tmp_path / "a.points.parquet")
+    assert found == points
+    assert found.index == {"b": 0, "a": 1}
+    assert len(found) == 2
+
+
+def test_maps_that_differ():
+    points = a_map(3, [0, 1, 1])
+    assert points == a_map(3, [0, 1, 1])
+    assert points != a_map(3, [0, 1, 1], seed=1)
+    assert points != "points"
+
+
+@pytest.fixture
+def written(tmp_path):
+    """``written(change)``: the path of a map whose table was changed."""
+
+    def write(change):
+        path = tmp_path / "a.points.parquet"
+        write_points(a_map(3, [0, 1, 1]), path)
+        change(pl.read_parquet(path)).write_parquet(path)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.drop("y"), "has no column y"),
+        (lambda t: t.drop("feature"), "has no column feature"),
+        (lambda t: t.drop("descriptor"), "has no column descriptor"),
+        (lambda t: t.drop("from_x"), "has no column from_x"),
+        (lambda t: t.with_columns(x=pl.lit("far")), "has no column x of numbers"),
+        (lambda t: t.with_columns(z=pl.lit(float("nan"))), "z is nan, expected a finite number"),
+        (lambda t: t.with_columns(feature=pl.Series(["sift", "orb", "orb", "orb"])), "kinds orb, sift"),
+        (lambda t: t.with_columns(descriptor=pl.Series([b"1234", b"12345678", b"1234", b"1234"])), "differ in their"),
+        (lambda t: t.with_columns(descriptor=pl.Series([b"12345"] * 4)), "differ in their length"),
+    ],
+)
+def test_damaged_tables(written, change, message):
+    path = written(change)
+    with pytest.raises(InputError) as caught:
+        read_points(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_no_tables(tmp_path):
+    path = tmp_path / "a.points.parquet"
+    with pytest.raises(InputError, match="is not a table of points"):
+        read_points(path)
+    write_points(a_map(3, [0, 1]), path)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match="is not a table of points"):
+        read_points(path)
