@@ -27,12 +27,14 @@ def cache_folder() -> Path:
 
 
 class FeatureCache:
-    """Contents by their keys, a file each, below ``folder``; together at most ``limit`` bytes once :meth:`trim` is called."""
+    """Contents by their keys, a file each, below ``folder``; together at most ``limit`` bytes once :meth:`trim` is called.
+
+    ``fault``: why nothing can be written, if so."""
 
     def __init__(self, folder: Path, limit: int = LIMIT) -> None:
         self._folder = folder / "features"
         self._limit = limit
-        self._writable = True
+        self.fault = ""
 
     def read(self, key: str) -> bytes | None:
         """What was written, and a mark that it was used now; None if it is not there or not as it was written."""
@@ -52,15 +54,15 @@ class FeatureCache:
 
     def write(self, key: str, content: bytes) -> None:
         """Keep ``content``, at once or not at all; where nothing can be written, nothing is."""
-        if not self._writable:
+        if self.fault:
             return
         path = self._path(key)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary:
                 temporary.write_bytes(_HEAD.pack(_MARK, zlib.crc32(content), len(content)) + content)
-        except OSError:
-            self._writable = False
+        except OSError as error:
+            self.fault = f"{self._folder}: cannot be written: {error.strerror}"
 
     def trim(self) -> None:
         """Remove what was not used for longest, until the rest is within the limit."""

@@ -85,23 +85,28 @@ def with_features(
             f"{log.name}: has images, but its rig {log.rig.name} has no [camera] that tells where they look"
         )
     camera = log.rig.camera.model()
-    images = _features(stream.file, settings, (camera.width, camera.height), progress or (lambda _: None))
+    kept = FeatureCache(cache_folder())
+    images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
     _require_calibrated(log, images, camera)
     found = [image.found or _nothing(settings) for image in images]
-    tracks = _tracks(stream, images, found, settings, camera)
+    tracks = _tracks(stream, images, found, settings, camera, kept)
     frames = [
         CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers)
         for t, f, numbers in zip(stream.t.tolist(), found, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
-    return replace(log, streams=streams), _doubts(log, images)
+    unkept = (f"features are not kept, {kept.fault}",) if kept.fault else ()
+    return replace(log, streams=streams), (*_doubts(log, images), *unkept)
 
 
 def _features(
-    files: Sequence[Path], settings: FrontendSettings, size: Size, progress: Callable[[float], None]
+    files: Sequence[Path],
+    settings: FrontendSettings,
+    size: Size,
+    kept: FeatureCache,
+    progress: Callable[[float], None],
 ) -> list[_Image]:
     """The features of N images, from the cache where they are there."""
-    kept = FeatureCache(cache_folder())
     about = f"{settings.feature} {settings.count} {size} {code_version(FEATURE_CODE)} "
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing are done outside of the interpreter
         images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
@@ -168,7 +173,12 @@ def _nothing(settings: FrontendSettings) -> Found:
 
 
 def _tracks(
-    stream: ImageStream, images: list[_Image], found: list[Found], settings: FrontendSettings, camera: CameraModel
+    stream: ImageStream,
+    images: list[_Image],
+    found: list[Found],
+    settings: FrontendSettings,
+    camera: CameraModel,
+    kept: FeatureCache,
 ) -> list[Integers]:
     """Numbers (K,) of each image's features, from the cache where they are there."""
     order = np.argsort(stream.t, kind="stable").tolist()
@@ -176,7 +186,6 @@ def _tracks(
     key = hashlib.sha256(
         (about + " ".join(images[i].key if images[i].found else "-" for i in order)).encode()
     ).hexdigest()
-    kept = FeatureCache(cache_folder())
     counts = [len(found[i].pixels) for i in order]
     stored = kept.read(key)
     if stored is not None and len(stored) == 4 * sum(counts):

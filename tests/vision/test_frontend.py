@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import FeatureStream, ImageStream, Log
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.vision import frontend
+from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.frontend import with_features
 from factorgraph_loc.world import World
@@ -155,8 +157,19 @@ def test_without_a_cache_it_works_as_well(log, tmp_path, monkeypatch):
     first, _ = frames(log)
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setenv("FGLOC_CACHE", str(tmp_path / "file"))
-    second, _ = frames(log)
+    second, (warning,) = frames(log)
     assert all(same(a, b) for a, b in zip(first, second, strict=True))
+    assert warning == f"features are not kept, {tmp_path / 'file' / 'features'}: cannot be written: Not a directory"
+
+
+def test_the_cache_does_not_grow_without_end(log, cache, monkeypatch):
+    frames(log)
+    kept = {path for path in cache.rglob("*") if path.is_file()}
+    size = sum(path.stat().st_size for path in kept)
+    monkeypatch.setattr(frontend, "FeatureCache", partial(FeatureCache, limit=size))
+    frames(log, FrontendSettings(feature="orb", count=90))
+    assert any(not path.exists() for path in kept)
+    assert sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) < 1.1 * size
 
 
 def test_processes_find_the_same(log, monkeypatch):
