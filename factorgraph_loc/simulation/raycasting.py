@@ -28,27 +28,29 @@ NEAREST = 1e-3  # m from a face's plane: a camera in it sees nothing of it
 # where the foot of the camera is on it, length, heights, the nearest point's distance in the plan, number in the scene,
 # and one over length and height
 NX, NY, AWAY, AX, AY, FOOT, LENGTH, BOTTOM, TOP, DISTANCE, FACE, PER_LENGTH, PER_HEIGHT = range(13)
-GROUND, CEILING, NOTHING = -1, -2, -3  # in place of a row of the table
+GROUND, CEILING, NOTHING, LID = -1, -2, -3, -4  # in place of a row of the table; lids count on downwards
 
 Ints = NDArray[np.int64]
+Place = tuple[
+    float, float, float, float, float, float
+]  # of a camera, height of the building, one over its width and depth
 
 
 class Surroundings(NamedTuple):
     """What can be seen from one place ``origin`` (3,): a ``table`` (M, 13) of faces, of which ``items[starts[b] : starts[b + 1]]``
-    may be met in the direction b; ``size`` (5,): width, depth and height of the building, and one over
-    the first two."""
+    may be met in the direction b; ``lids`` (B, 6) below the place, as of the scene; ``size`` (5,): width, depth and height of
+    the building, and one over the first two."""
 
     origin: Array
     table: Array
     starts: Ints
     items: Ints
+    lids: Array
     size: Array
 
 
 @numba.njit(cache=True, error_model="numpy")
-def surroundings(
-    faces: Array, bottoms: Array, tops: Array, closed: NDArray[np.bool_], origin: Array, size: Array
-) -> Surroundings:
+def surroundings(faces: Array, bottoms: Array, tops: Array, lids: Array, origin: Array, size: Array) -> Surroundings:
     """The faces that can be seen from ``origin`` (3,), for :func:`cast`."""
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))
@@ -59,8 +61,7 @@ def surroundings(
         length = math.hypot(x2 - x1, y2 - y1)
         ax, ay = (x2 - x1) / length, (y2 - y1) / length
         away = -(x1 * -ay + y1 * ax)
-        # the far sides of a box matter to a ray that came in through its top
-        if away < NEAREST and not (closed[i] and away < -NEAREST and origin[2] > tops[i]):
+        if away < NEAREST:
             continue
         foot = -(x1 * ax + y1 * ay)
         beyond = max(-foot, foot - length, 0.0)
@@ -69,8 +70,6 @@ def surroundings(
         row[BOTTOM], row[TOP], row[DISTANCE], row[FACE] = bottoms[i], tops[i], math.hypot(away, beyond), i
         row[PER_LENGTH], row[PER_HEIGHT] = 1.0 / length, 1.0 / (tops[i] - bottoms[i])
         right, left = _direction(x1, y1), _direction(x2, y2)
-        if away < 0.0:
-            right, left = left, right
         lows[m] = right - 1e-9
         highs[m] = left + 1e-9 + (BINS if left < right else 0.0)
         m += 1
@@ -86,18 +85,24 @@ def surroundings(
         for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
             items[used[b % BINS]] = k
             used[b % BINS] += 1
-    return Surroundings(origin, table[order], starts, items, size)
+    return Surroundings(origin, table[order], starts, items, lids[lids[:, 4] < origin[2]], size)
 
 
 @numba.njit(inline="always", error_model="numpy")
 def cast(
-    table: Array, starts: Ints, items: Ints, z0: float, top: float, dx: float, dy: float, dz: float
+    table: Array, starts: Ints, items: Ints, lids: Array, place: Place, dx: float, dy: float, dz: float
 ) -> tuple[int, float]:
-    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`, and how
-    far away in lengths of the ray."""
+    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`LID` or a lid's number less,
+    :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and how far away in lengths of the ray."""
     best, found = np.inf, NOTHING
+    x0, y0, z0, top, per_width, per_depth = place
     if dz < -1e-12:
         best, found = -z0 / dz, GROUND
+        for i in range(len(lids)):
+            t = (lids[i, 4] - z0) / dz
+            x, y = x0 + t * dx, y0 + t * dy
+            if t < best and lids[i, 0] <= x <= lids[i, 2] and lids[i, 1] <= y <= lids[i, 3]:
+                best, found = t, LID - i
     elif dz > 1e-12:
         best, found = (top - z0) / dz, CEILING
     flat = math.sqrt(dx * dx + dy * dy)
@@ -106,21 +111,23 @@ def cast(
         i = items[k]
         if table[i, DISTANCE] > best * flat:
             break
-        away = table[i, AWAY]
         towards = table[i, NX] * dx + table[i, NY] * dy
-        if towards * away >= 0.0:
+        if towards >= 0.0:
             continue
-        t = -away / towards
+        t = -table[i, AWAY] / towards
         s = table[i, FOOT] + t * (table[i, AX] * dx + table[i, AY] * dy)
         if s < -SLACK or s > table[i, LENGTH] + SLACK:
             continue
         z = z0 + t * dz
         if z > table[i, TOP] + SLACK or z < table[i, BOTTOM] - SLACK:
             continue
-        if away < 0.0:
-            t = (table[i, TOP] - z0) / dz
         if t < best:
             best, found = t, i
+    if CEILING <= found < 0:
+        # a camera outside of the building may look past it
+        x, y = (x0 + best * dx) * per_width, (y0 + best * dy) * per_depth
+        if not (-SLACK <= x <= 1.0 + SLACK and -SLACK <= y <= 1.0 + SLACK):
+            best, found = np.inf, NOTHING
     return found, best
 
 
@@ -128,9 +135,11 @@ def cast(
 def cast_all(around: Surroundings, rays: Array) -> Array:
     """Distances (K,) in lengths of ``rays`` (K, 3), infinite where nothing is met."""
     distance = np.empty(len(rays))
-    table, starts, items, z0, top = around.table, around.starts, around.items, around.origin[2], around.size[2]
+    table, starts, items, lids = around.table, around.starts, around.items, around.lids
+    origin, size = around.origin, around.size
+    place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
     for i in range(len(rays)):
-        _, distance[i] = cast(table, starts, items, z0, top, rays[i, 0], rays[i, 1], rays[i, 2])
+        _, distance[i] = cast(table, starts, items, lids, place, rays[i, 0], rays[i, 1], rays[i, 2])
     return distance
 
 
@@ -149,37 +158,36 @@ def expose(
     building; where two surfaces meet in a pixel, the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels.
     ``found`` (H, W): room to work in."""
     height, width = directions.shape[:2]
-    table, starts, items, origin, size = around.table, around.starts, around.items, around.origin, around.size
+    table, starts, items, lids = around.table, around.starts, around.items, around.lids
+    origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
     for i in range(height):
         for j in range(width):
             x, y = directions[i, j, 0], directions[i, j, 1]
             found[i, j], blue, green, red = _look(
-                table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
+                table, starts, items, lids, place, texels, layout, x, y, rotation, pixel_at_one
             )
             out[i, j, 0] += blue
             out[i, j, 1] += green
             out[i, j, 2] += red
-    quarter = np.float32(0.25)
     for i in range(height):
         for j in range(width):
             here = found[i, j]
             left, right, up, down = max(j - 1, 0), min(j + 1, width - 1), max(i - 1, 0), min(i + 1, height - 1)
             if found[i, left] == here == found[i, right] and found[up, j] == here == found[down, j]:
                 continue
-            x, y = directions[i, j, 0], directions[i, j, 1]
-            _, blue, green, red = _look(table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one)
-            out[i, j, 0] -= blue
-            out[i, j, 1] -= green
-            out[i, j, 2] -= red
-            for k in range(4):
-                a, b = (0.5 * (k % 2) - 0.25) / (right - left), (0.5 * (k // 2) - 0.25) / (down - up)
-                sx = x + a * (directions[i, right, 0] - directions[i, left, 0])
-                sy = y + b * (directions[down, j, 1] - directions[up, j, 1])
-                _, blue, green, red = _look(table, starts, items, place, texels, layout, sx, sy, rotation, pixel_at_one)
-                out[i, j, 0] += quarter * blue
-                out[i, j, 1] += quarter * green
-                out[i, j, 2] += quarter * red
+            across = (directions[i, right, 0] - directions[i, left, 0]) / (right - left)
+            along = (directions[down, j, 1] - directions[up, j, 1]) / (down - up)
+            for k in range(5):  # the one ray in the middle is taken away, four around it come in its place
+                a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
+                weight = np.float32(0.25) if k < 4 else np.float32(-1.0)
+                x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
+                _, blue, green, red = _look(
+                    table, starts, items, lids, place, texels, layout, x, y, rotation, pixel_at_one
+                )
+                out[i, j, 0] += weight * blue
+                out[i, j, 1] += weight * green
+                out[i, j, 2] += weight * red
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -187,7 +195,8 @@ def _look(
     table: Array,
     starts: Ints,
     items: Ints,
-    place: tuple[float, float, float, float, float, float],
+    lids: Array,
+    place: Place,
     texels: NDArray[np.uint8],
     layout: Ints,
     x: float,
@@ -196,11 +205,11 @@ def _look(
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
     """What is seen along (x, y, 1) in the camera's frame, as :func:`cast` has it, and its colour (blue, green, red) there."""
-    x0, y0, z0, top, per_width, per_depth = place
+    x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
     dz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-    found, depth = cast(table, starts, items, z0, top, dx, dy, dz)
+    found, depth = cast(table, starts, items, lids, place, dx, dy, dz)
     blue = green = red = np.float32(0.0)
     if found == NOTHING:
         return found, blue, green, red
@@ -212,6 +221,10 @@ def _look(
         u = 1.0 - s * table[found, PER_LENGTH]
         v = (table[found, TOP] - z0 - depth * dz) * table[found, PER_HEIGHT]
         slant = flat / abs(table[found, NX] * dx + table[found, NY] * dy)
+    elif found <= LID:
+        number, lid = int(lids[LID - found, 5]), lids[LID - found]
+        u, v = (x0 + depth * dx - lid[0]) / (lid[2] - lid[0]), (y0 + depth * dy - lid[1]) / (lid[3] - lid[1])
+        slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
     else:
         number = layout.shape[0] - (2 if found == GROUND else 1)
         u = (x0 + depth * dx) * per_width

@@ -103,7 +103,7 @@ class Renderer:
         scene = self.scene
         place = np.asarray(position, dtype=float)
         found: Surroundings = raycasting.surroundings(
-            scene.faces, scene.bottoms, scene.tops, scene.closed, place, self._size
+            scene.faces, scene.bottoms, scene.tops, scene.lids, place, self._size
         )
         return found
 

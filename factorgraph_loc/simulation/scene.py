@@ -30,8 +30,8 @@ LEVELS = 7  # of each texture, the first included
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """``faces`` (F, 4) [m]: segments whose left side is seen; ``bottoms`` and ``tops`` (F,) [m] of them; ``closed`` (F,): faces
-    of a box, on whose upper side at ``tops`` one may look down.
+    """``faces`` (F, 4) [m]: segments whose left side is seen; ``bottoms`` and ``tops`` (F,) [m] of them. ``lids``
+    (B, 6): upper sides of boxes, x1, y1, x2, y2, height [m], and the number of the face whose texture they have too.
 
     ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout``
     (F + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face to its
@@ -41,7 +41,7 @@ class Scene:
     faces: Array
     bottoms: Array
     tops: Array
-    closed: NDArray[np.bool_]
+    lids: Array
     width: float
     depth: float
     height: float
@@ -82,9 +82,9 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Sce
         yield textures.ceiling(rng, *across, texel)
 
     texels, layout = _stored([*sizes, across, across], drawn())
-    closed = (np.arange(len(faces)) >= w) & (np.arange(len(faces)) < w + b)
-    size3 = plan.width, plan.depth, ROOM_HEIGHT
-    return Scene(faces, bottoms, tops, closed, *size3, texels, layout, texel)
+    sides = w + 4 * np.arange(len(plan.boxes))
+    lids = np.column_stack((np.array(plan.boxes).reshape(-1, 4), tops[sides], sides))
+    return Scene(faces, bottoms, tops, lids, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
 
 
 def _outer(plan: Plan, face: Array) -> bool:
