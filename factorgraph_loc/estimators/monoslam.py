@@ -24,7 +24,7 @@ from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmarks import MapUse
 from factorgraph_loc.estimators.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.estimators.monoslam_sighting import Looker, Match
-from factorgraph_loc.estimators.monoslam_state import Eye, Innovation, MapPoint, SlamState, squared, widening
+from factorgraph_loc.estimators.monoslam_state import POSE, Eye, Innovation, MapPoint, SlamState, squared, widening
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.space_motion import (
     PLANAR,
@@ -62,13 +62,14 @@ VAGUE = 0.5  # m, rad: standard deviations beyond which a place is not known
 class MonoslamSettings(FilterSettings):
     """``acceleration``, ``angular_acceleration``: standard deviations of the constant-velocity model, as published.
 
-    ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``. ``landmarks``: use of the map's points, as of
+    ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
+    space. ``landmarks``: use of the map's points, as of
     :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``max_points``: in the state; ``per_image``: how many of them
     are wanted in an image before new ones are taken in. ``iterations``: 1 is the published update, more linearise again.
     ``smooth``: the final trajectory of a run in a known map is smoothed; with points in the state it is the causal one.
     """
 
-    planar: bool = True
+    planar: bool | None = None
     acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="m/s^2")] = 4.0
     angular_acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="rad/s^2")] = 6.0
     height_sigma: Annotated[float, Field(gt=0.0, le=1.0, description="m")] = 0.005
@@ -104,7 +105,8 @@ class Monoslam(Filter):
         self._looker = Looker(setup, self.diagnostics, settings.landmarks)
         twist = setup.rig.twist if "twist" in setup.sensors else None
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
-        self._by_odometry = settings.planar and "odometry" in setup.sensors
+        self._planar = settings.planar is not False
+        self._wheels = "odometry" in setup.sensors
         self._step: Step | None = None
         self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
         # without a map nothing tells of the start: its uncertainty is kept out of the state, where it would shrink as the
@@ -139,29 +141,34 @@ class Monoslam(Filter):
     def space_trajectory(self) -> Trajectory3:
         """The poses in space at the stamps of the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or with
         ``smooth`` off, the causal ones."""
+        found = self._past()
+        ticks = np.unique(np.array(self._ticks))
+        chosen = [found[i] for i in np.searchsorted([t for t, *_ in found], ticks, side="right") - 1]
+        return Trajectory3(
+            ticks,
+            np.array([r.position for _, r, _ in chosen]).reshape(-1, 3),
+            np.array([r.rotation for _, r, _ in chosen]).reshape(-1, 3, 3),
+            np.array([self._spread(r, c) for _, r, c in chosen]).reshape(-1, 6, 6),
+        )
+
+    def _past(self) -> list[tuple[float, RobotState, Array]]:
+        """Time, robot and covariance (12, 12) of each record."""
         records: list[_Record] = self._records
         smooth = self._smooth and self._settings.landmarks == "known"
+        size = ROBOT if self._by_velocity else POSE
         newest = records[-1]
-        robots, covariances = [newest.robot], [newest.covariance]
+        found = [(newest.t, newest.robot, newest.covariance)]
         for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
             robot, covariance = here.robot, here.covariance
             if smooth and not after.anew:
-                robot, covariance = _smoothed(here, after, robots[-1], covariances[-1])
-            robots.append(robot)
-            covariances.append(covariance)
-        ticks = np.unique(np.array(self._ticks))
-        rows = np.searchsorted([r.t for r in records], ticks, side="right") - 1
-        chosen = [(robots[-1 - i], covariances[-1 - i]) for i in rows.tolist()]
-        return Trajectory3(
-            ticks,
-            np.array([r.position for r, _ in chosen]).reshape(-1, 3),
-            np.array([r.rotation for r, _ in chosen]).reshape(-1, 3, 3),
-            np.array([self._spread(r, c) for r, c in chosen]).reshape(-1, 6, 6),
-        )
+                robot, covariance = _smoothed(here, after, *found[-1][1:], size)
+            found.append((here.t, robot, covariance))
+        return found[::-1]
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
         covariance = _starting()
+        self._planar = prior.space is None if s.planar is None else s.planar
         if prior.space is not None:
             position, rotation = prior.space.position, prior.space.rotation
             covariance[:6, :6] = prior.space.covariance
@@ -171,26 +178,31 @@ class Monoslam(Filter):
             covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
         if s.landmarks == "unknown":
-            free = PLANAR if s.planar else list(range(6))
+            free = PLANAR if self._planar else list(range(6))
             spread = np.zeros((6, 6))
             spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
             self._origin = Origin(robot, spread)
             covariance[free] = covariance[:, free] = 0.0
         return SlamState(robot, covariance)
 
+    @property
+    def _by_velocity(self) -> bool:
+        """Whether no motion is measured, so that the velocity tells where the robot goes."""
+        return self._twists is None and not (self._planar and self._wheels)
+
     def _predict(self, increment: Increment) -> None:
         s, robot, dt = self._settings, self._state.robot, increment.duration
         if self._twists is not None:
             step = measured(robot, self._twists.between(self._t, self._t + dt), dt)
-        elif self._by_odometry:
+        elif not self._by_velocity:
             step = measured(robot, planar(increment), dt)
         else:
             free = np.ones(3)
             impulse, turning = s.acceleration * dt * free, s.angular_acceleration * dt * free
-            if s.planar:
+            if self._planar:
                 impulse[2] = turning[0] = turning[1] = 0.0
             step = constant_velocity(robot, dt, impulse, turning)
-        if s.planar:
+        if self._planar:
             step = on_the_floor(step, dt, s.height_sigma, s.tilt_sigma)
         self._step = step
         self._state = self._state.moved(step)
@@ -205,12 +217,16 @@ class Monoslam(Filter):
             self.diagnostics.ignore("camera", len(m.pixels))
             return
         match = self._looker.match(m, self._state, eye)
+        self._matched(m, match, eye)
         state, self._anew = self._relocated(m, self._state, eye, match)
         if len(match.pixels) and not self._anew and not self._vague(state):
             state = self._corrected(m, state, eye, match)
         if not self._anew and self._settings.landmarks != "known":
             state = self._managed(m, state, eye, match)
         self._state = state
+
+    def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
+        """Told of every image and what was found in it."""
 
     def _corrected(self, m: PixelSightings | CameraFrame, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The Kalman update, iterated; pixels far off have their noise widened, then are weighted by Huber's loss."""
@@ -271,7 +287,7 @@ class Monoslam(Filter):
         covariance = _starting()
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
-        if s.planar:
+        if self._planar:
             if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
                 return None
             covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
@@ -319,10 +335,17 @@ def _starting() -> Array:
     return np.diag(np.square([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3))
 
 
-def _smoothed(here: _Record, after: _Record, robot: RobotState, covariance: Array) -> tuple[RobotState, Array]:
-    """The robot of a record given what came later: ``robot`` and ``covariance`` (12, 12) are the smoothed ones of ``after``."""
-    carried = after.step.transition @ here.covariance
-    # what is not known apart before the step (a velocity that was measured) has no inverse
-    gain = (np.linalg.pinv(after.predicted, rcond=1e-12, hermitian=True) @ carried).T
-    smoothed = here.covariance + gain @ (covariance - after.predicted) @ gain.T
-    return here.robot.plus(gain @ robot.minus(after.step.robot)), 0.5 * (smoothed + smoothed.T)
+def _smoothed(
+    here: _Record, after: _Record, robot: RobotState, covariance: Array, size: int
+) -> tuple[RobotState, Array]:
+    """The robot of a record given what came later: ``robot`` and ``covariance`` (12, 12) are the smoothed ones of ``after``. The
+    first ``size`` values of the error are smoothed, on which the others have no influence later."""
+    transition, predicted = after.step.transition[:size, :size], after.predicted[:size, :size]
+    own = here.covariance[:size, :size]
+    gain = np.linalg.solve(predicted, transition @ own).T
+    change = np.zeros(ROBOT)
+    change[:size] = gain @ robot.minus(after.step.robot)[:size]
+    smoothed = here.covariance.copy()
+    own = own + gain @ (covariance[:size, :size] - predicted) @ gain.T
+    smoothed[:size, :size] = 0.5 * (own + own.T)
+    return here.robot.plus(change), smoothed

@@ -24,6 +24,7 @@ ESTIMATORS = {
     "monoslam": ("monoslam", "Monoslam", "MonoslamSettings"),
     "smoother": ("smoother", "Smoother", "SmootherSettings"),
     "batch": ("batch", "Batch", "BatchSettings"),
+    "space_batch": ("space_batch", "SpaceBatch", "SpaceBatchSettings"),
 }
 
 IN_SPACE = ("monoslam", "space_batch")  # those of a robot that need not be on a floor

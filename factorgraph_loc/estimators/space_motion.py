@@ -29,6 +29,7 @@ UPRIGHT = [0, 1, 5]  # and what the floor holds: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # velocities of these
 SETTLING = 1.0  # s, in which a robot that was lifted or tilted comes back to the floor
 HOLD = 1.0  # s, for which a measured motion holds on
+SHORTEST = 1e-3  # s, for which a velocity means something
 UNKNOWN = 0.5  # m and rad per sqrt(s) without any
 
 
@@ -125,7 +126,8 @@ def constant_velocity(robot: RobotState, dt: float, impulse: Array, angular_impu
 
 
 def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
-    """Motion that was measured: it replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
+    """Motion that was measured over ``dt``: it replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
+    dt = max(dt, SHORTEST)
     rotation = orthonormal(robot.rotation @ motion.rotation)
     transition, by_noise = np.zeros((ROBOT, ROBOT)), np.zeros((ROBOT, 6))
     transition[TURN, TURN] = transition[SHIFT, SHIFT] = motion.rotation.T
