@@ -25,10 +25,11 @@ LOOSE, OUTLIER = (
     6.0,
     3.5,
 )  # standard deviations of a pixel beyond which an observation is left out, in the first round and later
-ITERATIONS = 30
-RELATIVE, ABSOLUTE = 1e-5, 1e-5  # decrease of the cost at which to stop
+ITERATIONS = 20
+RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
 FOCAL_SIGMA = 0.1  # of an unknown focal length, as a share
 FIXED = 1e-5  # standard deviation of those constants of a calibration that are known
+SOMEWHERE = 1000.0  # m, standard deviation of a point of which nothing is known
 CHUNK = 500  # points whose covariances are computed at a time
 
 
@@ -137,7 +138,7 @@ def marginals(
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
-    of_points = np.zeros((total, 3, 3))
+    of_points = np.repeat(SOMEWHERE**-2 * np.eye(3)[None], total, axis=0)
     np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
     if known is not None:
         of_points[known.points] += np.linalg.inv(known.covariances)

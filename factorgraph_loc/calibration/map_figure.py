@@ -1,7 +1,8 @@
-"""The picture of a map, of landmarks or tags: what was given, what was learnt, and where the robot was."""
+"""The picture of a map, of landmarks, tags or points: what was given, what was learnt, and where the robot was."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,12 +10,14 @@ import numpy as np
 from factorgraph_loc.calibration.mapping import LandmarkMap
 from factorgraph_loc.calibration.tag_mapping import MadeTags
 from factorgraph_loc.evaluation.figures import COLOURS, grid, legend
+from factorgraph_loc.points import PointMap
 from factors.se2 import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORNERS = 60  # of an ellipse that is drawn as a polygon
+FAR = 10.0  # median absolute deviations, of points that are left out of the picture
 LABEL = 4  # last characters of a tag's EPC, that the picture has room for
 
 
@@ -58,6 +61,27 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
         axis.annotate(entry.landmark[-label:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
         if entry.flagged and entry.given is not None:
             axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    legend(out, [axis])
+    return out
+
+
+def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
+    """Points from above, those of one height in one colour, and where the camera was, ``cameras`` (F, 3)."""
+    off = np.abs(points.positions - np.median(points.positions, axis=0))
+    # a few points far off would make all others small
+    shown = points.positions[np.all(off <= np.maximum(FAR * np.median(off, axis=0), 1.0), axis=1)]
+    everything = np.concatenate((shown[:, :2], cameras[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map of {len(points)} points")
+    axis = axes[0, 0]
+    for x1, y1, x2, y2 in walls:
+        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    axis.plot(*cameras[:, :2].T, color=COLOURS[1], linewidth=1.0, label="camera", zorder=3)
+    dots = axis.scatter(*shown[:, :2].T, c=shown[:, 2], s=6.0, cmap="viridis", label="point", zorder=2)
+    out.colorbar(dots, ax=axis, label="height [m]")
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")

@@ -1,4 +1,4 @@
-"""``fgloc map``: a map of landmarks or of RFID tags from a log, and what it says about the map that the log has."""
+"""``fgloc map``: a map of landmarks, of RFID tags or of points from a log, and what it says about the map that the log has."""
 
 from __future__ import annotations
 
@@ -47,13 +47,16 @@ def map_(
     extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
     of: Annotated[
         str | None,
-        typer.Option(metavar="WHAT", help="landmarks or tags; else landmarks where the log has sightings of them."),
+        typer.Option(
+            metavar="WHAT",
+            help="landmarks, tags or points; else points where the log has images, landmarks where it has sightings of them.",
+        ),
     ] = None,
     poses: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="For tags: reference or odometry, which estimates the poses too; else the reference if there is one.",
+            help="For tags and points: reference or odometry, which estimates the poses too; else the reference if there is one.",
         ),
     ] = None,
     tag_height: Annotated[
@@ -70,12 +73,18 @@ def map_(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Make a map of the landmarks or RFID tags in a log; where the log has a map, check that."""
+    """Make a map of the landmarks, RFID tags or points in a log; where the log has a map of landmarks or tags, check that."""
     picture = _picture_beside(out, overwrite=overwrite)
     options = LogOptions(reader, reader_option, data_root, rig, world)
     loaded = options.load_one(log)
-    of_landmarks, of_tags = set_ or estimator != MAPPERS[0], poses is not None or tag_height is not None
-    if _maps_tags(loaded, of, of_landmarks=bool(of_landmarks), of_tags=of_tags):
+    of_landmarks, of_tags = bool(set_ or estimator != MAPPERS[0]), tag_height is not None
+    if _maps_points(loaded, of, of_others=of_landmarks or of_tags or extend):
+        from factorgraph_loc.cli.mapping_points import PointOptions
+        from factorgraph_loc.cli.mapping_points import map_log as map_points
+
+        map_points(loaded, PointOptions(poses, prior, json), out, picture)
+        return
+    if _maps_tags(loaded, of, of_landmarks=of_landmarks, of_tags=of_tags or poses is not None):
         from factorgraph_loc.cli.mapping_tags import TagOptions, map_log
 
         map_log(loaded, TagOptions(poses, prior, tag_height, extend=extend, json=json), out, picture)
@@ -99,7 +108,7 @@ def map_(
     if extend:
         started, config = loaded, RunConfig(estimator, settings | {"landmarks": "extended"}, prior=prior)
     else:
-        started, source = _started_exactly(loaded, prior)
+        started, source = started_exactly(loaded, prior)
         config = RunConfig(estimator, settings | {"landmarks": "unknown"}, prior="log")
     with show.progress(estimator, counted=False) as report:
         result = run(started, config, lambda share: report(share, 1.0))
@@ -124,10 +133,17 @@ def map_(
     typer.echo(f"\nthe map is in {out}, a picture of it in {picture}")
 
 
+def _maps_points(log: Log, of: str | None, *, of_others: bool) -> bool:
+    """Whether points are mapped; InputError for options of the other kinds."""
+    if of == "points" and of_others:
+        raise InputError("--estimator, --set, --extend and --tag-height are for other maps, but points are mapped here")
+    return of == "points" or (of is None and not of_others and "camera" in log.streams and log.rig.camera is not None)
+
+
 def _maps_tags(log: Log, of: str | None, *, of_landmarks: bool, of_tags: bool) -> bool:
     """Whether tags are mapped rather than landmarks; InputError for options of the other kind."""
     if of not in (None, "landmarks", "tags"):
-        raise InputError(f"--of is {of!r}, expected landmarks or tags")
+        raise InputError(f"--of is {of!r}, expected landmarks, tags or points")
     tags = of == "tags" or (of is None and "bearing_range" not in log.streams and "rfid" in log.streams)
     if tags and of_landmarks:
         raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
@@ -136,7 +152,7 @@ def _maps_tags(log: Log, of: str | None, *, of_landmarks: bool, of_tags: bool) -
     return tags
 
 
-def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
+def started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
     """The log with a start that is certain, and where that lies, in words."""
     from dataclasses import replace
 

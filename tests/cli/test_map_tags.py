@@ -79,7 +79,7 @@ def test_without_reference_and_map_the_frame_is_the_start(fgloc, on_disk, tmp_pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--of", "walls"], "--of is 'walls', expected landmarks or tags"),
+        (["--of", "walls"], "--of is 'walls', expected landmarks, tags or points"),
         (["--poses", "gps"], "--poses is 'gps', expected reference or odometry"),
         (["--tag-height", "1200"], "--tag-height is 1200, expected metres"),
         (["--of", "landmarks"], "has no sightings of landmarks"),
