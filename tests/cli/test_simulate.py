@@ -1,9 +1,10 @@
 """``fgloc simulate``: folders that can be read back, the same bytes for the same seed, and errors of one line."""
 
+import cv2
 import pytest
 
 from factorgraph_loc.readers import load
-from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.simulation import film, preset, simulate
 
 
 def content(folder):
@@ -62,9 +63,30 @@ def test_reads_may_come_from_another_log(fgloc, tmp_path):
     assert "recorded" in log.metadata["reads"]
 
 
+def test_images_are_written_with_the_log(fgloc, tmp_path):
+    options = ("--images", "--image-rate", 2, "--duration", 2, "--world-seed", 5)
+    done = fgloc("simulate", "office", "-o", tmp_path / "new" / "log", "--seed", 3, *options)
+    assert done.exit_code == 0, done.stderr
+    assert [folder.name for folder in (tmp_path / "new").iterdir()] == ["log"]
+    (log,) = load(str(tmp_path / "new" / "log"))
+    assert log.streams["camera"].t.tolist() == [0.5, 1.0, 1.5, 2.0]
+    assert log.rig.sensors == ("odometry", "rfid", "camera")
+    images = film(preset("office", {"world_seed": 5, "drive": {"duration": 2.0}, "images": {"rate": 2.0}}), 3)
+    read = cv2.imread(str(log.streams["camera"].file[3]))
+    assert abs(read.astype(float) - images[3]).mean() < 4.0  # what the file's compression takes
+
+
+def test_nothing_is_rendered_for_a_folder_that_holds_something(fgloc, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    done = fgloc("simulate", "office", "-o", tmp_path, "--images", "--duration", 300)
+    assert done.exit_code == 2
+    assert "not an empty folder" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("office", "--image-rate", 0), "images.rate is 0"),
         (("ofice",), "did you mean office?"),
         (("missing.toml",), "missing.toml: cannot be read"),
         (("office", "--seeds", "5:5"), "expected a number such as 3, or a range"),
