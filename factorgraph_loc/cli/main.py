@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from factorgraph_loc import __version__
-from factorgraph_loc.cli import calibrating, features, inspecting, mapping, running, simulating
+from factorgraph_loc.cli import calibrating, features, images, inspecting, mapping, running, simulating
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
@@ -49,6 +49,7 @@ app.command()(running.run)
 app.command()(running.compare)
 app.command()(calibrating.calibrate)
 app.command("map")(mapping.map_)
+app.command()(images.images)
 app.command()(simulating.simulate)
 app.add_typer(features.app, name="features")
 

@@ -1,72 +1,23 @@
-"""`fgloc map` of points, from images to files and back to a run's map."""
+"""`fgloc map` of points, from images to files and back to a run's map; `fgloc images`."""
 
 import json
-from dataclasses import replace
 
-import cv2
 import numpy as np
+import polars as pl
 import pytest
 from PIL import Image
 
-from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
-from factorgraph_loc.log import ImageStream, IncrementStream, Log
-from factorgraph_loc.readers import write_native
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World, read_world
-from factors import se2
-from factors.reprojection import camera_pose
+from factorgraph_loc.world import read_world
 
-WALL = 3.0  # m: the picture hangs on the plane x = 3, 4 m wide and 2.4 m high, 100 px a metre
-CAMERA = CameraSettings(
-    width=320, height=240, fx=260, fy=260, cx=160, cy=120, z=1.2, frontend=FrontendSettings(feature="sift", count=300)
-)
-
-
-@pytest.fixture(scope="session")
-def gallery(tmp_path_factory):
-    """A log of a robot that passes a picture at 2 m to 3 m, sideways, as it looks at it: ten images of it."""
-    rng = np.random.default_rng(4)
-    picture = cv2.GaussianBlur(rng.integers(0, 255, (240, 400, 3), dtype=np.uint8), (0, 0), 2.5)
-    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
-    t = np.arange(10) * 0.5
-    poses = np.column_stack((0.1 * np.sin(t), 0.15 * np.arange(10) - 0.7, 0.03 * np.cos(2.0 * t)))
-    folder = tmp_path_factory.mktemp("images")
-    model = CAMERA.model()
-    # from the picture's pixels to the wall: u to the right is -y, v downwards is -z
-    to_wall = np.array(((0.0, 0.0, WALL), (-0.01, 0.0, 2.0), (0.0, -0.01, 2.4)))
-    files = []
-    for i, pose in enumerate(poses):
-        position, rotation = camera_pose(model, pose)
-        local = rotation.T @ (to_wall - np.outer(position, (0.0, 0.0, 1.0)))
-        image = cv2.warpPerspective(picture, model.matrix() @ local, (320, 240), borderValue=(90, 90, 90))
-        files.append(folder / f"{i:03d}.png")
-        cv2.imwrite(str(files[-1]), image)
-    steps = se2.between(poses[:-1], poses[1:])
-    odometry = IncrementStream(t, *np.vstack((np.zeros(3), steps)).T)
-    world = World(landmarks={"door": Landmark(x=0.0, y=1.0)}, walls=((WALL, -2.0, WALL, 2.0),))
-    streams = {"odometry": odometry, "camera": ImageStream(t, files)}
-    rig = Rig(sensors=("odometry", "camera"), camera=CAMERA)
-    return Log("gallery", rig, world, streams, Trajectory(t, poses))
-
-
-@pytest.fixture
-def on_disk(gallery, tmp_path, monkeypatch):
-    """``on_disk(**changes)``: the path of the log with other fields."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-    def write(**changes):
-        folder = tmp_path / f"log{len(list(tmp_path.glob('log*')))}"
-        write_native(replace(gallery, **changes), folder)
-        return folder
-
-    return write
+WALL = 3.0  # m, where the picture hangs
 
 
 @pytest.mark.parametrize("poses", ["reference", "odometry"])
-def test_points_lie_on_the_wall(fgloc, on_disk, tmp_path, poses):
+def test_points_lie_on_the_wall(fgloc, gallery_on_disk, tmp_path, poses):
     out = tmp_path / "hall.world.toml"
-    result = fgloc("map", on_disk(), "-o", out, "--poses", poses, "--json")
+    result = fgloc("map", gallery_on_disk(), "-o", out, "--poses", poses, "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     world = read_world(out)
@@ -85,18 +36,18 @@ def test_points_lie_on_the_wall(fgloc, on_disk, tmp_path, poses):
     assert report["frame"].startswith(frame)
 
 
-def test_points_are_mapped_where_nothing_else_is_asked_for(fgloc, on_disk, tmp_path):
-    result = fgloc("map", on_disk(), "-o", tmp_path / "a.world.toml")
+def test_points_are_mapped_where_nothing_else_is_asked_for(fgloc, gallery_on_disk, tmp_path):
+    result = fgloc("map", gallery_on_disk(), "-o", tmp_path / "a.world.toml")
     assert result.exit_code == 0, result.output
     assert "points are in the new map" in result.stdout
     assert "the frame of the new map is that of the reference" in result.stdout
 
 
-def test_bad_input(fgloc, on_disk, tmp_path, gallery):
+def test_bad_input(fgloc, gallery_on_disk, tmp_path, gallery):
     out = tmp_path / "a.world.toml"
 
     def refused(*args, **changes):
-        result = fgloc("map", on_disk(**changes), "-o", out, *args)
+        result = fgloc("map", gallery_on_disk(**changes), "-o", out, *args)
         assert result.exit_code == 2
         assert "Traceback" not in result.output
         assert not out.exists()
@@ -108,3 +59,44 @@ def test_bad_input(fgloc, on_disk, tmp_path, gallery):
     blind = {name: s for name, s in gallery.streams.items() if name != "camera"}
     assert "has no images" in refused("--of", "points", streams=blind)
     assert "has no [camera]" in refused("--of", "points", rig=Rig(sensors=("odometry",)))
+
+
+def test_images_are_located_in_a_map_of_others(fgloc, gallery_on_disk, tmp_path):
+    out = tmp_path / "found"
+    arguments = ("images", gallery_on_disk(), "--map", "0:10:2", "--query", "A=1:10:2", "-o", out)
+    result = fgloc(*arguments, "--feature", "sift,orb", "--count", 300)
+    assert result.exit_code == 0, result.output
+    rows = pl.read_csv(out / "images.csv")
+    assert rows["image"].to_list() == [1, 3, 5, 7, 9] * 4
+    graph = rows.filter((pl.col("feature") == "sift") & (pl.col("method") == "graph"))
+    assert graph["position_error"].median() < 0.03
+    assert graph["angle_error"].median() < 0.02
+    assert (out / "table.md").read_text().count("image by image") == 2
+    with Image.open(out / "images.png") as picture:
+        assert picture.width == 1600
+    again = fgloc(*arguments)
+    assert again.exit_code == 2
+    assert "exists already" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--map", "0-10", "--query", "A=1:3"), "--map is '0-10'"),
+        (("--map", "5:2", "--query", "A=1:3"), "--map is '5:2'"),
+        (("--map", "0:4", "--query", "1:3"), "--query is '1:3'"),
+        (("--map", "0:4", "--query", "A=1:30"), "A asks for images 1 to 29, expected some of 0 to 9"),
+        (("--map", "0:4", "--query", "A=1:3", "--feature", "surf"), "feature 'surf' is not known"),
+    ],
+)
+def test_ranges_that_are_none(fgloc, gallery_on_disk, tmp_path, options, message):
+    result = fgloc("images", gallery_on_disk(), *options, "--count", 300, "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_images_without_poses(fgloc, gallery_on_disk, tmp_path):
+    log = gallery_on_disk(reference=Trajectory(np.array((0.0, 2.0)), np.zeros((2, 3))))
+    result = fgloc("images", log, "--map", "0:4", "--query", "A=1:3", "--feature", "sift", "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "of 10 images have no pose" in result.stderr

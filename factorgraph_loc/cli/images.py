@@ -1,0 +1,95 @@
+"""``fgloc images``: how well images are located in a map that was made from others."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import (
+    DataRoot,
+    Json,
+    LogName,
+    LogOptions,
+    Out,
+    Overwrite,
+    Reader,
+    ReaderOption,
+    RigFile,
+    parse_list,
+)
+from factorgraph_loc.errors import InputError
+
+RANGE = "FIRST:END or FIRST:END:STEP"
+
+
+def images(
+    log: LogName,
+    out: Out,
+    map_: Annotated[str, typer.Option("--map", metavar="RANGE", help=f"Images for the map, from 0: {RANGE}.")],
+    query: Annotated[
+        list[str], typer.Option(metavar="NAME=RANGE", help="Images to be located, a sequence; may be repeated.")
+    ],
+    feature: Annotated[str, typer.Option(metavar="A,B", help="Features to compare.")] = "colour,sift,orb",
+    count: Annotated[int, typer.Option(min=10, max=20_000, help="Features an image.")] = 1500,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Map some images of a log with their reference, locate others, and tell the errors."""
+    from factorgraph_loc.experiments import image_localization as evaluation
+    from factorgraph_loc.vision.features import extractor
+
+    mapped = parse_range(map_, "--map")
+    queries = dict(_query(text) for text in query)
+    names = list(dict.fromkeys(parse_list(feature)))
+    if not names:
+        raise InputError(f"--feature is {feature!r}, expected names such as colour,sift,orb")
+    for name in names:
+        extractor(name, count)
+    evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
+    loaded = LogOptions(reader, reader_option, data_root, rig, None).load_one(log)
+    with show.progress("images", counted=False) as report:
+        results = evaluation.evaluate_images(loaded, names, count, mapped, queries, lambda share: report(share, 1.0))
+    evaluation.write_results(loaded.name, results, out)
+    for warning in (*loaded.warnings, *results.warnings):
+        show.note(f"warning: {warning}")
+    if json:
+        outcomes = [
+            {
+                "feature": one.feature,
+                "query": one.query,
+                "method": one.method,
+                "success": one.success,
+                "position": one.position.tolist(),
+                "angle": one.angle.tolist(),
+            }
+            for one in results.outcomes
+        ]
+        show.document({"maps": {name: asdict(made) for name, made in results.maps.items()}, "outcomes": outcomes})
+        return
+    show.table(*evaluation.table(results))
+    typer.echo(f"\nresults are in {out}: {', '.join(evaluation.FILES)}")
+
+
+def parse_range(text: str, option: str) -> range:
+    """``0:200:2`` as the numbers 0, 2, ... 198; InputError if it is not such a range."""
+    try:
+        found = range(*(int(part) for part in text.split(":")))
+    except (TypeError, ValueError):
+        found = range(0)
+    if ":" not in text or not found or min(found) < 0 or found.step < 1:
+        raise InputError(f"{option} is {text!r}, expected a range of images such as 0:200:2")
+    return found
+
+
+def _query(text: str) -> tuple[str, range]:
+    name, equals, numbers = text.partition("=")
+    if not (name and equals):
+        raise InputError(f"--query is {text!r}, expected a name and a range of images such as A=1:200:2")
+    return name, parse_range(numbers, "--query")
