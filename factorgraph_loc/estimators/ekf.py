@@ -106,7 +106,7 @@ class Ekf(Filter):
         self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
-        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants)
+        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, motion=self._motion)
         self._finder = PixelFinder(self._points, self._motion)
         self.supports_unknown_start = self._points.known
         # where the constants lie in the state's rest, and where the landmarks begin
@@ -204,8 +204,7 @@ class Ekf(Filter):
         factor = self._points.factor(m, predicted, None, twist)
         if factor is not None:
             self._correct_by_pixels(m.t, factor, size)
-        pose, covariance = self._state.pose, self._state.covariance[:3, :3]
-        since = self._finder.refuted_since(m, self._odometry, pose, covariance)
+        since = self._finder.refuted_since(m, self._odometry, self._state.pose)
         found = self._finder.best
         if since is not None and found is not None:
             self.diagnostics.events.append((m.t, f"lost: {MISSED} since {since:.1f} s; goes on at another place"))

@@ -51,7 +51,7 @@ class MeasuringGraph(KeyframeGraph):
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
         default = KEYFRAME_INTERVAL if settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
         self._interval = default if settings.keyframe_interval is None else settings.keyframe_interval
-        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, settings.landmarks)
+        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, settings.landmarks, self._motion)
         if settings.landmarks != "known" and self._points.model is not None:
             constants = self._camera_constants.indices
             self._unknown = UnknownPoints(self._points.model, self.diagnostics, constants)

@@ -83,10 +83,11 @@ class PixelFinder:
         enough = len(poor) >= POOR_FRAMES and poor[0] - poor[-1] >= POOR_TIME
         return poor[-1] if enough else None
 
-    def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Since when a track must have been wrong, after a frame was taken at its ``pose`` (3,) with body-frame ``covariance``
-        (3, 3): points were missed since then, and the last frames agree on another place. None where they do not.
+    def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array) -> float | None:
+        """Since when a track must have been wrong, after a frame was taken at its ``pose`` (3,): points were missed since then, and
+        the last frames agree on another place. None where they do not.
 
+        How sure the track is does not count: the points of one that is not are missed as they are looked for in wrong places.
         Frames from that time on that were taken before are forgotten.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
@@ -96,7 +97,7 @@ class PixelFinder:
         since = self._suspicious_since()
         if since is None or not self.look(m, odometry):
             return None
-        if _distance(pose, covariance, self._fixes[-1]) <= APART:
+        if _distance(pose, np.zeros((3, 3)), self._fixes[-1]) <= APART:
             self.clear()
             return None
         return since if self._agree() else None

@@ -26,7 +26,7 @@ class PixelTracker:
     """What pixels make of a cloud whose place is known; see the module."""
 
     def __init__(self, setup: Setup, motion: Motion, diagnostics: Diagnostics) -> None:
-        self._points = KnownPoints(setup, diagnostics, NOTHING)
+        self._points = KnownPoints(setup, diagnostics, NOTHING, motion=motion)
         self._finder = PixelFinder(self._points, motion)
         self._rng = setup.rng
 
@@ -44,8 +44,7 @@ class PixelTracker:
 
     def refuted_since(self, m: Pixels, odometry: ChainState, cloud: Cloud) -> float | None:
         """Since when the robot must have been elsewhere, after a frame that was taken; None where nothing tells that."""
-        mean, covariance = cloud.moments
-        return self._finder.refuted_since(m, odometry, mean, se2.world_to_body(mean, covariance))
+        return self._finder.refuted_since(m, odometry, cloud.moments[0])
 
     def factor(self, m: Pixels, cloud: Cloud) -> ReprojectionFactor | None:
         """What was seen of points of the map; None where that is nothing. Reports the innovation."""

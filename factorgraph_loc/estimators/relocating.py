@@ -20,7 +20,6 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstim
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
-from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.estimators.new_points import FEWEST
 from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
 from factorgraph_loc.estimators.registry import Setup
@@ -184,8 +183,7 @@ class RelocatingGraph(MeasuringGraph):
         if m.t < self._t:
             return
         moved = self._since(self._keyframes[-1], m.t)
-        track = se2.compose(self._pose, moved.delta), propagate(self._covariance, moved)
-        since = self._camera.refuted_since(m, self._motion.state(m.t), *track)
+        since = self._camera.refuted_since(m, self._motion.state(m.t), se2.compose(self._pose, moved.delta))
         if since is not None:
             self._lose(MISSED, since)
             self._go_on(since)

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.clock_check import ClockCheck
 from factorgraph_loc.estimators.landmarks import MapUse
-from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import Update, robust_update, update_state
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
@@ -50,10 +51,17 @@ class KnownPoints:
     """Turns what a camera sees into factors; what the map or the rig lacks is counted as ignored, what cannot be right as rejected.
 
     ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``motion``: of the robot, to check the stamps of images by.
     """
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics, estimated: Estimated, use: MapUse = "known") -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        diagnostics: Diagnostics,
+        estimated: Estimated,
+        use: MapUse = "known",
+        motion: Motion | None = None,
+    ) -> None:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
         self.model: CameraModel | None = None if settings is None else settings.model()
@@ -66,6 +74,9 @@ class KnownPoints:
         self.associator: Associator | None = None
         if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
             self.associator = Associator(self.map, self.model)
+        self._clock: ClockCheck | None = None
+        if motion is not None and not self.needs_twist:
+            self._clock = ClockCheck(motion, diagnostics)
         self.missed = False  # whether points of the map were not where they were expected in the last image
         self._map_matters = False
         if settings is not None and len(self.map):
@@ -145,6 +156,8 @@ class KnownPoints:
         errors = -update.residual * factor.model.sigma
         for i, name in enumerate("uv"):
             self._diagnostics.residuals.setdefault(f"camera.{name}", []).extend(errors[:, i].tolist())
+        if self._clock is not None:
+            self._clock.add(t, float(np.median(errors[:, 0])) / factor.model.fx)
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
         spreads = self.map.covariances[points] if self._map_matters else None

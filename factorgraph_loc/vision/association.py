@@ -30,14 +30,14 @@ RATIO, GLOBAL_RATIO = 0.85, 0.8
 NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are looked for
 TURNED, ZOOMED = math.radians(50.0), 2.0  # between the views of a point: of their directions, and of their distances
 GATE = float(chi2.ppf(0.99, 2))
-SMALLEST_GATE, LARGEST_GATE = (
-    3.0,
-    80.0,
-)  # px, half the diameter: of what the prediction lacks, and of what may be searched
+CELL = 20.0  # px, of the cells that features are sorted into
+# px, half the diameter: for what the prediction lacks, and for what may be searched
+SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px around the image in which a point may be predicted
 SAME = 4.0  # px: points and features that are nearer may be one
 SAME_POINT = 0.15  # m: points that are nearer may be one
 CHANCE = 0.02  # share of the map's different points that look more alike than a match may
+FEWEST = 3  # matches: fewer may agree with the prediction by chance
 SAMPLED = 300  # views, to tell that
 FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # matches that must agree on a place without a prediction, and their share
 
@@ -109,7 +109,7 @@ class Associator:
             spreads += away[:, :, None] * away[:, None, :]
         inverses, reaches = _gates(by_camera @ covariance @ by_camera.transpose(0, 2, 1) + spreads)
         features = np.ascontiguousarray(frame.pixels, dtype=float)
-        pairs = kernels.gated_pairs(predicted[kept], inverses[kept], reaches[kept], features, LARGEST_GATE / 4.0)
+        pairs = kernels.gated_pairs(predicted[kept], inverses[kept], reaches[kept], features, CELL)
         pairs[:, 0] = np.flatnonzero(kept)[pairs[:, 0]]
         costs = self._costs(pairs, begins, views, frame.descriptors)
         near = costs <= self._farthest_look
@@ -117,8 +117,8 @@ class Associator:
         ratio = RATIO if self._binary else RATIO**2
         pairs = pairs[kernels.clear_pairs(pairs, costs, predicted, features, ratio, SAME)]
         rows, seen = pairs[:, 0], pairs[:, 1]
-        if len(rows) == 0:
-            return Associations(rows, seen, int(kept.sum()))
+        if len(rows) < FEWEST:
+            return Associations(rows[:0], seen[:0], int(kept.sum()))
         camera = CameraPose(position, rotation, covariance)
         right = agreeing(model, camera, points[rows], features[seen], spreads[rows])
         wrong = int(np.count_nonzero(~right))

@@ -28,6 +28,8 @@ SAMPLE = 3
 HYPOTHESES, ROUND = 96, 16  # at most, and between looks whether that is enough
 MISSED = 1e-3  # probability that no sample of right points was drawn
 REACH = 10.0  # standard deviations of the prediction, within which a correction may lie
+FARTHEST = 3.0  # reaches, of a single step
+RIDGE = 1e-9  # of the information: keeps it invertible where the points are as good as at the camera
 LOOSE, GATE = 25.0, 13.8  # squared residuals of those that agree with three, and with all (99.9 %)
 JOINT = 0.99  # probability of all together to be compatible, if all are right
 
@@ -89,9 +91,12 @@ def _best_of_samples(
             # Gauss-Newton in the whitened perturbation, whose prior is the unit Gaussian
             residual, jacobian = _whitened_each(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
-            normal = np.eye(6) + flat.transpose(0, 2, 1) @ flat
+            normal = flat.transpose(0, 2, 1) @ flat
+            normal[:, range(6), range(6)] = 1.0 + (1.0 + RIDGE) * normal[:, range(6), range(6)]
             gradient = np.einsum("hij,hi->hj", flat, residual) + moved
             step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+            # three wrong points may lead anywhere
+            step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
             moved = moved + step
             position, rotation = _moved(position, rotation, step @ root.T)
         squared = _squared(model, position, rotation, points, pixels, whiteners)

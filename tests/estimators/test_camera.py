@@ -1,0 +1,317 @@
+"""Points of a map seen by a camera, in every estimator."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_world import CAMERA, frame, room, simulate, weave, with_camera, with_frames, with_views
+
+from factorgraph_loc.camera_settings import CameraUncertainty
+from factorgraph_loc.estimators.base import Diagnostics, PosePrior
+from factorgraph_loc.estimators.registry import Setup, create, settings_of
+from factorgraph_loc.estimators.seen_points import KnownPoints, Predicted, lifted, pixel_update
+from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import SightingStream, cut, join
+from factorgraph_loc.measurements import CameraFrame, IncrementOdometry, PixelSightings, Tick
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import NOTHING, GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.world import World
+from factors import reprojection, se2
+
+CONFIGS = {
+    "ekf": RunConfig("ekf"),
+    "particle_filter": RunConfig("particle_filter", {"particles": 1000}),
+    "smoother": RunConfig("smoother"),
+    "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
+    "batch": RunConfig("batch"),
+}
+CAUSAL = ("ekf", "particle_filter", "smoother", "smoother_lag")
+EXACT = ("ekf", "smoother", "smoother_lag", "batch")
+LOST = "lost: points in images were not where they were expected since {:.1f} s"
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(seconds=15.0)
+
+
+def position_errors(result, log):
+    """Of the causal estimates [m]."""
+    return np.hypot(*(result.poses - log.reference.at(result.t))[:, :2].T)
+
+
+# A camera that looks along y at points 5 m away on a robot that moves along x: u measures x, linearly.
+FAR = np.column_stack((np.linspace(-3.0, 3.0, 9), np.full(9, 5.0), np.zeros(9)))
+STIFF = GrowthSettings(per_distance=1e-6)
+SIGMAS = np.array((0.2, 1e-5, 1e-6))
+
+
+def side_camera():
+    settings = CAMERA.model_copy(
+        update={
+            "distortion": (0.0, 0.0, 0.0, 0.0),
+            "x": 0.0,
+            "y": 0.0,
+            "z": 0.0,
+            "pitch": 0.0,
+            "yaw": np.pi / 2,
+            "pixel_sigma": 20.0,
+            "robust": 100.0,
+        }
+    )
+    noise = OdometryNoise(along=GrowthSettings(per_distance=0.1), lateral=STIFF, heading=STIFF)
+    return Rig(sensors=("odometry", "sightings"), odometry=OdometrySettings(noise=noise), camera=settings)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "batch", "particle_filter"])
+def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
+    rig, points = side_camera(), PointMap.of(tuple(f"p{i}" for i in range(9)), FAR)
+    model, rng = rig.camera.model(), np.random.default_rng(4)
+    setup = Setup(rig, World(points=points), rig.sensors, np.random.default_rng(7))
+    settings = (
+        {"particles": 5000, "smoothing_interval": 0.5, "smoothing_trajectories": 300}
+        if name == "particle_filter"
+        else {}
+    )
+    estimator = create(name, setup, settings_of(name, settings))
+    estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag(SIGMAS**2)))
+    estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
+    x, mean, variance = 0.1, 0.0, SIGMAS[0] ** 2
+    noise = (model.sigma * 5.0 / model.fx) ** 2 / 9.0  # of x from all points
+    predicted, filtered, causal = [], [], []
+    for i in range(1, 16):
+        x += 0.1 + 0.1 * np.sqrt(0.1) * rng.standard_normal()
+        pixels = reprojection.predict(model, np.array((x, 0.0, 0.0)), FAR)[0]
+        pixels += model.sigma * rng.standard_normal(pixels.shape)
+        estimator.process(IncrementOdometry(0.5 * i, 0.1, 0.0, 0.0))
+        estimator.process(PixelSightings(0.5 * i, points.names, pixels))
+        estimator.process(Tick(0.5 * i))
+        estimate = estimator.estimate()
+        causal.append((estimate.pose[0], estimate.covariance[0, 0]))
+        measured = np.mean(FAR[:, 0] - (pixels[:, 0] - model.cx) * 5.0 / model.fx)
+        mean, variance = mean + 0.1, variance + 0.1**2 * 0.1
+        predicted.append((mean, variance))
+        gain = variance / (variance + noise)
+        mean, variance = mean + gain * (measured - mean), (1.0 - gain) * variance
+        filtered.append((mean, variance))
+    smoothed = [filtered[-1]]
+    for (m, v), (pm, pv) in zip(filtered[-2::-1], predicted[:0:-1], strict=True):
+        gain = v / pv
+        smoothed.insert(0, (m + gain * (smoothed[0][0] - pm), v + gain**2 * (smoothed[0][1] - pv)))
+    filtered, smoothed, causal = np.array(filtered), np.array(smoothed), np.array(causal)
+    final = estimator.trajectory()
+    if name == "particle_filter":
+        # the mean of particles of spread s is off by s / sqrt(N_eff): 6 sigma of 500 effective ones, below 1e-7 of false alarms
+        assert np.all(np.abs(causal[:, 0] - filtered[:, 0]) < 6.0 * np.sqrt(filtered[:, 1] / 500.0))
+        np.testing.assert_allclose(causal[:, 1], filtered[:, 1], rtol=0.25)
+        assert np.all(np.abs(final.poses[:, 0] - smoothed[:, 0]) < 6.0 * np.sqrt(smoothed[:, 1] / 80.0))
+        return
+    if name != "batch":
+        np.testing.assert_allclose(causal[:, 0], filtered[:, 0], atol=5e-4)  # a thirtieth of a standard deviation
+        np.testing.assert_allclose(causal[:, 1], filtered[:, 1], rtol=1e-2)
+    np.testing.assert_allclose(final.poses[:, 0], smoothed[:, 0], atol=5e-4)
+    np.testing.assert_allclose(final.covariances[:, 0, 0], smoothed[:, 1], rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_points_by_name_and_frames_of_features_keep_the_robot_within_centimetres(name, log):
+    for made in (log, with_frames(log, wrong=0.4)):
+        result = run(made, CONFIGS[name])
+        scores = score(result, made)
+        assert scores["final.position_rmse"] < 0.02
+        nis = np.array([row[1:] for row in result.diagnostics.nis["camera"]])
+        # of some 2,800 degrees of freedom: five standard deviations of the mean, below 1e-6 of false alarms
+        assert abs(nis[:, 0].sum() / nis[:, 1].sum() - 1.0) < 5.0 * np.sqrt(2.0 / nis[:, 1].sum())
+        if name in CAUSAL:
+            assert scores["causal.position_rmse"] < 0.02
+
+
+def test_estimators_agree(log):
+    results = {name: run(log, config) for name, config in CONFIGS.items()}
+    for name in ("smoother", "smoother_lag", "particle_filter"):
+        apart = np.abs(results[name].poses - results["ekf"].poses)
+        bound = 0.004 if name == "particle_filter" else 0.0005  # a tenth of a standard deviation, and a hundredth
+        assert np.median(apart[:, :2]) < bound
+    apart = results["smoother"].final.poses - results["batch"].final.poses
+    assert np.abs(apart).max() < 1e-4
+
+
+def test_errors_are_those_that_the_covariances_say():
+    """Over eight runs: average normalised errors of three degrees of freedom, at steps 5 s apart."""
+    for name in ("ekf", "smoother", "particle_filter"):
+        squared = []
+        for seed in range(8):
+            made = simulate(seed=seed, seconds=15.5)
+            settings = {"particles": 300, "smooth": False} if name == "particle_filter" else {"smooth": False}
+            result = run(made, RunConfig(name, settings, seed=seed))
+            for t in (5.0, 10.0, 15.0):
+                (i,) = np.flatnonzero(np.isclose(result.t, t))
+                error = result.poses[i] - made.reference.at(np.array([t]))[0]
+                error[2] = se2.wrap_scalar(error[2])
+                squared.append(error @ np.linalg.solve(result.covariances[i], error))
+        # 72 degrees of freedom: the bounds have 1e-4 of false alarms on either side
+        assert 1.59 < np.mean(squared) < 4.95, name
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("kind", [lambda log: log, with_frames])
+def test_an_unknown_start_is_told_by_the_first_frame(name, kind, log):
+    made = kind(cut(log, 0.0, 5.0))
+    result = run(made, replace(CONFIGS[name], prior="unknown"))
+    assert errors(result.final, made.reference).position.max() < 0.08
+    if name != "batch":  # which only tells in the end
+        assert result.status[0] == "unlocalized"
+        assert result.status[3] == "localized"
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("kind", [lambda log: log, with_frames])
+def test_a_robot_that_is_carried_elsewhere_goes_on_there(name, kind, log):
+    made = kind(join(cut(log, 0.0, 5.0), cut(simulate(seed=3, seconds=30.0), 20.0, 26.0)))
+    result = run(made, CONFIGS[name])
+    lost = [t for t, what in result.diagnostics.events if what.startswith("lost: points in images")]
+    assert len(lost) == 1
+    assert 5.0 < lost[0] < 7.0
+    assert position_errors(result, made)[result.t > lost[0] + 0.2].max() < 0.15
+    assert errors(result.final, made.reference).position[result.t < 4.9].max() < 0.1
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_wrong_start_is_corrected(name, log):
+    result = run(log, replace(CONFIGS[name], prior="-1,1,2"))
+    assert position_errors(result, log)[result.t > 2.0].max() < 0.1
+
+
+CONSTANTS = {
+    "pitch": (CAMERA.pitch + 0.03, CAMERA.pitch),
+    "yaw": (0.03, 0.0),
+    "x": (CAMERA.x + 0.06, CAMERA.x),
+    "fx": (1.05 * CAMERA.fx, CAMERA.fx),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_constants_of_the_camera_are_learnt(name):
+    made = simulate(seconds=20.0, speeds=weave)
+    believed = {key: wrong for key, (wrong, _) in CONSTANTS.items()}
+    made = with_camera(
+        made,
+        **believed,
+        fy=1.05 * CAMERA.fy,
+        uncertainty=CameraUncertainty(pitch=0.03, yaw=0.03, x=0.06, focal=0.05),
+    )
+    learnt = run(made, CONFIGS[name]).learnt.values
+    truth = {key: right - wrong for key, (wrong, right) in CONSTANTS.items() if key != "fx"}
+    truth["focal"] = -np.log(1.05)
+    assert set(learnt) == {f"camera.{key}" for key in truth}
+    for key, value in truth.items():
+        found, sigma = learnt[f"camera.{key}"]
+        assert abs(found - value) < 4.0 * sigma + 1e-4  # below 1e-4 of false alarms each
+        assert sigma < 0.6 * abs(value)
+
+
+def test_errors_of_the_map_widen_the_noise(log):
+    points = log.world.points
+    rng = np.random.default_rng(8)
+    sigma = 0.05
+    moved = points.positions + sigma * rng.standard_normal(points.positions.shape)
+    spreads = np.broadcast_to(sigma**2 * np.eye(3), (len(points), 3, 3)).copy()
+    exact = replace(log, world=World(points=replace(points, positions=moved)))
+    honest = replace(log, world=World(points=replace(points, positions=moved, covariances=spreads)))
+    for name in ("ekf", "particle_filter"):
+        blind, knows = run(exact, CONFIGS[name]), run(honest, CONFIGS[name])
+        ratios = []
+        for result in (blind, knows):
+            nis = np.array([row[1:] for row in result.diagnostics.nis["camera"]])
+            ratios.append(nis[:, 0].sum() / nis[:, 1].sum())
+        assert ratios[0] > 3.0
+        assert 0.5 < ratios[1] < 1.5
+        assert score(knows, log)["causal.position_rmse"] < 0.6 * score(blind, log)["causal.position_rmse"]
+
+
+def test_the_camera_moves_with_the_robot():
+    model, pose = CAMERA.model(), np.array((0.3, -0.4, 0.9))
+    step = 1e-6
+    camera = lifted(model, pose, np.zeros((3, 3)))
+    for i, d in enumerate(step * np.eye(3)):
+        moved = lifted(model, se2.compose(pose, se2.exp(d)), np.zeros((3, 3)))
+        turn = (camera.rotation.T @ moved.rotation - np.eye(3)) / step
+        shift = camera.rotation.T @ (moved.position - camera.position) / step
+        found = np.array((turn[2, 1], turn[0, 2], turn[1, 0], *shift))
+        spread = lifted(model, pose, np.diag(np.eye(3)[i])).covariance
+        np.testing.assert_allclose(spread, np.outer(found, found), atol=1e-5)
+
+
+def test_late_images_are_taken_and_those_that_are_too_late_are_counted(log):
+    stream = log.streams["sightings"]
+    stamps = np.unique(stream.t)
+    order = np.concatenate(
+        [np.flatnonzero(stream.t == t) for t in (*stamps[:20], stamps[21], stamps[20], *stamps[22:])]
+    )
+    swapped = SightingStream(stream.t[order], [stream.point[i] for i in order], stream.u[order], stream.v[order])
+    late = replace(log, streams={**log.streams, "sightings": swapped})
+    for name in ("ekf", "smoother"):
+        result, usual = run(late, CONFIGS[name]), run(log, CONFIGS[name])
+        assert not result.diagnostics.late
+        assert np.abs(result.final.poses - usual.final.poses).max() < 0.01
+    estimator = create(
+        "ekf", Setup(log.rig, log.world, log.rig.sensors, np.random.default_rng(0)), settings_of("ekf", {})
+    )
+    estimator.initialize(PosePrior(0.0, np.array((1.0, -1.0, 0.0)), 0.01 * np.eye(3)))
+    estimator.process(Tick(3.0))
+    estimator.process(PixelSightings(1.0, ("p0", "p1"), np.zeros((2, 2))))
+    assert estimator.diagnostics.late == {"camera": 2}
+
+
+def test_what_is_not_in_the_map_or_of_another_kind_is_counted(log):
+    setup = Setup(log.rig, log.world, ("odometry", "sightings"), np.random.default_rng(0))
+    diagnostics = Diagnostics()
+    points = KnownPoints(setup, diagnostics, NOTHING)
+    predicted = Predicted(np.zeros(3), 0.01 * np.eye(3))
+    assert points.factor(PixelSightings(0.0, ("nobody", "nothing"), np.zeros((2, 2))), predicted) is None
+    assert diagnostics.ignored == {"point not in the map": 2}
+    assert points.factor(PixelSightings(0.0, (), np.empty((0, 2))), predicted) is None
+    # the map of named points has no views to find features by
+    found, _ = frame(with_views(room()), np.zeros(3), 0.0, np.random.default_rng(1))
+    assert points.factor(found, predicted) is None
+    assert diagnostics.ignored["camera"] == len(found.pixels)
+    mapped = World(points=with_views(room()))
+    points = KnownPoints(replace(setup, world=mapped, sensors=("odometry", "camera")), diagnostics, NOTHING)
+    other = CameraFrame(
+        0.0, "orb", found.pixels, found.sizes, np.zeros((len(found.pixels), 32), np.uint8), found.tracks
+    )
+    assert points.factor(other, predicted) is None
+    assert diagnostics.ignored["camera: features of another kind than the map's"] == len(found.pixels)
+
+
+def test_an_update_is_taken_to_the_optimum():
+    """From a prediction that is poor, a single step of a Kalman filter would be off by many of its standard deviations."""
+    points, model, pose = room(40), CAMERA.model(), np.array((0.5, 0.2, 0.4))
+    seen, depth = reprojection.predict(model, pose, points.positions)
+    rows = np.flatnonzero(model.contains(seen) & (depth > 0.3))
+    setup = Setup(
+        Rig(sensors=("sightings",), camera=CAMERA), World(points=points), ("sightings",), np.random.default_rng(0)
+    )
+    known = KnownPoints(setup, Diagnostics(), NOTHING)
+    m = PixelSightings(0.0, tuple(points.names[i] for i in rows), seen[rows])
+    start, covariance = se2.compose(pose, np.array((0.3, -0.2, 0.1))), np.diag((0.4, 0.4, 0.2)) ** 2
+    factor = known.factor(m, Predicted(start, covariance))
+    assert len(factor.points) == len(rows)
+    update = pixel_update(factor, start, covariance)
+    error = se2.log(se2.between(pose, se2.compose(start, se2.exp(update.delta))))
+    assert np.all(np.abs(error) < 0.3 * np.sqrt(np.diag(update.covariance)))
+
+
+def test_more_pixels_tell_more(log):
+    """With every second sighting the pose is known less well."""
+    stream = log.streams["sightings"]
+    some = replace(
+        log,
+        streams={
+            **log.streams,
+            "sightings": SightingStream(stream.t[::2], stream.point[::2], stream.u[::2], stream.v[::2]),
+        },
+    )
+    half, whole = run(some, CONFIGS["smoother"]), run(log, CONFIGS["smoother"])
+    assert np.median(half.final.covariances[:, 0, 0]) > 1.2 * np.median(whole.final.covariances[:, 0, 0])

@@ -1,0 +1,166 @@
+"""Every estimator on what a camera sees, with what goes wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_world import CAMERA, simulate, weave, with_camera, with_frames, with_sightings
+
+from factorgraph_loc.camera_settings import CameraUncertainty
+from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import FeatureStream
+from factorgraph_loc.world import World
+from factors import se2
+
+CONFIGS = {
+    "ekf": RunConfig("ekf"),
+    "particle_filter": RunConfig("particle_filter", {"particles": 500}),
+    "smoother": RunConfig("smoother"),
+    "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
+    "batch": RunConfig("batch"),
+}
+CALIBRATING = ("ekf", "smoother", "batch")
+CLEAN = 0.02  # m: what the final position error stays below where nothing is wrong
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(seconds=20.0, speeds=weave)
+
+
+def final_rmse(result, log):
+    assert np.all(np.isfinite(result.poses))
+    assert np.all(np.isfinite(result.covariances))
+    return score(result, log)["final.position_rmse"]
+
+
+def nis_per_degree(result):
+    rows = np.array([row[1:] for row in result.diagnostics.nis["camera"]])
+    return rows[:, 0].sum() / rows[:, 1].sum()
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_forty_percent_wrong_names_are_left_out(name, log):
+    rng, stream = np.random.default_rng(4), log.streams["sightings"]
+    bad = rng.random(len(stream.t)) < 0.4
+    names = np.where(bad, rng.choice(log.world.points.names, len(bad)), stream.point)
+    wrong = with_sightings(log, point=names.tolist())
+    result = run(wrong, CONFIGS[name])
+    assert final_rmse(result, log) < CLEAN
+    rejected = result.diagnostics.rejected["camera: does not agree with the others"]
+    assert abs(rejected - np.count_nonzero(bad)) < 0.03 * np.count_nonzero(bad)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother_lag"])
+def test_sixty_percent_wrong_names_from_an_unknown_start(name, log):
+    rng, stream = np.random.default_rng(5), log.streams["sightings"]
+    bad = rng.random(len(stream.t)) < 0.6
+    names = np.where(bad, rng.choice(log.world.points.names, len(bad)), stream.point)
+    result = run(with_sightings(log, point=names.tolist()), replace(CONFIGS[name], prior="unknown"))
+    late = result.t > 3.0
+    assert set(np.array(result.status)[late]) == {"localized"}
+    assert np.hypot(*(result.poses - log.reference.at(result.t))[late, :2].T).max() < 0.1
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_landmarks_that_were_moved_by_a_metre_are_left_out(name, log):
+    rng, points = np.random.default_rng(6), log.world.points
+    positions = points.positions.copy()
+    rows = rng.choice(len(points), 24, replace=False)  # of 160
+    away = rng.standard_normal((len(rows), 3))
+    positions[rows] += away / np.linalg.norm(away, axis=1)[:, None]
+    result = run(replace(log, world=World(points=replace(points, positions=positions))), CONFIGS[name])
+    assert final_rmse(result, log) < CLEAN
+    assert not [what for _, what in result.diagnostics.events if what.startswith("lost")]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_nothing_in_view_for_a_minute_is_bridged_by_odometry(name):
+    log = simulate(seconds=75.0, rate=2.5)
+    t = log.streams["sightings"].t
+    dark = (t > 7.0) & (t < 67.0)
+    result = run(with_sightings(log, ~dark), CONFIGS[name])
+    assert not result.diagnostics.events or name == "batch"
+    off = np.hypot(*(result.poses - log.reference.at(result.t))[:, :2].T)
+    assert off[result.t < 7.0].max() < 0.1
+    assert off[result.t > 68.0].max() < 0.1
+    spread = np.sqrt(result.covariances[:, 0, 0])
+    assert spread[result.t > 66.0][0] > 0.1  # it knows that it does not know
+    final = errors(result.final, log.reference)
+    assert final.position[(result.t < 7.0) | (result.t > 68.0)].max() < 0.1
+    if name == "particle_filter":
+        return
+    # three degrees of freedom at 40 s, a bound with 1e-5 of false alarms
+    (i,) = np.flatnonzero(np.isclose(result.final.t, 40.0))
+    assert final.nees[i] < 25.9
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_black_frames_and_a_covered_third_of_the_image(name, log):
+    made = with_frames(log)
+    stream = made.streams["camera"]
+    frames = []
+    for i, f in enumerate(stream.frame):
+        keep = (f.pixels[:, 0] > CAMERA.width / 3.0) & (not 30 <= i < 60)
+        frames.append(
+            replace(
+                f, pixels=f.pixels[keep], sizes=f.sizes[keep], descriptors=f.descriptors[keep], tracks=f.tracks[keep]
+            )
+        )
+    covered = replace(made, streams={**made.streams, "camera": FeatureStream(stream.t, frames)})
+    result = run(covered, CONFIGS[name])
+    assert np.all(np.isfinite(result.poses))
+    off = np.hypot(*(result.poses - log.reference.at(result.t))[:, :2].T)
+    assert off[(result.t < 6.0) | (result.t > 13.0)].max() < 0.1
+
+
+def test_an_offset_of_time_is_estimated_or_told(log):
+    early = with_sightings(log, t=log.streams["sightings"].t - 0.1)
+    for name in CALIBRATING:
+        found = run(with_camera(early, uncertainty=CameraUncertainty(time_offset=0.1)), CONFIGS[name])
+        offset, sigma = found.learnt.values["camera.time_offset"]
+        assert abs(offset - 0.1) < 4.0 * sigma  # below 1e-4 of false alarms
+        assert sigma < 0.03
+        assert final_rmse(found, log) < 1.5 * CLEAN
+    for config in CONFIGS.values():
+        blind = run(early, config)
+        (event,) = [what for _, what in blind.diagnostics.events if "time_offset" in what]
+        assert event.startswith("camera: images seem to be taken 0.1")
+        assert "later" in event
+        right = run(log, config)
+        assert not [what for _, what in right.diagnostics.events if "time_offset" in what]
+
+
+def test_a_wrong_focal_length_is_estimated_or_shows(log):
+    wrong = with_camera(log, fx=1.05 * CAMERA.fx, fy=1.05 * CAMERA.fy)
+    for name in CALIBRATING:
+        found = run(with_camera(wrong, uncertainty=CameraUncertainty(focal=0.05)), CONFIGS[name])
+        value, sigma = found.learnt.values["camera.focal"]
+        assert abs(value + np.log(1.05)) < 4.0 * sigma + 1e-4
+        assert final_rmse(found, log) < CLEAN
+        assert nis_per_degree(found) < 1.2
+    for config in CONFIGS.values():
+        assert nis_per_degree(run(wrong, config)) > 2.0
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_camera_that_was_knocked_does_not_break_a_run(name, log):
+    """A pitch that is wrong by 6 degrees: nothing agrees. What is told must be finite, and that it is wrong must show."""
+    result = run(with_camera(log, pitch=CAMERA.pitch + 0.1), CONFIGS[name])
+    assert np.all(np.isfinite(result.poses))
+    assert np.all(np.isfinite(result.final.poses))
+    assert result.diagnostics.rejected["camera: does not agree with the others"] > 500
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "particle_filter"])
+def test_points_behind_the_camera_and_at_its_place_do_no_harm(name, log):
+    """Names that the map has behind the robot, and at where the camera is."""
+    points = log.world.points
+    positions = points.positions.copy()
+    poses = log.reference.at(np.linspace(0.0, 20.0, 20))
+    ahead = se2.compose(poses, np.array((CAMERA.x, CAMERA.y, 0.0)))
+    positions[:20] = np.column_stack((ahead[:, :2], np.full(20, CAMERA.z)))
+    positions[20:30] *= -1.0
+    result = run(replace(log, world=World(points=replace(points, positions=positions))), CONFIGS[name])
+    assert final_rmse(result, log) < CLEAN
