@@ -58,8 +58,8 @@ class Outcome:
         numbers = (
             f"{np.median(self.position):.4f}",
             f"{np.median(degrees):.2f}",
-            f"{np.percentile(self.position, 90):.3f}",
-            f"{np.percentile(degrees, 90):.1f}",
+            f"{np.percentile(self.position, 90, method='higher'):.3f}",
+            f"{np.percentile(degrees, 90, method='higher'):.1f}",
         )
         return [self.feature, self.query, self.method, f"{100.0 * self.success:.0f} %", *numbers]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from benchmarking.report import Report
+
 from camera_benchmark.options import CameraOptions
 from factorgraph_loc.experiments.image_localization import evaluate_images, table, write_results
 from factorgraph_loc.readers import load
