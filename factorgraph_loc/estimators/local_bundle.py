@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_loc.estimators.graph_parts import Keyframe
-from factorgraph_loc.estimators.new_points import FEWEST, Place, Sighting, triangulate
+from factorgraph_loc.estimators.new_points import FEWEST, Place, Sighting, agreed
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.variables import Values, point_key
 from factors.graph import PriorFactor
@@ -43,16 +43,17 @@ def bundled(
     values: Values = {k.key: pose for k, pose in zip(keyframes, poses, strict=True)}
     make = PointSightings(model)
     natives = []
-    for sightings in waiting.values():
-        seen = [s for s in sightings if s.keyframe >= first]
-        if len(seen) < FEWEST:
-            continue
-        found = triangulate(model, seen, [places[s.keyframe - first] for s in seen], ROUGH)
+    often = [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
+    if len(often) < ENOUGH:
+        return None
+    for seen in often:
+        found = agreed(model, seen, [places[s.keyframe - first] for s in seen], ROUGH)
         if found is None:
             continue
+        point, right = found
         key = point_key(len(values))
-        values[key] = found.position
-        for s in seen:
+        values[key] = point.position
+        for s in right:
             ours = ReprojectionFactor(model, np.zeros((1, 3)), s.pixel[None], free=True)
             pose = keyframes[s.keyframe - first].key
             natives.append((ours, (pose, key), make.factor(pose, key, s.pixel)))

@@ -112,22 +112,41 @@ class NewPoints:
                 if sighting.keyframe not in known:
                     known[sighting.keyframe] = places(sighting.keyframe)
             seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
-            result = self._agreed([s for s, _ in seen], [p for _, p in seen])
+            if len(seen) < FEWEST or not self._apart(*seen[0], *seen[-1]):
+                continue
+            result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen], MAX_SPREAD)
             if result is not None:
                 del self._waiting[name]
                 found.append((name, *result))
         return found
 
-    def _agreed(self, seen: list[Sighting], places: list[Place]) -> tuple[Triangulated, list[Sighting]] | None:
-        while len(seen) >= FEWEST:
-            result = triangulate(self._model, seen, places)
-            if result is None:
-                return None
-            if result.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
-                return result, seen
-            worst = int(np.argmax(result.squared))
-            del seen[worst], places[worst]
-        return None
+    def _apart(self, first: Sighting, here: Place, last: Sighting, there: Place) -> bool:
+        """Whether it is worth a try: two rays alone would nearly tell the place well enough."""
+        sigma = math.hypot(self._model.sigma, max(here.slack, there.slack)) / self._model.fx
+        angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
+        return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
+
+
+def agreed(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
+) -> tuple[Triangulated, list[Sighting]] | None:
+    """The point of ``seen`` from ``places``, and those sightings that agree on it; None where they do not tell it to the share
+    ``spread`` of its depth. Where they contradict each other, the one goes without which the others do so least."""
+    seen, places = list(seen), list(places)
+    found = _triangulate(model, seen, places, spread)
+    while found is not None and not found.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
+        if len(seen) <= FEWEST:
+            return None
+        best: tuple[float, int, Triangulated] | None = None
+        for i in range(len(seen)):
+            others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], spread)
+            if others is not None and (best is None or others.squared.sum() < best[0]):
+                best = float(others.squared.sum()), i, others
+        if best is None:
+            return None
+        _, out, found = best
+        del seen[out], places[out]
+    return None if found is None else (found, seen)
 
 
 def triangulate(
@@ -138,6 +157,14 @@ def triangulate(
 
     It begins where the rays come nearest to each other, and minimises the squared residuals in the images.
     """
+    found = _triangulate(model, seen, places, spread)
+    return None if found is None or not math.isfinite(found.squared.sum()) else found
+
+
+def _triangulate(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
+) -> Triangulated | None:
+    """The same, with residuals that are infinite where the rays do not meet in front of the camera."""
     centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
     rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
     if (rays @ rays.T).min() > math.cos(MIN_PARALLAX):
@@ -148,7 +175,7 @@ def triangulate(
     for i in range(ITERATIONS + 1):
         local = ((point - centres)[:, None, :] @ turns)[:, 0]
         if not local[:, 2].min() > NEAREST:
-            return None
+            return Triangulated(point, UNTURNED, np.full(len(seen), np.inf))
         # a point in the frame of a camera is as one of the world seen by a camera that is not moved
         at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
         residual = (at - pixels) / sigmas[:, None]

@@ -62,7 +62,11 @@ class Problem:
             for key, value in values.items():
                 size = len(value)
                 graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
-            step = graph.optimize()
+            try:
+                step = graph.optimize()
+            except RuntimeError:  # nearly singular
+                damping *= 10.0
+                continue
             moved = {key: retract(key, value, step.at(key)) for key, value in values.items()}
             new_cost = self.cost(moved)
             if new_cost > cost:

@@ -156,7 +156,12 @@ class Smoother(RelocatingGraph):
                 self._constants[key], self._spreads[key] = self._marginal(key)
         except RuntimeError:
             self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
-        for key in () if self._unknown is None else self._unknown.leave(now - lag):
+        if self._unknown is not None:
+            self._forget(self._unknown.leave(now - lag))
+
+    def _forget(self, points: Iterable[int]) -> None:
+        """Keep the estimates of points that leave the window."""
+        for key in points:
             try:
                 self._departed[0][key], self._departed[1][key] = self._marginal(key)
             except RuntimeError:
@@ -211,9 +216,11 @@ class Smoother(RelocatingGraph):
 
     def _new_solver(self) -> Solver:
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("QR")  # Cholesky loses long stretches of dead reckoning as indeterminate
+        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
+        parameters.setFactorization("QR" if self._unknown is None else "CHOLESKY")
         parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
-        parameters.relinearizeSkip = self._settings.relinearize_skip
+        # far from where a point was first taken to be its factors mean nothing
+        parameters.relinearizeSkip = self._settings.relinearize_skip if self._unknown is None else 1
         if self._settings.lag is None:
             return FullHistory(parameters)
         parameters.findUnusedFactorSlots = True

@@ -19,7 +19,8 @@ from factorgraph_loc.estimators.graph_parts import Addition, Guess, Keyframe
 from factorgraph_loc.estimators.local_bundle import bundled
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of, spread_out
-from factorgraph_loc.estimators.seen_points import lifted, pixel_update
+from factorgraph_loc.estimators.robust_update import robust_update
+from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.estimators.variables import Node, Values, point_key
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
@@ -32,7 +33,7 @@ from factors.se2 import Array
 
 PER_KEYFRAME = 40  # points, those that wait included
 STRIKES = 2
-ANCHORED = 6  # points of the graph that place a keyframe well: to SLACK pixels
+ANCHORED = 4  # points of the graph that place a keyframe well: to SLACK pixels
 SLACK = 2.0  # px
 HORIZON, BUNDLE = 60, 8  # keyframes back that sightings may wait, and that are adjusted together
 
@@ -103,14 +104,13 @@ class UnknownPoints:
         for i, agrees in zip(old, right.tolist(), strict=True):
             self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
         self._anchored[keyframe.index] = int(np.count_nonzero(right)) >= ANCHORED
-        sightings = sightings_of(self.model, keyframe.index, pixels)
-        fresh = [name for name in names if name not in self._points]
-        for name, sighting in zip(names, sightings, strict=True):
-            if name not in self._points:
-                self._new.add(name, sighting)
+        fresh = [i for i, name in enumerate(names) if name not in self._points]
+        for i, sighting in zip(fresh, sightings_of(self.model, keyframe.index, pixels[fresh]), strict=True):
+            self._new.add(names[i], sighting)
         self._new.forget(keyframe.index)
-        places, pose = self._places(keyframe, guess[0], graph)
-        for name, found, seen in self._new.ready(fresh, places.get):
+        waiting = [names[i] for i in fresh if self._new.count(names[i]) >= FEWEST_SIGHTINGS]
+        places, pose = self._places(keyframe, guess[0], waiting, graph)
+        for name, found, seen in self._new.ready(waiting, places.get):
             key = point_key(len(self._names))
             self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
             self._points[name] = _Point(key, keyframe.t, np.asarray(np.linalg.inv(found.covariance), dtype=float))
@@ -158,7 +158,7 @@ class UnknownPoints:
         if np.count_nonzero(right) < FEWEST:
             return guess, right
         factor = ReprojectionFactor(model, positions[right], pixels[right], point_covariances=spreads[right])
-        update = pixel_update(factor, *guess)
+        update = robust_update(factor, *guess, ITERATIONS, SETTLED)
         return (se2.compose(guess[0], se2.exp(update.delta)), guess[1]), right
 
     def _again(
@@ -197,37 +197,43 @@ class UnknownPoints:
         keyframe.nodes.append(node)
         addition.nodes.append(node)
 
-    def _places(self, newest: Keyframe, pose: Array, graph: GraphView) -> tuple[dict[int, Place], Array]:
-        """Where the last keyframes are, by number, and how well their pixels fit to those of the newest; and its pose (3,).
+    def _places(
+        self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView
+    ) -> tuple[dict[int, Place], Array]:
+        """Where the keyframes are that see points that wait, by number, and how well their pixels fit to those of the newest; and
+        the pose (3,) of that.
 
         Between keyframes that points of the graph have placed they do; else that goes with the turn that odometry alone tells
         between them, or with the adjustment of both where that is possible.
         """
-        places: dict[int, Place] = {}
-        poses: dict[int, Array] = {}
+        slacks = self._slacks(newest, graph)
+        if not self._anchored[newest.index]:
+            last = [index for index in sorted(slacks)[-BUNDLE:] if graph.is_open(index)]
+            poses = [pose if i == newest.index else graph.current(graph.keyframes[i].key) for i in last]
+            some = [slacks[i] for i in last]
+            found = bundled(self.model, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
+            if found is not None:
+                return {i: Place.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
+        places = {newest.index: Place.of(self.model, pose, slacks[newest.index])}
+        for i in {s.keyframe for name in names for s in self._new.waiting()[name]}:
+            if i not in places and i in slacks and graph.is_open(i):
+                places[i] = Place.of(self.model, graph.current(graph.keyframes[i].key), slacks[i])
+        return places, pose
+
+    def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:
+        """By how many pixels the last keyframes may be off against the newest."""
+        slacks: dict[int, float] = {}
         to_anchor = since = (
             0.0  # variance of the turn from the newest to the first one that is anchored, and from that on
         )
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):
-            if not graph.is_open(index):
-                break
             if self._anchored.get(index, False):
                 reached, since = True, 0.0
-            slack = math.hypot(SLACK, self.model.fx * math.sqrt(to_anchor + since))
-            poses[index] = pose if index == newest.index else graph.current(graph.keyframes[index].key)
-            places[index] = Place.of(self.model, poses[index], slack)
+            slacks[index] = math.hypot(SLACK, self.model.fx * math.sqrt(to_anchor + since))
             step = graph.keyframes[index].from_previous
             if step is None:
                 break
             variance = float(step.covariance[2, 2])
             to_anchor, since = (to_anchor, since + variance) if reached else (to_anchor + variance, since)
-        last = sorted(poses)[-BUNDLE:]
-        if self._anchored[newest.index] or len(last) < FEWEST_SIGHTINGS:
-            return places, pose
-        keyframes = [graph.keyframes[index] for index in last]
-        slacks = [places[index].slack for index in last]
-        found = bundled(self.model, keyframes, [poses[index] for index in last], slacks, self._new.waiting())
-        if found is None:
-            return places, pose
-        return {i: Place.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
+        return slacks

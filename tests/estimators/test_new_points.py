@@ -1,5 +1,7 @@
 """When a point that no map has is taken in, and where it is."""
 
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 import pytest
@@ -91,7 +93,7 @@ def test_rays_that_meet_behind_the_camera_are_no_point() -> None:
     assert located(poses, pixels_of(poses)[::-1]) is None
 
 
-def places(poses: Array, slack: float = 0.0):
+def places(poses: Array, slack: float = 0.0) -> Callable[[int], Place]:
     return lambda k: Place.of(MODEL, poses[k], slack)
 
 

@@ -1,0 +1,164 @@
+"""Points in space that are estimated on the way, from their pixels in a simulated room, with and without a part of the map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import VelocityStream
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import se2
+from tests.estimators import camera_world
+
+UNKNOWN = {"landmarks": "unknown"}
+CONFIGS = {
+    "smoother": RunConfig("smoother", UNKNOWN),
+    "smoother_lag": RunConfig("smoother", {**UNKNOWN, "lag": 6.0}),
+    "batch": RunConfig("batch", UNKNOWN),
+}
+SEEDS = range(1, 9)
+SECONDS = 24.0
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return {seed: camera_world.simulate(seed, SECONDS) for seed in SEEDS}
+
+
+@pytest.fixture(scope="module")
+def log(logs):
+    return logs[1]
+
+
+@pytest.fixture(scope="module")
+def mapped(logs):
+    """``mapped(name, seed=1)``: the result of SLAM, computed once."""
+    known = {}
+
+    def of(name, seed=1):
+        if (name, seed) not in known:
+            known[name, seed] = run(logs[seed], CONFIGS[name])
+        return known[name, seed]
+
+    return of
+
+
+def errors(result, log):
+    """Errors (N, 3) of the final trajectory."""
+    out = result.final.poses - log.reference.at(result.final.t)
+    out[:, 2] = se2.wrap(out[:, 2])
+    return out
+
+
+def rmse(result, log):
+    return float(np.sqrt(np.mean(np.sum(errors(result, log)[:, :2] ** 2, axis=1))))
+
+
+def truth_of(points, log):
+    true = log.world.points
+    return np.array([true.positions[true.index[name]] for name in points.names])
+
+
+def with_wrong(log, share, seed=0):
+    """A share of the pixels is anywhere in the image."""
+    rng = np.random.default_rng(seed)
+    s = log.streams["sightings"]
+    wrong = rng.random(len(s.t)) < share
+    u = np.where(wrong, rng.uniform(0.0, 640.0, len(s.t)), s.u)
+    v = np.where(wrong, rng.uniform(0.0, 480.0, len(s.t)), s.v)
+    return replace(log, streams={**log.streams, "sightings": replace(s, u=u, v=v)})
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_points_without_a_map_hold_the_robot(mapped, log, name):
+    alone = run(log, RunConfig("dead_reckoning"))
+    result = mapped(name)
+    assert rmse(result, log) < 0.35 * rmse(alone, log)
+    assert result.diagnostics.events == []
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_points_are_where_they_are(mapped, log, name):
+    points = mapped(name).learnt.points
+    off = np.linalg.norm(points.positions - truth_of(points, log), axis=1)
+    assert len(points) > 60
+    assert np.median(off) < 0.25
+    assert np.all(np.linalg.eigvalsh(points.covariances) > 0.0)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_scale_is_that_of_the_odometry(mapped, log, name):
+    # 5 % of noise per square root of a metre is about 2 % of the 7 m that the robot drives
+    points = mapped(name).learnt.points
+    true = truth_of(points, log)
+    spread, expected = (np.linalg.norm(p - p.mean(axis=0), axis=1).mean() for p in (points.positions, true))
+    assert spread / expected == pytest.approx(1.0, abs=0.08)
+
+
+def test_smoother_and_batch_agree(mapped):
+    smoother, batch = mapped("smoother"), mapped("batch")
+    apart = smoother.final.poses - batch.final.poses
+    apart[:, 2] = se2.wrap(apart[:, 2])
+    squared = [d @ np.linalg.solve(c, d) for d, c in zip(apart, batch.final.covariances, strict=True)]
+    # they differ in which sightings they took for wrong or came too late, not in what they make of them
+    assert np.mean(squared) < 0.3
+
+
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_errors_are_as_large_as_the_covariances_say(mapped, logs, name):
+    # the last pose of eight runs; the mean leaves this band once in a thousand
+    total = 0.0
+    for seed in SEEDS:
+        result = mapped(name, seed)
+        error = errors(result, logs[seed])[-1]
+        total += error @ np.linalg.solve(result.final.covariances[-1], error)
+    assert chi2.ppf(0.0005, 24) < total < chi2.ppf(0.9995, 24)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_wrong_pixels_do_little_harm(mapped, log, name):
+    result = run(with_wrong(log, 0.1), CONFIGS[name])
+    assert rmse(result, log) < max(2.0 * rmse(mapped(name), log), 0.2)
+    assert result.diagnostics.rejected["camera: does not agree with the others"] > 5
+
+
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_what_the_map_has_holds_the_rest_in_place(log, name):
+    known = log.world.points
+    rows = np.arange(0, len(known), 4)
+    part = PointMap.of([known.names[i] for i in rows], known.positions[rows])
+    result = run(replace(log, world=World(points=part)), RunConfig(name, {"landmarks": "extended"}))
+    assert rmse(result, log) < 0.08
+    learnt = result.learnt.points
+    assert not set(learnt.names) & set(part.names)
+    assert np.median(np.linalg.norm(learnt.positions - truth_of(learnt, log), axis=1)) < 0.1
+
+
+def test_points_leave_the_window_and_are_kept(mapped):
+    full, window = mapped("smoother"), mapped("smoother_lag")
+    assert len(window.learnt.points) > 0.8 * len(full.learnt.points)
+    assert len(set(window.learnt.points.names)) == len(window.learnt.points)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_robot_at_rest_or_turning_on_the_spot(name, turn):
+    camera = camera_world.CAMERA.model_copy(update={"x": 0.0, "y": 0.0})
+    t = np.arange(0.0, 15.0, 0.05)
+    poses = np.column_stack((0.0 * t, 0.0 * t, se2.wrap(turn * t)))
+    truth, points = Trajectory(t, poses), camera_world.room()
+    rng = np.random.default_rng(3)
+    seen = camera_world.sightings(truth, points, np.arange(0.1, 14.9, 0.2), rng, camera)
+    log = replace(
+        camera_world.with_camera(camera_world.simulate(1, 2.0), x=0.0, y=0.0),
+        streams={"odometry": VelocityStream(t, 0.0 * t, 0.0 * t + turn), "sightings": seen},
+        reference=truth,
+    )
+    result = run(log, CONFIGS[name])
+    assert np.all(np.isfinite(result.poses))
+    assert rmse(result, log) < 0.1
+    assert result.learnt.points is None or np.all(np.isfinite(result.learnt.points.covariances))
