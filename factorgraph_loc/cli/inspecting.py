@@ -105,7 +105,9 @@ def _print(log: Log, found: Inspection) -> None:
         "world": f"{log.world.name}, {len(log.world.landmarks)} landmarks, {len(log.world.tags)} tags",
         "start": "stated by the log" if log.start is not None else "not stated",
     }
-    if log.reference is None:
+    if log.reference is None and log.reference3 is not None:
+        about["reference"] = f"in space, {len(log.reference3)} poses"
+    elif log.reference is None:
         about["reference"] = "none: runs cannot be scored"
     elif not log.reference.has_heading:
         about["reference"] = "positions only, headings are not scored"

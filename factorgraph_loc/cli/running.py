@@ -42,6 +42,13 @@ COLUMNS = {
     "heading RMSE [rad]": ("heading_rmse", 4),
     "ANEES": ("anees", 2),
 }
+# and of one of a robot in space
+SPACE_COLUMNS = {
+    "position RMSE [m]": ("position_rmse", 3),
+    "max [m]": ("position_max", 3),
+    "rotation RMSE [rad]": ("rotation_rmse", 4),
+    "ANEES": ("anees", 2),
+}
 
 
 def run(
@@ -133,6 +140,21 @@ def compare(
         raise typer.Exit(1)
 
 
+def _print_space(scores: Mapping[str, Any]) -> bool:
+    """Print the accuracy of a robot in space; whether there is any."""
+    kinds = [kind for kind in ("causal", "final") if scores[f"{kind}.space_position_rmse"] is not None]
+    if kinds:
+        rows = [
+            (
+                kind,
+                *(show.number(scores[f"{kind}.space_{figure}"], digits) for figure, digits in SPACE_COLUMNS.values()),
+            )
+            for kind in kinds
+        ]
+        show.table(("in space", *SPACE_COLUMNS), rows)
+    return bool(kinds)
+
+
 def _print_accuracy(scores: Mapping[str, Any]) -> None:
     if scores["causal.position_rmse"] is not None or scores["final.position_rmse"] is not None:
         rows = [
@@ -140,7 +162,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
             for kind in ("causal", "final")
         ]
         show.table(("", *COLUMNS), rows)
-    else:
+    elif not _print_space(scores):
         typer.echo("there is no reference to score against")
     if scores["aligned.position_rmse"] is not None:
         position, heading = (

@@ -304,7 +304,7 @@ def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in missing]
     if blind := [s for s in _blind(log) if s in log.rig.sensors]:
         doubts.append(f"{log.name}: {', '.join(blind)} left out, as the rig {log.rig.name} has no [camera]")
-    if "odometry" not in sensors:
+    if "odometry" not in sensors and "twist" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
 
