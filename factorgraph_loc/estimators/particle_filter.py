@@ -46,7 +46,8 @@ class ParticleFilterSettings(FilterSettings):
     ``min_particles`` (KLD sampling: Fox, IJRR 22(12), 2003). ``resample_below``: effective sample size, as a share, below which
     they are resampled. ``smoothing_trajectories``: drawn backwards for the final result, through clouds
     ``smoothing_interval`` seconds apart. ``self_calibration``: constants to which the rig gives an uncertainty travel with
-    each particle, but not the sensor's time offset, which is taken as the rig has it."""
+    each particle, but not the sensor's time offset, which is taken as the rig has it, and not those of the camera, which widen
+    the noise of its pixels instead."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     kld: bool = False

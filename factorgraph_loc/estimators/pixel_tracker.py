@@ -2,7 +2,7 @@
 
 Where the place is not known, or is refuted by what is seen, frames tell it (:mod:`~factorgraph_loc.estimators.pixel_finder`). Else
 which points are seen is decided once, at the mean of the cloud; what they tell weighs the particles. The constants of the camera
-are those of the rig.
+are those of the rig: what is not known of them widens the noise.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.pixel_finder import PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels, Predicted, pixel_update
-from factorgraph_loc.rig import NOTHING
 from factors import reprojection, se2
 from factors.odometry import ChainState
+from factors.reprojection import TIME_OFFSET
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
@@ -26,7 +26,10 @@ class PixelTracker:
     """What pixels make of a cloud whose place is known; see the module."""
 
     def __init__(self, setup: Setup, motion: Motion, diagnostics: Diagnostics) -> None:
-        self._points = KnownPoints(setup, diagnostics, NOTHING, motion=motion)
+        self._constants = setup.rig.estimated_camera()
+        self._spread = np.diag(self._constants.sigmas**2)
+        self._points = KnownPoints(setup, diagnostics, self._constants, motion=motion)
+        self._motion = motion
         self._finder = PixelFinder(self._points, motion)
         self._rng = setup.rng
 
@@ -50,18 +53,27 @@ class PixelTracker:
         """What was seen of points of the map; None where that is nothing. Reports the innovation."""
         mean, covariance = cloud.moments
         covariance = se2.world_to_body(mean, covariance)
-        factor = self._points.factor(m, Predicted(mean, covariance))
+        twist = self._motion.twist(m.t) if self._points.needs_twist else None
+        unchanged = (np.zeros(len(self._spread)), self._spread) if self._constants.names else ()
+        factor = self._points.factor(m, Predicted(mean, covariance, *unchanged), None, twist)
         if factor is not None:
-            self._points.report(m.t, factor, pixel_update(factor, mean, covariance))
+            self._points.report(m.t, factor, pixel_update(factor, mean, covariance, *unchanged))
         return factor
 
-    @staticmethod
-    def log_likelihood(factor: ReprojectionFactor, cloud: Cloud) -> Array:
+    def log_likelihood(self, factor: ReprojectionFactor, cloud: Cloud) -> Array:
         """Of the particles (N,)."""
         spreads = None
-        if factor.point_covariances is not None:
+        if factor.point_covariances is not None or self._constants.names:
             mean, _ = cloud.moments
-            _, _, by_point, _ = reprojection.linearize(factor.model, mean, factor.points)
-            spreads = by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
-            spreads = spreads + factor.model.sigma**2 * np.eye(2)
+            _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, mean, factor.points)
+            spreads = np.broadcast_to(factor.model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
+            if factor.point_covariances is not None:
+                spreads = spreads + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+            if factor.twist is not None:
+                by_constants[..., TIME_OFFSET] = by_pose @ factor.twist
+            if self._constants.names:
+                by_constants = by_constants[..., list(self._constants.indices)]
+                # all pixels have this error in common: together they must not seem to be rid of it
+                common = by_constants @ self._spread @ by_constants.transpose(0, 2, 1)
+                spreads = spreads + len(common) * common
         return reprojection.log_likelihood(factor.model, cloud.poses, factor.points, factor.pixels, spreads)

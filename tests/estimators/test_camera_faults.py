@@ -144,6 +144,15 @@ def test_a_wrong_focal_length_is_estimated_or_shows(log):
         assert nis_per_degree(run(wrong, config)) > 2.0
 
 
+def test_particles_allow_for_what_is_not_known_of_the_camera(log):
+    wrong = with_camera(log, fx=1.05 * CAMERA.fx, fy=1.05 * CAMERA.fy)
+    blind = score(run(wrong, CONFIGS["particle_filter"]), log)
+    found = score(run(with_camera(wrong, uncertainty=CameraUncertainty(focal=0.05)), CONFIGS["particle_filter"]), log)
+    assert found["causal.position_rmse"] < 0.3 * blind["causal.position_rmse"]
+    assert blind["causal.anees"] > 100.0
+    assert found["causal.anees"] < 6.0  # of 3
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_camera_that_was_knocked_does_not_break_a_run(name, log):
     """A pitch that is wrong by 6 degrees: nothing agrees. What is told must be finite, and that it is wrong must show."""
