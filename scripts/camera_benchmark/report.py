@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,11 +32,14 @@ NOTHING = "–"
 
 @dataclass(frozen=True)
 class Attempt:
-    """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``."""
+    """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``.
+    ``seen``: how many points the camera's update had in the mean, NaN without any. ``events``: what happened, each text once."""
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
     warnings: tuple[str, ...] = ()
+    seen: float = math.nan
+    events: tuple[str, ...] = ()
     failure: str = ""
 
 
@@ -50,7 +54,10 @@ def attempt(log: Log, config: RunConfig) -> Attempt:
         return Attempt(None, {}, failure=str(error))
     except Exception as error:
         return Attempt(None, {}, failure=repr(error))
-    return Attempt(run_errors(result, log), score(result, log), result.warnings)
+    freedoms = [dof for _, _, dof in result.diagnostics.nis.get("camera", [])]
+    seen = sum(freedoms) / 2.0 / len(freedoms) if freedoms else math.nan
+    events = tuple(dict.fromkeys(text for _, text in result.diagnostics.events))
+    return Attempt(run_errors(result, log), score(result, log), result.warnings, seen, events)
 
 
 def attempts(log: Log, configs: Mapping[str, RunConfig]) -> dict[str, Attempt]:

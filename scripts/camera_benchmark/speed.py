@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 from benchmarking.report import Report
 
+from camera_benchmark.drives import COUNT, RATE, Drive, log_of, map_of, with_map
 from camera_benchmark.options import CameraOptions
+from factorgraph_loc.experiments.images import prepare
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.simulation import film, preset, simulate, with_images
+from factorgraph_loc.vision import frontend
+from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.feature_cache import VARIABLE
 
 POINTS = 3000  # so many that 20 are in sight nearly always
 SEED = 0
 WARM_UP = 20.0  # s of another drive: what is compiled at first use is no part of a step
 DURATION = 300.0  # s
+FIRST = 6000
+IMAGES, RENDERED = 600, 200
 KNOWN: Mapping[str, Any] = {"rounds_per_second": 10.0, "pixels": {"rate": 10.0}}
 KEYFRAMES: Mapping[str, Any] = {"pixels": {"rate": 2.0}}  # an image for each keyframe
 NO_MAP: Mapping[str, Any] = {"landmarks": "unknown"}
@@ -50,6 +62,26 @@ STEPS = (
 
 
 @dataclass(frozen=True)
+class Chain:
+    """What is kept of drives is in ``folder``."""
+
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Links:
+    """Seconds that a drive of some ``images`` takes, with a map of some ``points``."""
+
+    images: int
+    feature: str
+    points: int
+    find: float
+    follow: float
+    associate: float
+    smooth: float
+
+
+@dataclass(frozen=True)
 class Job:
     steps: Steps
     duration: float
@@ -57,8 +89,30 @@ class Job:
 
 def section(options: CameraOptions) -> Report:
     report = Report("speed", options)
+    chain(report, options)
     estimators(report, options.seconds(DURATION))
     return report
+
+
+def chain(report: Report, options: CameraOptions) -> None:
+    """From images to poses, and how fast images are made."""
+    job = Chain(options.drives)
+    for what, function in (("chain", chained), ("renderer", rendered)):
+        found = report.collect(function, [job], [what], workers=1)
+        if found and what == "chain":
+            links: Links = found[0]
+            report.say(
+                f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
+                f"{links.points} points; {os.cpu_count()} processes find features, the rest has one. *Smooth*: what the smoother "
+                "does but for finding the points of the map among the features. Targets: 15 images/s, 10 % of it to smooth"
+            )
+            whole = links.find + links.follow + links.associate + links.smooth
+            parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
+            cells = (f"{1e3 * s / links.images:.1f} ({100 * s / whole:.0f} %)" for s in parts.values())
+            heads = (*(f"{name} [ms]" for name in parts), "images/s")
+            report.table(heads, [(*cells, f"{links.images / whole:.1f}")])
+        elif found:
+            report.say(f"The renderer makes {found[0]:.1f} images/s on one core; target: 20.")
 
 
 def estimators(report: Report, duration: float) -> None:
@@ -77,6 +131,59 @@ def estimators(report: Report, duration: float) -> None:
         rows.append((steps.what, steps.config.estimator, step, later, steps.target, f"{points:.1f}"))
     heads = ("what", "estimator", "median / p99 / max [ms]", "second half", "target", "points an image")
     report.table(heads, rows)
+
+
+def chained(job: Chain) -> Links:
+    """From the files of a drive to its poses, nothing of it in a cache."""
+    drive = Drive(FIRST, FIRST, IMAGES / RATE)
+    points = map_of(drive, job.folder)
+    config = RunConfig("smoother", {"lag": 10.0}, ("odometry", "rfid", "camera"))
+    warm, _ = log_of(replace(drive, seed=FIRST + 1, duration=WARM_UP), job.folder)
+    run(with_map(warm, points), config)
+    with tempfile.TemporaryDirectory() as name:
+        os.environ[VARIABLE] = name
+        folder = Path(name) / "images"
+        folder.mkdir()
+        settings = drive.settings()
+        log = with_map(with_images(simulate(settings, drive.seed), settings, drive.seed, folder), points)
+        with spent(frontend, "follow") as follow, spent(Associator, "guided") as associate:
+            prepared = prepare(log, config.sensors or (), config.estimator)
+            started = perf_counter()
+            run(prepared.log, config)
+            smooth = perf_counter() - started
+    find = prepared.seconds - sum(follow)
+    return Links(
+        prepared.images, drive.feature, len(points), find, sum(follow), sum(associate), smooth - sum(associate)
+    )
+
+
+def rendered(_: Chain) -> float:
+    """Images per second, the scene and what is compiled at first use left out."""
+    drive = Drive(FIRST, FIRST, RENDERED / RATE)
+    images = iter(film(drive.settings(), drive.seed))
+    next(images)
+    started = perf_counter()
+    count = sum(1 for _ in images)
+    return count / (perf_counter() - started)
+
+
+@contextmanager
+def spent(owner: object, name: str) -> Iterator[list[float]]:
+    """The seconds of each call of a function of a module or class."""
+    function, seconds = getattr(owner, name), []
+
+    def timed_call(*arguments: Any, **named: Any) -> Any:
+        started = perf_counter()
+        try:
+            return function(*arguments, **named)
+        finally:
+            seconds.append(perf_counter() - started)
+
+    setattr(owner, name, timed_call)
+    try:
+        yield seconds
+    finally:
+        setattr(owner, name, function)
 
 
 def timed(job: Job) -> tuple[np.ndarray, float]:

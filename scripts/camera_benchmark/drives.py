@@ -1,0 +1,196 @@
+"""Drives through rendered offices: the features of their images, kept in files, and the map that another drive teaches.
+
+Images are compressed as those of a log, and never written. What is kept is named by a hash of everything that it depends on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.calibration.camera_poses import posed_frames
+from factorgraph_loc.calibration.point_mapping import map_points
+from factorgraph_loc.experiments.prior import REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA
+from factorgraph_loc.files import replacing
+from factorgraph_loc.log import FeatureStream, ImageStream, Log
+from factorgraph_loc.measurements import CameraFrame
+from factorgraph_loc.points import PointMap, read_points, write_points
+from factorgraph_loc.simulation import film, preset, simulate, with_images
+from factorgraph_loc.simulation.filming import JPEG
+from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.vision.features import extractor
+from factorgraph_loc.vision.found import decode, encode
+from factorgraph_loc.vision.frontend import FEATURE_CODE, TRACK_CODE, code_version
+from factorgraph_loc.vision.tracks import follow
+
+TAGS = 20
+RATE, MAP_RATE = 5.0, 2.0  # images/s
+COUNT = 500  # features of an image
+MAP_DURATION = 600.0  # s
+MAP_SEED = 100_000  # is added to the seed of the drive that the map is learnt from
+SIGMAS = np.array(
+    (REFERENCE_POSITION_SIGMA, REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
+)  # of that drive's poses
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive of ``seed`` through the office of ``world``, ``duration`` [s] long, and what is looked for in its images."""
+
+    world: int
+    seed: int
+    duration: float
+    rate: float = RATE
+    feature: str = "colour"
+    count: int = COUNT
+
+    def settings(self) -> SimulationSettings:
+        changes: dict[str, Any] = {
+            "world": {"tags": TAGS},
+            "world_seed": self.world,
+            "drive": {"duration": self.duration},
+            "images": {"rate": self.rate},
+            "rig": {"camera": {"frontend": {"feature": self.feature, "count": self.count}}},
+        }
+        return preset("office", changes)
+
+    def mapping(self) -> Drive:
+        """The other drive through the same office, which the map is learnt from."""
+        return replace(self, seed=self.seed + MAP_SEED, duration=MAP_DURATION, rate=MAP_RATE)
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """What it took to make a drive's features: to render, to find and to follow them [s], for all images."""
+
+    render: float
+    find: float
+    follow: float
+
+
+def log_of(drive: Drive, folder: Path) -> tuple[Log, Seconds]:
+    """The log of a drive with the features of its images and without a map of points; these are kept in ``folder``."""
+    settings = drive.settings()
+    log = simulate(settings, drive.seed)
+    path = folder / f"{_key(drive)}.npz"
+    if not path.exists():
+        _write_features(drive, settings, path)
+    stream, seconds = _read_features(drive, path)
+    streams = {**log.streams, "camera": stream}
+    rig = log.rig.model_copy(update={"sensors": (*log.rig.sensors, "camera")})
+    return replace(log, streams=streams, rig=rig), seconds
+
+
+def written(drive: Drive, folder: Path) -> Log:
+    """The log of a drive with the files of its images, which are kept in ``folder``, and without a map of points."""
+    settings = drive.settings()
+    log = simulate(settings, drive.seed)
+    path = folder / f"{_key(drive)}-images"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as name:
+            with_images(log, settings, drive.seed, Path(name))
+            Path(name).rename(path)  # the context does not mind
+    times = film(settings, drive.seed).stamps
+    return replace(log, streams={**log.streams, "camera": ImageStream(times, sorted(path.glob("*.jpg")))})
+
+
+def map_of(drive: Drive, folder: Path) -> PointMap:
+    """What the mapping drive of a drive teaches; its poses are known as well as a reference is."""
+    other = drive.mapping()
+    path = folder / f"{_key(other)}-{code_of('calibration')}.points.parquet"
+    if not path.exists():
+        log, _ = log_of(other, folder)
+        made = map_points(other.settings().rig.camera.model(), posed_frames(with_errors(log, other.seed), 0.0, 0.0))
+        write_points(made.points, path)
+    return read_points(path)
+
+
+def with_map(log: Log, points: PointMap) -> Log:
+    return replace(log, world=log.world.model_copy(update={"points": points}))
+
+
+def with_errors(log: Log, seed: int) -> Log:
+    """The log with a reference that is wrong by as much as it says."""
+    truth = log.reference
+    assert truth is not None
+    noise = SIGMAS * np.random.default_rng(seed).standard_normal((len(truth), 3))
+    spread = np.repeat(np.diag(SIGMAS**2)[None], len(truth), axis=0)
+    return replace(log, reference=Trajectory(truth.t, truth.poses + noise, spread))
+
+
+def images(settings: SimulationSettings, seed: int) -> Iterator[np.ndarray]:
+    """The images of a drive as they come out of a log."""
+    cv2.setNumThreads(1)
+    for _, image in film(settings, seed):
+        yield compressed(image)
+
+
+def compressed(image: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, JPEG)[1], cv2.IMREAD_COLOR))
+
+
+def _write_features(drive: Drive, settings: SimulationSettings, path: Path) -> None:
+    finder = extractor(drive.feature, drive.count)
+    contents, times = [], [perf_counter()]
+    render = 0.0
+    for image in images(settings, drive.seed):
+        render += perf_counter() - times[-1]
+        contents.append(encode(*finder.detectAndCompute(image)))
+        times.append(perf_counter())
+    found = [decode(content) for content in contents]
+    camera = settings.rig.camera
+    assert camera is not None
+    started = perf_counter()
+    tracks = follow([f.pixels for f in found], [f.descriptors for f in found], camera.model(), binary=finder.binary)
+    seconds = np.array((render, times[-1] - times[0] - render, perf_counter() - started))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            stamps=film(settings, drive.seed).stamps,
+            content=np.frombuffer(b"".join(contents), dtype=np.uint8),
+            lengths=np.array([len(content) for content in contents]),
+            tracks=np.concatenate(tracks),
+            seconds=seconds,
+        )
+
+
+def _read_features(drive: Drive, path: Path) -> tuple[FeatureStream, Seconds]:
+    with np.load(path) as stored:
+        content, ends = stored["content"].tobytes(), np.cumsum(stored["lengths"]).tolist()
+        found = [decode(content[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        numbers = np.split(stored["tracks"], np.cumsum([len(f.pixels) for f in found])[:-1])
+        t = stored["stamps"]
+        frames = [
+            CameraFrame(stamp, drive.feature, f.pixels, f.sizes, f.descriptors, tracks)
+            for stamp, f, tracks in zip(t.tolist(), found, numbers, strict=True)
+        ]
+        return FeatureStream(t, frames), Seconds(*stored["seconds"].tolist())
+
+
+def _key(drive: Drive) -> str:
+    about = f"{drive.settings().model_dump_json()} {drive.seed} {code_of('simulation')} {code_version(FEATURE_CODE + TRACK_CODE)}"
+    return hashlib.sha256(about.encode()).hexdigest()[:16]
+
+
+@cache
+def code_of(package: str) -> str:
+    """A hash of the code of a package of the library."""
+    digest = hashlib.sha256()
+    folder = resources.files(f"factorgraph_loc.{package}")
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
+        if file.name.endswith(".py"):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:8]

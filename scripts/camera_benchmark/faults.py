@@ -1,0 +1,113 @@
+"""What goes wrong, one thing at a time: what it costs, what is said about it, and whether the estimate comes back."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from benchmarking.report import Report, pooled
+
+from camera_benchmark.drives import Drive, map_of, with_map, written
+from camera_benchmark.faulty import FAULTS, Given
+from camera_benchmark.office import BOTH, CAMERA
+from camera_benchmark.options import CameraOptions
+from camera_benchmark.report import NOTHING, Attempt, attempts
+from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.vision.feature_cache import VARIABLE
+
+SEEDS = 3
+FIRST = 9000
+DURATION = 150.0  # s
+AFTERWARDS = 30.0  # s at the end, when whatever lasts for a time is over
+BACK = 0.10  # m: an estimate that is no farther off then has recovered
+RIGHT = "none"
+CONFIGS = {
+    "ekf, camera": RunConfig("ekf", sensors=CAMERA),
+    "monoslam, camera": RunConfig("monoslam", sensors=CAMERA),
+    "smoother, camera": RunConfig("smoother", sensors=CAMERA),
+    "smoother, rfid, camera": RunConfig("smoother", sensors=BOTH),
+}
+SHOWN = 110  # characters of a message
+
+
+@dataclass(frozen=True)
+class Job:
+    fault: str
+    drive: Drive
+    folder: Path
+
+
+def section(options: CameraOptions) -> Report:
+    report = Report("faults", options)
+    drives = [Drive(FIRST + i, FIRST + i, options.seconds(DURATION)) for i in range(options.count(SEEDS))]
+    # a drive's images are written and mapped once, before several processes want them
+    ready = report.collect(
+        prepared, [Job(RIGHT, drive, options.drives) for drive in drives], [str(d.seed) for d in drives]
+    )
+    jobs = [Job(fault, drives[i], options.drives) for fault in FAULTS for i in sorted(ready)]
+    outcomes = report.collect(faulty, jobs, [f"{job.fault}, seed {job.drive.seed}" for job in jobs])
+    report.say(
+        f"{len(ready)} rendered offices of {options.seconds(DURATION):.0f} s with a map from another drive, pooled. *Afterwards*: "
+        f"causal position RMSE in the last {AFTERWARDS:.0f} s, of the worst run. *Said*: warnings, events, and what changed in the "
+        "diagnostics, of the first office; NIS is that of the camera per degree of freedom"
+    )
+    rows = []
+    for label in CONFIGS:
+        right = [outcomes[i][label] for i, job in enumerate(jobs) if job.fault == RIGHT and i in outcomes]
+        for fault in FAULTS:
+            runs = [outcomes[i][label] for i, job in enumerate(jobs) if job.fault == fault and i in outcomes]
+            if runs:
+                rows.append((fault, label, *cells(runs), said(runs[0], right[0] if right else runs[0])))
+    report.table(("fault", "run", "causal [m] / [deg]", "final [m] / [deg]", "afterwards [m]", "said"), rows)
+    return report
+
+
+def prepared(job: Job) -> int:
+    written(job.drive, job.folder)
+    return len(map_of(job.drive, job.folder))
+
+
+def faulty(job: Job) -> dict[str, Attempt]:
+    """All runs on a drive with a fault, from the files of its images."""
+    os.environ[VARIABLE] = str(job.folder)
+    log = with_map(written(job.drive, job.folder), map_of(job.drive, job.folder))
+    folder = job.folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', job.fault.lower())}-{job.drive.seed}"
+    return attempts(FAULTS[job.fault](Given(log, np.random.default_rng(job.drive.seed), folder)), CONFIGS)
+
+
+def cells(runs: Sequence[Attempt]) -> tuple[str, str, str]:
+    errors = [one.errors for one in runs if one.errors is not None]
+    if len(errors) < len(runs):
+        return NOTHING, NOTHING, NOTHING
+    causal, final = (
+        "{:.3f} / {:.2f}".format(*pooled([getattr(one, kind) for one in errors])) for kind in ("causal", "final")
+    )
+    last = max(one.causal.where(one.causal.t > one.causal.t[-1] - AFTERWARDS).position_rmse() for one in errors)
+    return causal, final, f"{last:.3f}" + ("" if last <= BACK else ", lost")
+
+
+def said(one: Attempt, right: Attempt) -> str:
+    """What a user is told that is not told without the fault."""
+    if one.failure:
+        return short(one.failure)
+    parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]
+    parts += [short(text) for text in one.events if text not in right.events]
+    for name, key in (("NIS", "nis.camera.mean_per_dof"), ("rejected", "rejected.total"), ("late", "late.total")):
+        now, before = one.figures.get(key), right.figures.get(key)
+        if now is not None and before is not None and abs(now - before) > 0.2 * abs(before):
+            parts.append(f"{name} {before:.3g} → {now:.3g}")
+    for key, value in one.figures.items():
+        if key.startswith("learnt.camera.") and key.endswith(".value"):
+            sigma = one.figures[key.replace(".value", ".sigma")]
+            parts.append(f"{key.removeprefix('learnt.').removesuffix('.value')} {value:.4f} ± {sigma:.4f}")
+    return "; ".join(parts) or NOTHING
+
+
+def short(text: str) -> str:
+    text = text.replace("|", "/")
+    text = re.sub(r"/[^ ]*/", "", text)  # folders
+    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."

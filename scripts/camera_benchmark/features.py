@@ -1,0 +1,89 @@
+"""Which feature: the same rendered offices with each of them, in the map and in the images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from benchmarking.report import Report
+
+from camera_benchmark.drives import COUNT, Drive, log_of, map_of, with_map
+from camera_benchmark.office import BEST, CONFIGS
+from camera_benchmark.options import CameraOptions
+from camera_benchmark.report import ACCURACY, Attempt, accuracy_cells, attempts, failures, succeeded
+
+SEEDS = 4
+DURATION = 300.0  # s
+FIRST = 8000
+FEATURES = ("colour", "sift", "orb")
+RUNS = ("smoother, camera", BEST)
+
+
+@dataclass(frozen=True)
+class Job:
+    drive: Drive
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """``runs`` by label; ``points`` of the map; how many features an image has, and how many of them are ``matched`` with the map;
+    milliseconds that an image takes."""
+
+    runs: dict[str, Attempt]
+    points: int
+    features: float
+    matched: float
+    find_ms: float
+    follow_ms: float
+
+
+def section(options: CameraOptions) -> Report:
+    report = Report("features", options)
+    count, duration = options.count(SEEDS), options.seconds(DURATION)
+    jobs = [
+        Job(Drive(FIRST + i, FIRST + i, duration, feature=feature), options.drives)
+        for i in range(count)
+        for feature in FEATURES
+    ]
+    labels = [f"{job.drive.feature}, seed {job.drive.seed}" for job in jobs]
+    outcomes = report.collect(localized, jobs, labels)
+    report.say(
+        f"{count} rendered offices of {duration:.0f} s, as above, with each feature, at most {COUNT} in an image. *Matched*: "
+        "points of the map that an image shows. Times are those of one core, with the other one busy"
+    )
+    accuracy, counts = [], []
+    for feature in FEATURES:
+        of_feature = {jobs[i].drive.seed: one for i, one in outcomes.items() if jobs[i].drive.feature == feature}
+        found = {seed: outcome.runs for seed, outcome in of_feature.items()}
+        failures(report, found)
+        for label in RUNS:
+            runs = list(succeeded(found, label).values())
+            if runs:
+                accuracy.append((feature, label, *accuracy_cells(runs)))
+        if of_feature:
+            means = [
+                np.mean([getattr(one, what) for one in of_feature.values()])
+                for what in ("points", "features", "matched", "find_ms", "follow_ms")
+            ]
+            counts.append((feature, *(f"{value:.0f}" for value in means[:3]), *(f"{value:.1f}" for value in means[3:])))
+    report.table(("feature", "run", *ACCURACY), accuracy)
+    report.table(("feature", "points in the map", "features", "matched", "to find [ms]", "to follow [ms]"), counts)
+    return report
+
+
+def localized(job: Job) -> Outcome:
+    """Both runs on one drive with one feature."""
+    log, seconds = log_of(job.drive, job.folder)
+    points = map_of(job.drive, job.folder)
+    runs = attempts(with_map(log, points), {label: CONFIGS[label] for label in RUNS})
+    frames = log.streams["camera"].frame  # type: ignore[attr-defined]
+    return Outcome(
+        runs,
+        len(points),
+        float(np.mean([len(frame.pixels) for frame in frames])),
+        runs[RUNS[0]].seen,
+        1e3 * seconds.find / len(frames),
+        1e3 * seconds.follow / len(frames),
+    )
