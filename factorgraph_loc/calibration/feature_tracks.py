@@ -65,9 +65,9 @@ def near_epipolar_lines(
     x, y, z = shift
     essential = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ rotation
     a, b = (np.column_stack((undistorted(model, pixels), np.ones(len(pixels)))) for pixels in (first, second))
-    lines_j, lines_i = a @ essential.T, b @ essential
-    off = np.abs(lines_j @ b.T)
-    limit = gate / np.sqrt(model.fx * model.fy)
+    lines_j, lines_i = (lines.astype(np.float32) for lines in (a @ essential.T, b @ essential))
+    off = np.abs(lines_j @ b.T.astype(np.float32))  # single precision is a thousandth of a pixel, and half of the time
+    limit = np.float32(gate / np.sqrt(model.fx * model.fy))
     return np.asarray(
         (off <= limit * np.hypot(lines_j[:, 0], lines_j[:, 1])[:, None]) & (off <= limit * np.hypot(*lines_i[:, :2].T))
     )

@@ -77,11 +77,15 @@ class ImageLocalizer:
         return place
 
     def all(
-        self, frames: Sequence[CameraFrame], t: Array, progress: Callable[[float], None] = lambda _: None
+        self,
+        frames: Sequence[CameraFrame],
+        t: Array,
+        ones: Sequence[Located | None],
+        progress: Callable[[float], None] = lambda _: None,
     ) -> list[Located | None]:
-        """The poses of a sequence of images, taken at ``t`` (F,) [s], from one graph. None for all where the map tells too few."""
-        places = self._extended(frames, [self.one(frame) for frame in frames])
-        progress(0.4)
+        """The poses of a sequence of images, taken at ``t`` (F,) [s], from one graph; ``ones``: what :meth:`one` says of each,
+        which is the answer where the graph cannot be solved. None for all where the map tells too few."""
+        places = self._extended(frames, ones)
         cameras = smooth_start(t, places)
         if cameras is None:
             return [None] * len(frames)
@@ -89,16 +93,19 @@ class ImageLocalizer:
         spread = np.diag(np.repeat(np.square(SURE), 3))
         pairs = overlapping_pairs(cameras)
         tracks = chained(frames, matched_pairs(self._model, cameras, frames, pairs, EPIPOLAR))
-        progress(0.6)
+        progress(0.5)
         for i in range(ROUNDS):
-            adjusted = self._solved(frames, t, cameras, seen, tracks)
+            try:
+                adjusted = self._solved(frames, t, cameras, seen, tracks)
+            except RuntimeError:  # GTSAM's of a system that is not determined
+                return places
             cameras, covariances = adjusted.cameras, adjusted.camera_covariances
             found = [
                 self._associated(frame, Located(p, r, c + spread, NOTHING, NOTHING))
                 for frame, p, r, c in zip(frames, cameras.positions, cameras.rotations, covariances, strict=True)
             ]
             seen = found
-            progress(0.6 + 0.4 * (i + 1) / ROUNDS)
+            progress(0.5 + 0.5 * (i + 1) / ROUNDS)
         return [replace(place, covariance=c) for place, c in zip(found, covariances, strict=True)]
 
     def _extended(self, frames: Sequence[CameraFrame], places: Sequence[Located | None]) -> list[Located | None]:

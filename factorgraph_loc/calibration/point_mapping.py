@@ -110,15 +110,18 @@ def map_points(
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
     total, (seen, old) = tracks.count, tracks.kept(good[tracks.track])
-    adjusted = bundle.adjust(
-        model,
-        posed.cameras,
-        posed.covariances,
-        seen,
-        found.positions[old],
-        focal=settings.focal,
-        progress=lambda share: progress(0.7 + 0.3 * share),
-    )
+    try:
+        adjusted = bundle.adjust(
+            model,
+            posed.cameras,
+            posed.covariances,
+            seen,
+            found.positions[old],
+            focal=settings.focal,
+            progress=lambda share: progress(0.7 + 0.3 * share),
+        )
+    except RuntimeError as error:  # GTSAM's of a system that is not determined
+        raise RunFailedError(f"points and cameras cannot be adjusted: {str(error).splitlines()[0]}") from error
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
     shift, turn = _moved(posed.cameras, adjusted.cameras)

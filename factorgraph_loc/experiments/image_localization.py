@@ -120,7 +120,7 @@ def evaluate_images(
                 ones.append(localizer.one(frame))
                 told(len(ones) / len(frames))
             done += 1
-            both = localizer.all(frames, t, told)
+            both = localizer.all(frames, t, ones, told)
             done += 1
             for method, places in zip(METHODS, (ones, both), strict=True):
                 outcomes.append(_outcome(feature, query, method, numbers, places, truth))

@@ -26,7 +26,7 @@ def a_map(sight, rng, known, sigma=0.002):
         "sift",
         np.arange(count),
         looks[known],
-        np.repeat(sight.cameras.positions[6][None], count, axis=0),
+        np.repeat(sight.cameras.positions[len(sight.frames) // 2][None], count, axis=0),
         np.full(count, 4.0),
     )
 
@@ -55,7 +55,7 @@ def test_an_image_of_elsewhere_is_not_located(look):
     frame = sight.frames[0]
     other = replace(frame, descriptors=rng.standard_normal(frame.descriptors.shape).astype(np.float32))
     assert localizer.one(other) is None
-    assert localizer.all([other] * 3, T[:3]) == [None] * 3
+    assert localizer.all([other] * 3, T[:3], [None] * 3) == [None] * 3
 
 
 def test_the_graph_is_better_than_single_images(look):
@@ -63,7 +63,7 @@ def test_the_graph_is_better_than_single_images(look):
     sight = look(rng, noise=1.0)
     localizer = ImageLocalizer(a_map(sight, rng, rng.choice(150, 40, replace=False)), sight.model)
     one = [localizer.one(frame) for frame in sight.frames]
-    both = localizer.all(sight.frames, T)
+    both = localizer.all(sight.frames, T, one)
     assert np.mean(errors(sight, both)) < 0.7 * np.mean(errors(sight, one))
 
 
@@ -79,8 +79,9 @@ def test_the_graph_reaches_beyond_the_map(look):
             replace(frame, pixels=frame.pixels[keep], sizes=frame.sizes[keep], descriptors=frame.descriptors[keep])
         )
     localizer = ImageLocalizer(a_map(sight, rng, known), sight.model)
-    assert all(localizer.one(frame) is None for frame in frames[8:])
-    places = localizer.all(frames, T)
+    ones = [localizer.one(frame) for frame in frames]
+    assert ones[8:] == [None] * 4
+    places = localizer.all(frames, T, ones)
     assert errors(sight, places).max() < 0.03
 
 
@@ -126,3 +127,16 @@ def test_gaps_are_not_bridged(t, factors):
     graph = gtsam.NonlinearFactorGraph()
     SteadyMotion(np.array(t)).add_to(graph)
     assert graph.size() == factors
+
+
+def test_a_graph_that_cannot_be_solved_leaves_single_images(look, monkeypatch):
+    rng = np.random.default_rng(7)
+    sight = look(rng, noise=0.5, count=4)
+    localizer = ImageLocalizer(a_map(sight, rng, np.arange(150)), sight.model)
+
+    def fails(*_, **__):
+        raise RuntimeError("Indeterminant linear system")
+
+    monkeypatch.setattr("factorgraph_loc.calibration.bundle.adjust", fails)
+    ones = [localizer.one(frame) for frame in sight.frames]
+    assert localizer.all(sight.frames, T[:4], ones) == ones
