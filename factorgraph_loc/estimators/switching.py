@@ -65,14 +65,15 @@ class Switching:
         )
         self._tags: Filter = ParticleFilter(by_tags, of_tags)
         self._vision: Filter = Ekf(by_sight, EkfSettings(max_delay=delay, smooth=False, self_calibration=False))
-        self.supports_unknown_start = "rfid" in setup.sensors
+        by_scans = "rfid" in setup.sensors
+        self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
         for part in (self._tags, self._vision):
             for shared in fields(Diagnostics):
                 setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))
         # both filters take the odometry: the second would count what is late or ignored once more
         self._vision.diagnostics.late = {}
         self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
-        self._active: Filter = self._tags if self.supports_unknown_start else self._vision
+        self._active: Filter = self._tags if by_scans else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []
         self._records: dict[float, _Record] = {}  # by their times: the last one counts
