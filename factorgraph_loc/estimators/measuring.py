@@ -274,6 +274,9 @@ class MeasuringGraph(KeyframeGraph):
         rows = list(range(len(m.pixels)))
         if isinstance(m, PixelSightings):
             rows = [i for i in rows if m.points[i] not in self._points.map.index]
+        else:
+            used = set(self._points.used.tolist())
+            rows = [i for i in rows if i not in used]
         shared = (CAMERA_KEY,) if self._camera_constants.names else ()
         changes = None
         if shared:

@@ -98,15 +98,15 @@ class NewPoints:
         self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
 
     def ready(
-        self, names: Iterable[Hashable], places: Callable[[int], Place | None]
+        self, names: Iterable[Hashable], places: Callable[[int], Place | None], most: int = 1000
     ) -> list[tuple[Hashable, Triangulated, list[Sighting]]]:
-        """Those of ``names`` whose place is told by now, with the sightings that tell it; they wait no longer. ``places``: of
-        keyframes, None for one that nothing can be added to."""
-        found = []
+        """Those of ``names``, at ``most`` so many, whose place is told by now, with the sightings that tell it; they wait no
+        longer. ``places``: of keyframes, None for one that nothing can be added to."""
+        found: list[tuple[Hashable, Triangulated, list[Sighting]]] = []
         known: dict[int, Place | None] = {}
         for name in names:
             waiting = self._waiting.get(name, [])
-            if len(waiting) < FEWEST:
+            if len(waiting) < FEWEST or len(found) >= most:
                 continue
             for sighting in waiting:
                 if sighting.keyframe not in known:

@@ -69,6 +69,7 @@ class KnownPoints:
         if setup.world.points is not None and use != "unknown":
             self.map = setup.world.points
         self._others_matter = use != "known"
+        self.used = np.empty(0, dtype=np.int64)  # features of the last image that show points of the map
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
@@ -112,6 +113,7 @@ class KnownPoints:
 
         ``twist`` (3,): the robot's velocity then, where the camera's time offset is estimated.
         """
+        self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
         if factor is None:
             return None
@@ -166,7 +168,8 @@ class KnownPoints:
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
         """A factor of no points yet, where features can be found in the map."""
         if self.model is None or self.associator is None:
-            self._diagnostics.ignore("camera", len(m.pixels))
+            if self.model is None or not self._others_matter:
+                self._diagnostics.ignore("camera", len(m.pixels))
             return None
         if m.feature != self.map.feature:
             self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
@@ -179,6 +182,7 @@ class KnownPoints:
         """A factor of the points that are found in a frame."""
         assert self.associator is not None
         seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        self.used = seen.features
         self.missed = len(seen) < FEW and min(seen.expected, len(m.pixels)) >= MANY
         if seen.rejected:
             self._diagnostics.reject(DISAGREES, seen.rejected)

@@ -11,30 +11,35 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.graph_parts import Addition, Guess, Keyframe
 from factorgraph_loc.estimators.local_bundle import bundled
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of, spread_out
+from factorgraph_loc.estimators.refound_points import refound
 from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.estimators.variables import Node, Values, point_key
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
-from factorgraph_loc.vision.consensus import FEWEST, Truths, agreeing
+from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factors import reprojection, se2
 from factors.point_sighting import PointSightings
 from factors.reprojection import CameraModel, recalibrated
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
-PER_KEYFRAME = 40  # points, those that wait included
+PER_KEYFRAME, WAITING = 40, 60  # points that are seen from one, and that wait
 STRIKES = 2
 ANCHORED = 4  # points of the graph that place a keyframe well: to SLACK pixels
 SLACK = 2.0  # px
+RECENT = 5.0  # s: a point that was seen since has the error of the track now
+REVISITED = 6  # points not seen for longer that together are right, whatever the others say
 HORIZON, BUNDLE = 60, 8  # keyframes back that sightings may wait, and that are adjusted together
 
 
@@ -47,6 +52,16 @@ class _Point:
     last: float
     information: Array
     strikes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What a point of the graph looked like last: the feature's descriptor (D,) and size [px], and where the camera was (3,)."""
+
+    key: int
+    descriptor: NDArray[Any]
+    size: float
+    seen_from: Array
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,9 @@ class UnknownPoints:
     _points: dict[Hashable, _Point] = field(default_factory=dict)
     _astray: list[_Point] = field(default_factory=list)  # in the graph, but seen no more under their name
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
+    _looks: dict[Hashable, _Look] = field(default_factory=dict)  # by name
+    _feature: str = ""
+    _again_as: dict[Hashable, Hashable] = field(default_factory=dict)  # names of points that are followed by new tracks
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
@@ -91,16 +109,23 @@ class UnknownPoints:
     ) -> Guess:
         """Turn ``rows`` of what is seen from a new keyframe into factors and variables; returned is the guess of its pose, placed
         by the points. Its covariance stays: the points are known no better than the poses that saw them."""
-        names: list[Hashable] = (
-            [m.points[i] for i in rows] if isinstance(m, PixelSightings) else m.tracks[list(rows)].tolist()
-        )
-        pixels = m.pixels[list(rows)]
-        priority = [len(names) if name in self._points else self._new.count(name) for name in names]
-        chosen = spread_out(pixels, priority, PER_KEYFRAME, self.model.width, self.model.height)
-        names, pixels = [names[i] for i in chosen], pixels[chosen]
         model = self.model if graph.changes is None else recalibrated(self.model, graph.changes)
+        rows = list(rows)
+        names = self._named(m, rows, lifted(model, *guess), graph)
+        pixels = np.asarray(m.pixels[rows], dtype=float)
+        priority = [len(names) if name in self._points else self._new.count(name) for name in names]
+        chosen = spread_out(pixels, priority, PER_KEYFRAME + WAITING, self.model.width, self.model.height)
+        rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
         old = [i for i, name in enumerate(names) if name in self._points]
-        guess, right = self._placed(model, [self._points[names[i]] for i in old], pixels[old], guess, graph)
+        few = spread_out(pixels[old], [0] * len(old), PER_KEYFRAME, self.model.width, self.model.height)
+        old = [old[i] for i in few]
+        points = [self._points[names[i]] for i in old]
+        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph)
+        if isinstance(m, CameraFrame):
+            seen_from = lifted(model, *guess).position
+            self._remember(
+                m, [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)], seen_from
+            )
         for i, agrees in zip(old, right.tolist(), strict=True):
             self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
         self._anchored[keyframe.index] = int(np.count_nonzero(right)) >= ANCHORED
@@ -110,15 +135,51 @@ class UnknownPoints:
         self._new.forget(keyframe.index)
         waiting = [names[i] for i in fresh if self._new.count(names[i]) >= FEWEST_SIGHTINGS]
         places, pose = self._places(keyframe, guess[0], waiting, graph)
-        for name, found, seen in self._new.ready(waiting, places.get):
+        for name, found, seen in self._new.ready(waiting, places.get, PER_KEYFRAME - len(old)):
             key = point_key(len(self._names))
             self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
             self._points[name] = _Point(key, keyframe.t, np.asarray(np.linalg.inv(found.covariance), dtype=float))
+            if isinstance(m, CameraFrame):
+                self._look(m, rows[names.index(name)], name, lifted(model, *guess).position)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             for sighting in seen:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
         return pose, guess[1]
+
+    def _named(
+        self, m: PixelSightings | CameraFrame, rows: Sequence[int], camera: CameraPose, graph: GraphView
+    ) -> list[Hashable]:
+        """What is seen, by name: of features the number of the track, or of that under which the point came into the graph."""
+        if isinstance(m, PixelSightings):
+            return [m.points[i] for i in rows]
+        self._again_as = {track: name for track, name in self._again_as.items() if name in self._points}
+        names: list[Hashable] = [self._again_as.get(track, track) for track in m.tracks[list(rows)].tolist()]
+        seen = set(names)
+        lost = [name for name in self._points if name not in seen and name in self._looks]
+        free = [i for i, name in zip(rows, names, strict=True) if name not in self._points]
+        positions = np.array([graph.values[self._points[name].key] for name in lost]).reshape(-1, 3)
+        place = {row: i for i, row in enumerate(rows)}
+        for which, row in refound(
+            self.model, camera, positions, [self._looks[name].descriptor for name in lost], m, free
+        ):
+            track = names[place[row]]
+            if self._new.count(track) < FEWEST_SIGHTINGS:
+                names[place[row]] = self._again_as[track] = lost[which]
+        return names
+
+    def _look(self, m: CameraFrame, row: int, name: Hashable, seen_from: Array) -> None:
+        self._feature = m.feature
+        self._looks[name] = _Look(self._points[name].key, m.descriptors[row], float(m.sizes[row]), seen_from)
+
+    def _remember(self, m: CameraFrame, seen: Sequence[tuple[int, Hashable, bool]], seen_from: Array) -> None:
+        """What points of the graph look like now; a track that is none of them after all goes its own way."""
+        for row, name, agrees in seen:
+            track = int(m.tracks[row])
+            if agrees:
+                self._look(m, row, name, seen_from)
+            elif self._again_as.pop(track, None) is not None:
+                self._points[name].strikes -= 1  # the point itself did nothing wrong
 
     def leave(self, t: float) -> list[int]:
         """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
@@ -133,7 +194,8 @@ class UnknownPoints:
         self._new = NewPoints(self.model)
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that were ever in the graph, those that were met under several keys under the first of them."""
+        """All points that were ever in the graph, those that were met under several keys under the first of them; of
+        features with the last view of each."""
         keys: dict[str, int] = {}
         for key, name in self._names.items():
             if key in values:
@@ -141,12 +203,28 @@ class UnknownPoints:
         if not keys:
             return None
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
-        return PointMap.of(tuple(keys), positions, covariances)
+        place = {key: i for i, key in enumerate(keys.values())}
+        looks = [look for look in self._looks.values() if look.key in place]
+        if not looks:
+            return PointMap.of(tuple(keys), positions, covariances)
+        return PointMap(
+            tuple(keys),
+            positions,
+            covariances,
+            self._feature,
+            np.array([place[look.key] for look in looks]),
+            np.array([look.descriptor for look in looks]),
+            np.array([look.seen_from for look in looks]),
+            np.array([look.size for look in looks]),
+        )
 
     def _placed(
-        self, model: CameraModel, points: list[_Point], pixels: Array, guess: Guess, graph: GraphView
+        self, model: CameraModel, points: list[_Point], pixels: Array, t: float, guess: Guess, graph: GraphView
     ) -> tuple[Guess, Truths]:
-        """The guess placed by points of the graph, and which of these agree."""
+        """The guess placed by points of the graph, and which of these agree.
+
+        Those that were not seen for long need not agree with the others, as the track has drifted since, but with each other.
+        """
         if not points:
             return guess, np.zeros(0, dtype=bool)
         positions = np.array([graph.current(point.key) for point in points])
@@ -154,12 +232,24 @@ class UnknownPoints:
         camera = lifted(model, *guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
-        right = agreeing(model, camera, positions, pixels, noise)
-        if np.count_nonzero(right) < FEWEST:
-            return guess, right
-        factor = ReprojectionFactor(model, positions[right], pixels[right], point_covariances=spreads[right])
-        update = robust_update(factor, *guess, ITERATIONS, SETTLED)
-        return (se2.compose(guess[0], se2.exp(update.delta)), guess[1]), right
+        recent = np.array([t - point.last < RECENT for point in points])
+        right = np.zeros(len(points), dtype=bool)
+        placed = guess
+        for which, enough in ((recent, FEWEST), (~recent, REVISITED)):
+            agrees = np.zeros(len(points), dtype=bool)
+            if which.any():
+                agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
+            if np.count_nonzero(agrees) >= enough and placed is guess:
+                factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
+                update = robust_update(factor, *guess, ITERATIONS, SETTLED)
+                placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
+            elif np.count_nonzero(agrees) < enough and placed is not guess:
+                error = reprojection.predict(model, placed[0], positions)[0] - pixels
+                agrees &= np.einsum("ki,kij,kj->k", error, np.linalg.inv(noise), error) < GATE
+            elif np.count_nonzero(agrees) < enough:
+                agrees &= which & recent
+            right |= agrees
+        return placed, right
 
     def _again(
         self,

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import VelocityStream
+from factorgraph_loc.log import FeatureStream, VelocityStream
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
@@ -162,3 +162,31 @@ def test_a_robot_at_rest_or_turning_on_the_spot(name, turn):
     assert np.all(np.isfinite(result.poses))
     assert rmse(result, log) < 0.1
     assert result.learnt.points is None or np.all(np.isfinite(result.learnt.points.covariances))
+
+
+def with_features(log, lifetime, seed=5):
+    """The log with features in place of named points, whose tracks last for ``lifetime`` seconds."""
+    rng = np.random.default_rng(seed)
+    points = camera_world.with_views(camera_world.room())
+    times = np.arange(0.13, SECONDS, 0.3)
+    frames = []
+    for k, (t, pose) in enumerate(zip(times.tolist(), log.reference.at(times), strict=True)):
+        found, shown = camera_world.frame(points, pose, t, rng, clutter=60)
+        tracks = np.where(shown < 0, 10**6 + 1000 * k + np.arange(len(shown)), shown + 1000 * int(t / lifetime))
+        frames.append(replace(found, tracks=tracks))
+    streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(times, frames)}
+    rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
+    return replace(log, rig=rig, streams=streams, world=World())
+
+
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_points_whose_tracks_end_are_found_again(log, name):
+    result = run(with_features(log, 4.0), CONFIGS[name])
+    points, true = result.learnt.points, camera_world.room()
+    assert rmse(result, log) < 0.25
+    assert points.feature == "colour"
+    assert np.array_equal(np.unique(points.owners), np.arange(len(points)))
+    # a track lives for seven keyframes: without finding points again there would be each several times
+    apart = np.linalg.norm(points.positions[:, None] - true.positions[None], axis=2)
+    assert np.median(apart.min(axis=1)) < 0.25
+    assert len(points) < 1.3 * len(np.unique(apart.argmin(axis=1)))
