@@ -21,6 +21,7 @@ from factors.se2 import Array
 
 BINS = 2048  # of the directions in the plan
 TAPS = 4  # samples of a texture at a slant, at most
+STEEPEST = 1e3  # slant that is told from steeper ones
 SLACK = 1e-9  # m, by which faces that meet overlap
 NEAREST = 1e-3  # m from a face's plane: a camera in it sees nothing of it
 
@@ -28,7 +29,7 @@ NEAREST = 1e-3  # m from a face's plane: a camera in it sees nothing of it
 # where the foot of the camera is on it, length, heights, the nearest point's distance in the plan, number in the scene,
 # and one over length and height
 NX, NY, AWAY, AX, AY, FOOT, LENGTH, BOTTOM, TOP, DISTANCE, FACE, PER_LENGTH, PER_HEIGHT = range(13)
-GROUND, CEILING, NOTHING, LID = -1, -2, -3, -4  # in place of a row of the table; lids count on downwards
+GROUND, CEILING, NOTHING = -1, -2, -3  # in place of a row of the table
 
 Ints = NDArray[np.int64]
 Place = tuple[
@@ -38,19 +39,17 @@ Place = tuple[
 
 class Surroundings(NamedTuple):
     """What can be seen from one place ``origin`` (3,): a ``table`` (M, 13) of faces, of which ``items[starts[b] : starts[b + 1]]``
-    may be met in the direction b; ``lids`` (B, 6) below the place, as of the scene; ``size`` (5,): width, depth and height of
-    the building, and one over the first two."""
+    may be met in the direction b; ``size`` (5,): width, depth and height of the building, and one over the first two."""
 
     origin: Array
     table: Array
     starts: Ints
     items: Ints
-    lids: Array
     size: Array
 
 
 @numba.njit(cache=True, error_model="numpy")
-def surroundings(faces: Array, bottoms: Array, tops: Array, lids: Array, origin: Array, size: Array) -> Surroundings:
+def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
     """The faces that can be seen from ``origin`` (3,), for :func:`cast`."""
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))
@@ -85,24 +84,17 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, lids: Array, origin:
         for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
             items[used[b % BINS]] = k
             used[b % BINS] += 1
-    return Surroundings(origin, table[order], starts, items, lids[lids[:, 4] < origin[2]], size)
+    return Surroundings(origin, table[order], starts, items, size)
 
 
 @numba.njit(inline="always", error_model="numpy")
-def cast(
-    table: Array, starts: Ints, items: Ints, lids: Array, place: Place, dx: float, dy: float, dz: float
-) -> tuple[int, float]:
-    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`LID` or a lid's number less,
-    :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and how far away in lengths of the ray."""
+def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
+    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and how
+    far away in lengths of the ray."""
     best, found = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
     if dz < -1e-12:
         best, found = -z0 / dz, GROUND
-        for i in range(len(lids)):
-            t = (lids[i, 4] - z0) / dz
-            x, y = x0 + t * dx, y0 + t * dy
-            if t < best and lids[i, 0] <= x <= lids[i, 2] and lids[i, 1] <= y <= lids[i, 3]:
-                best, found = t, LID - i
     elif dz > 1e-12:
         best, found = (top - z0) / dz, CEILING
     flat = math.sqrt(dx * dx + dy * dy)
@@ -135,11 +127,11 @@ def cast(
 def cast_all(around: Surroundings, rays: Array) -> Array:
     """Distances (K,) in lengths of ``rays`` (K, 3), infinite where nothing is met."""
     distance = np.empty(len(rays))
-    table, starts, items, lids = around.table, around.starts, around.items, around.lids
+    table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
     for i in range(len(rays)):
-        _, distance[i] = cast(table, starts, items, lids, place, rays[i, 0], rays[i, 1], rays[i, 2])
+        _, distance[i] = cast(table, starts, items, place, rays[i, 0], rays[i, 1], rays[i, 2])
     return distance
 
 
@@ -158,14 +150,14 @@ def expose(
     building; where two surfaces meet in a pixel, the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels.
     ``found`` (H, W): room to work in."""
     height, width = directions.shape[:2]
-    table, starts, items, lids = around.table, around.starts, around.items, around.lids
+    table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
     for i in range(height):
         for j in range(width):
             x, y = directions[i, j, 0], directions[i, j, 1]
             found[i, j], blue, green, red = _look(
-                table, starts, items, lids, place, texels, layout, x, y, rotation, pixel_at_one
+                table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
             )
             out[i, j, 0] += blue
             out[i, j, 1] += green
@@ -182,9 +174,7 @@ def expose(
                 a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
                 weight = np.float32(0.25) if k < 4 else np.float32(-1.0)
                 x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
-                _, blue, green, red = _look(
-                    table, starts, items, lids, place, texels, layout, x, y, rotation, pixel_at_one
-                )
+                _, blue, green, red = _look(table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one)
                 out[i, j, 0] += weight * blue
                 out[i, j, 1] += weight * green
                 out[i, j, 2] += weight * red
@@ -195,7 +185,6 @@ def _look(
     table: Array,
     starts: Ints,
     items: Ints,
-    lids: Array,
     place: Place,
     texels: NDArray[np.uint8],
     layout: Ints,
@@ -209,7 +198,7 @@ def _look(
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
     dz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-    found, depth = cast(table, starts, items, lids, place, dx, dy, dz)
+    found, depth = cast(table, starts, items, place, dx, dy, dz)
     blue = green = red = np.float32(0.0)
     if found == NOTHING:
         return found, blue, green, red
@@ -221,16 +210,13 @@ def _look(
         u = 1.0 - s * table[found, PER_LENGTH]
         v = (table[found, TOP] - z0 - depth * dz) * table[found, PER_HEIGHT]
         slant = flat / abs(table[found, NX] * dx + table[found, NY] * dy)
-    elif found <= LID:
-        number, lid = int(lids[LID - found, 5]), lids[LID - found]
-        u, v = (x0 + depth * dx - lid[0]) / (lid[2] - lid[0]), (y0 + depth * dy - lid[1]) / (lid[3] - lid[1])
-        slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
     else:
         number = layout.shape[0] - (2 if found == GROUND else 1)
         u = (x0 + depth * dx) * per_width
         v = (y0 + depth * dy) * per_depth
         slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
         along_x, along_y = dx / flat, dy / flat
+    slant = min(slant, STEEPEST)
     pixel = depth * pixel_at_one  # the size of a pixel there, in texels, across the slant
     taps = 1
     if slant * pixel > 1.0 and slant >= 1.5:
@@ -241,9 +227,6 @@ def _look(
         size *= 0.5
         level += 1
     first, width, height = layout[number, level, 0], layout[number, level, 1], layout[number, level, 2]
-    if taps == 1:
-        blue, green, red = _sample(texels, first, u * width, v * height, width, height)
-        return found, blue, green, red
     shrunk = step / (1 << level)
     column, line = u * width, v * height
     for k in range(taps):
@@ -291,18 +274,21 @@ def _direction(x: float, y: float) -> float:
 def develop(
     light: NDArray[np.float32],
     gain: NDArray[np.float32],
-    noise: NDArray[np.float32],
+    noise: NDArray[np.uint16],
+    quantiles: NDArray[np.float32],
     read: float,
     shot: float,
 ) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with ``noise`` (H, W, 3) of deviation 1 made as large as
-    a sensor's: of the variance read^2 + shot * value."""
+    """The picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with a sensor's noise of the variance
+    read^2 + shot * value, drawn by the numbers ``noise`` (H, W, 3) from the ``quantiles`` (Q,), Q a power of two, of a
+    distribution of deviation 1."""
     height, width = gain.shape
     out = np.empty((height, width, 3), dtype=np.uint8)
+    last = np.uint16(len(quantiles) - 1)
     for i in range(height):
         for j in range(width):
             for c in range(3):
                 value = light[i, j, c] * gain[i, j]
-                value += math.sqrt(read * read + shot * value) * noise[i, j, c]
+                value += math.sqrt(read * read + shot * value) * quantiles[noise[i, j, c] & last]
                 out[i, j, c] = int(min(max(value + 0.5, 0.0), 255.0))
     return out

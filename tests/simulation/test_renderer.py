@@ -77,7 +77,7 @@ def test_rays_end_where_all_surfaces_tried_one_by_one_say(office):
     renderer = Renderer(office, MODEL)
     pixels = np.random.default_rng(1).uniform((0, 0), (639, 479), (500, 2))
     directions = np.column_stack((reprojection.undistorted(MODEL, pixels), np.ones(len(pixels))))
-    for position, rotation in places(40):
+    for position, rotation in places(15):
         x, y, z = position
         if any(x1 < x < x2 and y1 < y < y2 and z < top for x1, y1, x2, y2, top, _ in office.lids):
             continue  # in a cupboard
@@ -132,6 +132,14 @@ def test_furniture_hides_the_wall_up_to_its_top_and_has_one(room):
         np.array(((MODEL.cx, MODEL.cy),)), np.array((3.0, 4.5, 2.6)), reprojection.mounting(0.0, 1.5, 1.0)
     )
     assert from_above[0, 2] == pytest.approx(top)
+    # and it is not the floor that is seen there
+    lidless = Renderer(dataclasses.replace(room, lids=np.empty((0, 6))), MODEL)
+    camera = np.array((3.0, 4.5, 2.6)), reprojection.mounting(0.0, 1.5, 1.0)
+    difference = np.abs(renderer.image(*camera).astype(int) - lidless.image(*camera)).max(axis=2) > 10
+    nearer = renderer.depths(*camera) < lidless.depths(*camera)
+    assert nearer.mean() > 0.1
+    assert difference[nearer].mean() > 0.5
+    assert not difference[~nearer].any()
 
 
 def painted(scene, segment, colours):
@@ -246,6 +254,19 @@ def test_nothing_but_black_is_seen_outside(room):
     assert not renderer.image(*camera).any()
     assert np.isnan(renderer.hits(np.array(((320.0, 240.0),)), *camera)).all()
     assert np.isinf(renderer.depths(*camera)).all()
+
+
+def test_a_camera_in_a_wall_or_over_an_edge_or_nowhere_does_no_harm(room):
+    """Rays along a face and straight down, pixels that are none."""
+    renderer = Renderer(room, MODEL)
+    for position in ((4.0, 1.0, 1.0), (4.0, 3.0, 1.0), (6.0, 5.0, 0.0), (3.0, 4.5, 1.0)):
+        for angles in ((0.0, 0.0, np.pi / 2.0), (0.0, np.pi / 2.0, 0.0), (0.0, 0.0, 0.0)):
+            image = renderer.image(np.array(position), reprojection.mounting(*angles))
+            assert image.shape == (480, 640, 3)
+    camera = reprojection.camera_pose(MODEL, POSE)
+    assert np.isnan(renderer.hits(np.array(((np.nan, 3.0),)), *camera)[0]).all()
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        renderer.image(np.full(3, np.nan), np.eye(3))
 
 
 def test_memory_of_a_large_building_is_bounded():
