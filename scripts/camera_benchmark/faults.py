@@ -82,7 +82,7 @@ def faulty(job: Job) -> dict[str, Attempt]:
 def cells(runs: Sequence[Attempt]) -> tuple[str, str, str]:
     errors = [one.errors for one in runs if one.errors is not None]
     if len(errors) < len(runs):
-        return NOTHING, NOTHING, NOTHING
+        return f"{len(runs) - len(errors)} of {len(runs)} refused", NOTHING, NOTHING
     causal, final = (
         "{:.3f} / {:.2f}".format(*pooled([getattr(one, kind) for one in errors])) for kind in ("causal", "final")
     )
