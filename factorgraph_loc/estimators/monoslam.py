@@ -55,6 +55,7 @@ from factors.se2 import Array
 SETTLED = 1e-3  # m, rad: a step of the iterated update that needs no further one
 HORIZON = 5.0  # s of measured motion that are kept
 VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s of the start
+LATELY = 5.0  # s: a point in the state that was not seen since may be hidden now
 LOST_AFTER = 5  # images in a row in which nothing is where it is expected
 VAGUE = 0.5  # m, rad: standard deviations beyond which a place is not known
 
@@ -64,8 +65,9 @@ class MonoslamSettings(FilterSettings):
 
     ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
     space. ``landmarks``: use of the map's points, as of
-    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``max_points``: in the state; ``per_image``: how many of them
-    are wanted in an image before new ones are taken in. ``iterations``: 1 is the published update, more linearise again.
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``max_points``: in the state; ``per_image``: new ones are taken
+    in where fewer than these should be in view. ``iterations``: in a known map; 1 is the published update, more linearise again.
+    With points in the state it is always 1: what is linearised at other places again and again seems to tell more than it does.
     ``smooth``: the final trajectory of a run in a known map is smoothed; with points in the state it is the causal one.
     """
 
@@ -238,7 +240,7 @@ class Monoslam(Filter):
         noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
         self._report(m, residual, innovation, sights.noise)
         delta, root, spread = zero, np.empty(0), np.empty(0)
-        for i in range(self._settings.iterations):
+        for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
             if i:
                 moved = prior.plus(delta, prior.covariance)
                 sights = eye.all(moved, match.mapped, points, spreads)
@@ -296,17 +298,18 @@ class Monoslam(Filter):
     def _managed(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match) -> SlamState:
         """Points counted, deleted, made x, y, z, and taken in where there are too few."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
-        state, failed = pruned(state, self._settings.max_points)
-        if failed:
-            self.diagnostics.reject("camera: points that were not found again", failed)
-        state = settled(state, eye)
-        room = min(self._settings.per_image - len(match.mapped), self._settings.max_points - len(state.points))
         frame = m if isinstance(m, CameraFrame) else None
-        for row in self._looker.new(m, state, eye, match, state.tracks)[: max(0, room)]:
+        wanted = min(self._settings.per_image, self._settings.max_points)
+        room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - LATELY))
+        for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
             name = m.points[row] if isinstance(m, PixelSightings) else f"met{state.met}"
             descriptor = None if frame is None else frame.descriptors[row]
             grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
             state = replace(grown, met=state.met + 1)
+        state, failed = pruned(state, self._settings.max_points)
+        if failed:
+            self.diagnostics.reject("camera: points that were not found again", failed)
+        state = settled(state, eye)
         tracks = frozenset() if frame is None else frozenset(frame.tracks.tolist())
         return replace(state, tracks=tracks)
 

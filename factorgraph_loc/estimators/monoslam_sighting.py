@@ -90,6 +90,11 @@ class Looker:
                 occupied = np.concatenate((occupied, m.pixels[None, i]))
         return chosen
 
+    def in_view(self, state: SlamState, eye: Eye, since: float) -> int:
+        """How many points of the state should be in the image, of those that were seen ``since`` then."""
+        lately = [i for i, p in enumerate(state.points) if p.t >= since]
+        return len(_visible(eye, eye.mapped(state, lately))[1])
+
     def _named(self, m: PixelSightings, state: SlamState, eye: Eye) -> Match:
         index = {p.name: i for i, p in enumerate(state.points)}
         ours = [(i, index[name]) for i, name in enumerate(m.points) if name in index]
