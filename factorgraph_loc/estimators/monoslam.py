@@ -257,8 +257,7 @@ class Monoslam(Filter):
 
     def _report(self, m: PixelSightings | CameraFrame, residual: Array, innovation: Innovation, noise: Array) -> None:
         sensor = "camera_right" if isinstance(m, PixelSightings) and m.right else "camera"
-        root, _ = innovation.gain(noise)
-        whitened = np.linalg.solve(root, residual.ravel())
+        whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
         self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
         for i, name in enumerate("uv"):
             self.diagnostics.residuals.setdefault(f"{sensor}.{name}", []).extend(residual[:, i].tolist())

@@ -26,8 +26,7 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     each = innovation.each(noise)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    root, _ = innovation.gain(noise)
-    whitened = np.linalg.solve(root, residual.ravel())
+    whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
     if whitened @ whitened < JOINT * 2 * count:
         return np.ones(count, dtype=bool)
     blocks = innovation.covariance.reshape(count, 2, count, 2).transpose(0, 2, 1, 3)  # (of j, by i)

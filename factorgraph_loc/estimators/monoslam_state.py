@@ -59,7 +59,8 @@ class SlamState:
 
     def starts(self) -> Integers:
         """Where each point begins in ``values``."""
-        return np.cumsum([0, *(p.size for p in self.points)], dtype=np.int64)[:-1]
+        sizes = [inverse_depth.SIZE if p.ray else 3 for p in self.points]
+        return np.cumsum([0, *sizes], dtype=np.int64)[:-1]
 
     def plus(self, error: Array, covariance: Array) -> SlamState:
         return replace(
@@ -212,13 +213,17 @@ class Innovation:
         blocks = self.covariance.reshape(len(noise), 2, len(noise), 2)
         return np.asarray(blocks[k, :, k, :] + noise)
 
-    def gain(self, noise: Array) -> tuple[Array, Array]:
-        """The Cholesky factor (2K, 2K) of the innovation's covariance, and its inverse times ``carried`` transposed."""
+    def root(self, noise: Array) -> Array:
+        """The Cholesky factor (2K, 2K) of the innovation's covariance, with ``noise`` (K, 2, 2)."""
         total = self.covariance.copy()
         blocks = total.reshape(len(noise), 2, len(noise), 2)
         k = np.arange(len(noise))
         blocks[k, :, k, :] += noise
-        root = np.asarray(np.linalg.cholesky(total), dtype=float)
+        return np.asarray(np.linalg.cholesky(total), dtype=float)
+
+    def gain(self, noise: Array) -> tuple[Array, Array]:
+        """:meth:`root`, and its inverse times ``carried`` transposed."""
+        root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 
 
