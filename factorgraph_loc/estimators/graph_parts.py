@@ -24,7 +24,8 @@ class GraphSettings(FileModel):
     ``keyframe_interval``: by default 0.09 s, and 0.5 s where landmarks are estimated, which makes each update far dearer.
 
     ``self_calibration``: constants to which the rig gives an uncertainty are variables. ``landmarks``: see
-    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`.
+    :class:`~factorgraph_loc.estimators.landmarks.KnownLandmarks`. ``visual_odometry``: what is followed from image to image, but is
+    no point of map or graph, tells the motion between them (:mod:`~factorgraph_loc.estimators.frame_pairs`).
     """
 
     keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
@@ -32,6 +33,7 @@ class GraphSettings(FileModel):
     max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
     self_calibration: bool = True
     landmarks: MapUse = "known"
+    visual_odometry: bool = False
 
 
 @dataclass

@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Hashable
 from dataclasses import replace
 
 import numpy as np
 
 from factorgraph_loc.estimators import landmarks
+from factorgraph_loc.estimators.frame_pairs import FramePairs
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
 from factorgraph_loc.estimators.keyframes import KeyframeGraph
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
@@ -56,6 +58,9 @@ class MeasuringGraph(KeyframeGraph):
             constants = self._camera_constants.indices
             self._unknown = UnknownPoints(self._points.model, self.diagnostics, constants)
         self._pixels_taken = -math.inf
+        self._pairs: FramePairs | None = None
+        if settings.visual_odometry and self._points.model is not None:
+            self._pairs = FramePairs(self._points.model)
         self._scans = WaitingScans(setup, self.diagnostics)
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
 
@@ -194,6 +199,7 @@ class MeasuringGraph(KeyframeGraph):
             guess = self._sight(keyframe, m, None, guess, addition)
         elif m is not None:
             guess = self._spot(keyframe, m, None, guess, addition)
+            self._compare(keyframe, m, addition)
         assert guess is not None
         addition.values[keyframe.key] = guess[0]
         self._extend(keyframe, addition, guess[1])
@@ -285,6 +291,26 @@ class MeasuringGraph(KeyframeGraph):
             self._keyframes, self._constants, self._spreads, self._current, self._is_open, shared, changes
         )
         return self._unknown.take(m, rows, keyframe, guess, graph, addition)
+
+    def _compare(self, keyframe: Keyframe, m: Pixels, addition: Addition) -> None:
+        """What tracks of no other use tell of the motion since the image before."""
+        if self._pairs is None:
+            return
+        if isinstance(m, PixelSightings):
+            names: list[Hashable] = list(m.points)
+            used = {i for i, name in enumerate(m.points) if name in self._points.map.index}
+        else:
+            names, used = m.tracks.tolist(), set(self._points.used.tolist())
+        if self._unknown is not None:
+            used |= {i for i, name in enumerate(names) if self._unknown.uses(name)}
+        rows = [i for i in range(len(names)) if i not in used]
+        before, predicted = self._pairs.previous(keyframe, self._keyframes), None
+        if before is not None and self._is_open(before.index):
+            predicted = self._recalibrated(self._motion.relative(before.odometry, keyframe.odometry))
+        node = self._pairs.take(keyframe, [names[i] for i in rows], m.pixels[rows], predicted)
+        if node is not None:
+            keyframe.nodes.append(node)
+            addition.nodes.append(node)
 
     def _meet(
         self, name: str, factor: BearingRangeFactor, keyframe: Keyframe, guess: Guess, addition: Addition

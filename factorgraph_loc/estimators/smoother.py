@@ -20,7 +20,7 @@ from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Gues
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point
+from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point, is_pose
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
@@ -200,7 +200,8 @@ class Smoother(RelocatingGraph):
             noise = gtsam.noiseModel.Gaussian.Covariance(spreads[key])
             nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
         for keyframe in others:
-            nodes += [self._odometry_node(keyframe), *keyframe.nodes]
+            there = (node for node in keyframe.nodes if all(not is_pose(k) or k >= oldest.key for k in node.keys))
+            nodes += [self._odometry_node(keyframe), *there]
         # of those that are both, ours never throw
         nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
         guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants

@@ -181,6 +181,10 @@ class UnknownPoints:
             elif self._again_as.pop(track, None) is not None:
                 self._points[name].strikes -= 1  # the point itself did nothing wrong
 
+    def uses(self, name: Hashable) -> bool:
+        """Whether what is seen under a name is a point of the graph, or waits to be one."""
+        return name in self._points or name in self._again_as or self._new.count(name) > 0
+
     def leave(self, t: float) -> list[int]:
         """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
         gone = [point.key for point in (*self._points.values(), *self._astray) if point.last < t]

@@ -8,6 +8,9 @@ seen: that stays as it was predicted, and the information along it is zero.
 Where a turn alone explains most matches, as for a robot at rest, the direction of the way is noise, or that of a thing that moves.
 Then only the turn is told: by least squares of the pixels themselves, with what the points may be displaced by the little way that
 the odometry allows as further unknowns.
+
+The information is that of Gaussian noise, to first order. Where the way is short against the noise of the pixels its direction is
+biased besides, as it is where all points lie in one plane: such motions are not told.
 """
 
 from __future__ import annotations
@@ -29,8 +32,9 @@ HYPOTHESES = 50
 NEWTON_STEPS, ITERATIONS, HALVINGS = 4, 15, 6
 AGREES, CLEAR = 3.0, 20.0  # standard deviations: from its epipolar line, and from the epipole
 TURN_AGREES = 3.4  # standard deviations of two numbers: 99.7 %
-TURN_EXPLAINS, TURN_EXPLAINS_REST = 0.8, 0.5  # share of the matches; where the robot may be at rest
-BLURRED = 0.3  # rad: the standard deviation of a direction that is not worth telling
+TURN_EXPLAINS = 0.5  # share of the matches, where the robot may be at rest
+DEPTHS = 0.3  # 1/m: how much the inverse depth differs between one side of the image and the other
+BLURRED = 0.05  # rad: the standard deviation of a direction that is not worth telling
 NEAR, NEAREST = 1.0, 0.5  # m: nearer than that few points are, and none
 SHORTEST = 1e-4  # m, of a way that has a direction
 SMALLEST = 1e-7  # of a step, m and rad
@@ -65,7 +69,7 @@ def frame_motion(
     turn = _turn(pairs, predicted, model.robust)
     way = float(np.linalg.norm(translation(pairs.position, predicted.delta)))
     may_rest = way < AGREES * float(np.sqrt(np.trace(predicted.covariance[:2, :2])))
-    if turn.agrees.mean() >= (TURN_EXPLAINS_REST if may_rest else TURN_EXPLAINS):
+    if may_rest and turn.agrees.mean() >= TURN_EXPLAINS:
         return turn
     moved = _refined(pairs, _start(pairs, predicted.delta, rng), model.robust)
     if moved.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)) or _blur(moved, model.position) > BLURRED:
@@ -184,7 +188,8 @@ def _turn(pairs: RayPairs, predicted: Increment, robust: float) -> FrameMotion:
     # what the different depths do besides shows in the residual
     excess = max(1.0, float(np.sum(weight[:, None] * residual**2)) / max(2.0 * weight.sum() - 1.0, 1.0))
     told = normal[0, 0] - normal[0, 1:] @ np.linalg.solve(normal[1:, 1:], normal[1:, 0])
-    return FrameMotion(delta, np.diag((0.0, 0.0, max(told, 0.0) / excess)), agrees)
+    variance = excess / max(told, 1e-9) + (DEPTHS * NEAR * allowed) ** 2
+    return FrameMotion(delta, np.diag((0.0, 0.0, 1.0 / variance)), agrees)
 
 
 def _likely_turn(pairs: RayPairs, guess: float) -> float:
