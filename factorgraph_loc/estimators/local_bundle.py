@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_loc.estimators.graph_parts import Keyframe
-from factorgraph_loc.estimators.new_points import FEWEST, Place, Sighting, agreed
+from factorgraph_loc.estimators.new_points import FEWEST, Place, Sighting, agreed, apart
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.variables import Values, point_key
 from factors.graph import PriorFactor
@@ -44,6 +44,8 @@ def bundled(
     make = PointSightings(model)
     natives = []
     often = [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
+    ends = [(seen[i], places[seen[i].keyframe - first]) for seen in often for i in (0, -1)]
+    often = [s for s, a, b in zip(often, ends[::2], ends[1::2], strict=True) if apart(model, *a, *b, ROUGH)]
     if len(often) < ENOUGH:
         return None
     for seen in often:

@@ -112,7 +112,7 @@ class NewPoints:
                 if sighting.keyframe not in known:
                     known[sighting.keyframe] = places(sighting.keyframe)
             seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
-            if len(seen) < FEWEST or not self._apart(*seen[0], *seen[-1]):
+            if len(seen) < FEWEST or not apart(self._model, *seen[0], *seen[-1]):
                 continue
             result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen], MAX_SPREAD)
             if result is not None:
@@ -120,11 +120,14 @@ class NewPoints:
                 found.append((name, *result))
         return found
 
-    def _apart(self, first: Sighting, here: Place, last: Sighting, there: Place) -> bool:
-        """Whether it is worth a try: two rays alone would nearly tell the place well enough."""
-        sigma = math.hypot(self._model.sigma, max(here.slack, there.slack)) / self._model.fx
-        angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
-        return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
+
+def apart(
+    model: CameraModel, first: Sighting, here: Place, last: Sighting, there: Place, spread: float = MAX_SPREAD
+) -> bool:
+    """Whether it is worth a try: two rays alone would nearly tell the point's place to the share ``spread`` of its depth."""
+    sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
+    angle = max(MIN_PARALLAX, min(sigma / spread, 0.5))
+    return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
 
 
 def agreed(
