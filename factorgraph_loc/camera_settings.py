@@ -50,7 +50,8 @@ class CameraSettings(FileModel):
     Mounted at (x, y, z) it looks along the robot's x axis, then turned by ``roll`` about x, ``pitch`` about y (down where
     positive) and ``yaw`` about z (to the left). ``time_offset`` [s] is added to the stamps of its images. ``pixel_sigma`` [px] and
     ``robust``, the scale of Huber's loss in standard deviations: of a feature found and matched, the errors of lens and
-    mounting included.
+    mounting included. ``tempering`` is for features that are found in a map: the errors of map and feature stay from image to
+    image, so that each image tells less than its pixels seem to.
     """
 
     time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
@@ -74,6 +75,7 @@ class CameraSettings(FileModel):
     yaw: Angle = 0.0
     pixel_sigma: Annotated[float, Field(gt=0.0, le=100.0, description="px")] = 1.0
     robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
+    tempering: Annotated[float, Field(gt=0.0, le=1.0, description="exponent of the likelihood")] = 0.1
     frontend: FrontendSettings = FrontendSettings()
     uncertainty: CameraUncertainty = CameraUncertainty()
 
@@ -90,4 +92,5 @@ class CameraSettings(FileModel):
             rotation=reprojection.mounting(self.roll, self.pitch, self.yaw),
             sigma=self.pixel_sigma,
             robust=self.robust,
+            tempering=self.tempering,
         )

@@ -39,7 +39,7 @@ class CameraModel:
 
     ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2); ``width``, ``height`` [px] of its images. ``position``
     (3,) [m] and ``rotation`` (3, 3) of the camera in the robot's frame. ``sigma`` [px] in u and in v; ``robust``: scale of
-    Huber's loss in standard deviations.
+    Huber's loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 where errors stay from image to image.
     """
 
     fx: float
@@ -53,6 +53,7 @@ class CameraModel:
     rotation: Array = field(default_factory=FORWARD.copy)
     sigma: float = 1.0
     robust: float = 2.0
+    tempering: float = 1.0
 
     def intrinsics(self) -> Array:
         """(fx, fy, cx, cy, k1, k2, p1, p2) as an array (8,)."""
@@ -165,7 +166,8 @@ def linearize_in_space(
 def log_likelihood(
     model: CameraModel, poses: Array, points: Array, pixels: Array, covariances: Array | None = None
 ) -> Array:
-    """The robust log-likelihood (N,) of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses`` (N, 3), up to a constant.
+    """The log-likelihood (N,), robust and tempered, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses`` (N, 3), up to a
+    constant.
 
     ``covariances`` (K, 2, 2) [px^2]: of each pixel, from its noise and that of the map; by default that of the model.
     """
@@ -174,7 +176,7 @@ def log_likelihood(
     else:
         whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
     arguments = (model.intrinsics(), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
-    return np.asarray(
+    return model.tempering * np.asarray(
         _log_likelihood(
             *arguments,
             np.ascontiguousarray(points, dtype=float),

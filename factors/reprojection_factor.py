@@ -47,18 +47,18 @@ class ReprojectionFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
         error, blocks = self.whitened(values)
-        weight = np.sqrt(huber_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
+        weight = np.sqrt(self.weight(np.einsum("ki,ki->k", error, error)))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
         return (weight[:, None] * error).ravel(), weighted
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
         error, _ = self.whitened(values)
-        return float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
+        return self.model.tempering * float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""
-        return huber_weight(squared, self.model.robust)
+        return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> ReprojectionFactor:
         """The same with a robust loss that is ``width`` times as wide."""

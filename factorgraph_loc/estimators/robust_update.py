@@ -71,11 +71,11 @@ def update_state(
     """Kalman update, robust and iterated, in information form.
 
     ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the
-    first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the robust weight (K,) of squared
-    residuals (K,). At first a sighting whose normalised innovation squared lies beyond the gate has its noise widened by the
-    square of the excess, so that it pulls the less the farther off it is, but never locks the filter out. Further iterations
-    widen it by the inverse of its robust weight at the updated state (iteratively reweighted least squares), until a step is
-    below ``converged``.
+    first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the weight (K,) of squared
+    residuals (K,), robust and tempered: that of zero is the tempering, which the innovation is free of. At first a sighting
+    whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that it
+    pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
+    weight at the updated state (iteratively reweighted least squares), until a step is below ``converged``.
     """
     prior = np.asarray(np.linalg.inv(covariance), dtype=float)
     zero = np.zeros(len(covariance))
@@ -86,8 +86,9 @@ def update_state(
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
     nis = float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull)
-    if widening.max() > 1.0:
-        delta, updated = _solve(prior, blocks, residual, widening**-2, zero[:size])
+    tempering = weight(np.zeros(1))[0]
+    if widening.max() > 1.0 or tempering < 1.0:
+        delta, updated = _solve(prior, blocks, residual, tempering * widening**-2, zero[:size])
     first, before = residual, zero
     for _ in range(iterations - 1):
         if np.abs(delta - before).max() < converged:

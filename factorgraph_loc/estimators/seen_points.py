@@ -64,7 +64,8 @@ class KnownPoints:
     ) -> None:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
-        self.model: CameraModel | None = None if settings is None else settings.model()
+        self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
+        self._tempering = 1.0 if settings is None else settings.tempering  # of points that are found in the map
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
             self.map = setup.world.points
@@ -174,7 +175,7 @@ class KnownPoints:
         if m.feature != self.map.feature:
             self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
             return None
-        return self._factor(self.model, [], np.empty((0, 2)))
+        return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
 
     def _found(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
