@@ -239,6 +239,9 @@ class Monoslam(Filter):
         residual = match.pixels - sights.pixels
         noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
         self._report(m, residual, innovation, sights.noise)
+        tempering = np.ones(len(residual))
+        if isinstance(m, CameraFrame):
+            tempering[len(match.mapped) :] = eye.model.tempering
         delta, root, spread = zero, np.empty(0), np.empty(0)
         for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
             if i:
@@ -248,7 +251,7 @@ class Monoslam(Filter):
                 residual = match.pixels - sights.pixels
                 weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
                 noise = sights.noise / weight[:, None, None]
-            root, spread = innovation.gain(noise)
+            root, spread = innovation.gain(noise / tempering[:, None, None])
             whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
             before, delta = delta, spread.T @ whitened
             if np.abs((delta - before)[:6]).max() < SETTLED:

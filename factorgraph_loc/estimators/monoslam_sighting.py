@@ -13,11 +13,11 @@ from factorgraph_loc.estimators.landmarks import MapUse
 from factorgraph_loc.estimators.monoslam_search import agreeing, find
 from factorgraph_loc.estimators.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.seen_points import DISAGREES, EXACT
+from factorgraph_loc.estimators.seen_points import DISAGREES, EXACT, MOST
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision import consensus
-from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.association import Associator, spread_out
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose
 from factorgraph_loc.vision.relocalization import located
 from factors.se2 import Array
@@ -148,7 +148,9 @@ class Looker:
         seen = self._associator.guided(m, *eye.pose(state.robot), eye.spread(state.covariance))
         if seen.rejected:
             self._diagnostics.reject(DISAGREES, seen.rejected)
-        return list(zip(seen.features.tolist(), seen.points.tolist(), strict=True)), seen.expected
+        # one that is left out must not become a new point
+        chosen = spread_out(m.pixels[seen.features], len(seen) if self._grows else MOST)
+        return list(zip(seen.features[chosen].tolist(), seen.points[chosen].tolist(), strict=True)), seen.expected
 
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye

@@ -16,7 +16,7 @@ from factorgraph_loc.estimators.robust_update import Update, robust_update, upda
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Estimated
-from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.association import Associator, spread_out
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factors import reprojection, se2
@@ -29,6 +29,7 @@ DISAGREES = "camera: does not agree with the others"  # why a sighting is reject
 CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
 FEW_SHARE = 0.3  # of named points, and
 FEW, MANY = 6, 20  # of points that are found by what they look like, where so many are expected: they are missed
+MOST = 100  # points of one image that are used: more tell hardly more, as the errors of neighbours in a map are alike
 EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
 # A pixel is so sharp that one step from a poor prediction does not lead to the optimum
 ITERATIONS, SETTLED = 8, 1e-3  # m, rad: a step that needs no further one
@@ -189,9 +190,11 @@ class KnownPoints:
             self._diagnostics.reject(DISAGREES, seen.rejected)
         if len(seen) == 0:
             return None
-        spreads = self.map.covariances[seen.points] if self._map_matters else None
         pixels = np.asarray(m.pixels[seen.features], dtype=float)
-        return replace(factor, points=self.map.positions[seen.points], pixels=pixels, point_covariances=spreads)
+        chosen = spread_out(pixels, MOST)
+        points = seen.points[chosen]
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """Where the camera is when the image is taken, with what is not known of its constants."""
