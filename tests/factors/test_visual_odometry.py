@@ -6,7 +6,7 @@ import pytest
 from factors import se2
 from factors.reprojection import CameraModel, mounting, predict
 from factors.se2 import Array
-from factors.visual_odometry import RayPairs, VisualOdometryFactor, sampson, translation
+from factors.visual_odometry import RayPairs, VisualOdometryFactor, from_epipole, nearness, sampson, translation
 
 MODEL = CameraModel(
     500.0,
@@ -112,3 +112,20 @@ def test_of_matches_without_noise_the_constraint_s_slope_is_the_jacobian() -> No
     pairs = RayPairs.of(MODEL, *seen(np.random.default_rng(7), MOTION))
     _, jacobian, signal = sampson(pairs, MOTION)
     np.testing.assert_allclose(signal, jacobian, atol=1e-6 * np.abs(jacobian).max())
+
+
+def test_rays_meet_at_the_points_depth() -> None:
+    points = np.array(((3.0, 0.8, 1.0), (6.0, 2.0, 0.4), (2.0, 0.3, 1.2)))
+    first, second = predict(MODEL, np.zeros(3), points)[0], predict(MODEL, MOTION, points)[0]
+    rho, sigma = nearness(RayPairs.of(MODEL, first, second), MOTION)
+    np.testing.assert_allclose(1.0 / rho, predict(MODEL, np.zeros(3), points)[1], rtol=1e-6)
+    assert np.all((sigma > 0.0) & (sigma < 0.1))
+
+
+def test_a_match_seen_where_the_camera_goes_is_at_the_epipole() -> None:
+    model = CameraModel(500.0, 500.0, 320.0, 240.0, 640, 480, sigma=2.0)
+    ahead, beside = np.array((320.0, 240.0)), np.array((420.0, 240.0))
+    away = from_epipole(
+        RayPairs.of(model, np.array((ahead, beside)), np.array((ahead, beside))), np.array((0.5, 0.0, 0.0))
+    )
+    assert away == pytest.approx((0.0, 50.0))
