@@ -64,7 +64,7 @@ class Addition:
 
 @dataclass(frozen=True)
 class TickAt:
-    """A stamp at which the trajectory is wanted, and the motion to it from the keyframe before."""
+    """A stamp at which the trajectory is wanted, and the motion to it from the keyframe before, as the odometry reports it."""
 
     t: float
     keyframe: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -233,4 +234,5 @@ class KeyframeGraph(ABC):
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""
         steps = [self._recalibrated(k.from_previous) for k in self._keyframes if k.from_previous is not None]
-        return between_keyframes(self._ticks, steps, poses, covariances)
+        ticks = [replace(tick, since=self._recalibrated(tick.since)) for tick in self._ticks]
+        return between_keyframes(ticks, steps, poses, covariances)

@@ -115,7 +115,7 @@ class MeasuringGraph(KeyframeGraph):
         if t - self._keyframes[-1].t >= self._graph_settings.keyframe_max_interval:
             self._add_keyframe(t, None)
         before = self._keyframe_before(t)
-        self._ticks.append(TickAt(t, before.index, self._since(before, t)))
+        self._ticks.append(TickAt(t, before.index, self._motion.relative(before.odometry, self._motion.state(t))))
 
     def _see(self, m: BearingRange | Pixels) -> None:
         newest = self._keyframes[-1]
