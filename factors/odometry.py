@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from factors import se2
+from factors.odometry_kernels import linearize, recalibrate
 from factors.se2 import Array
 
 MINIMUM_POSITION_VARIANCE = 1e-8
@@ -143,9 +144,14 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
     heading-rate bias [rad/s], additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of
     its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant curvature.
     """
-    x, y, phi = se2.log(increment.delta).tolist()
+    arc = se2.log(increment.delta)
+    parameters = np.asarray(parameters, dtype=float)
+    if parameters.ndim == 1:
+        delta, jacobian = recalibrate(arc, increment.duration, parameters)
+        return delta, jacobian
+    x, y, phi = arc.tolist()
     by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.duration, math.hypot(x, y)]])
-    changed = np.array((x, y, phi)) + np.asarray(parameters) @ by_parameter.T
+    changed = arc + parameters @ by_parameter.T
     return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
 
 
@@ -164,19 +170,14 @@ class OdometryFactor:
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
         self._increment = increment
+        self._arc = se2.log(increment.delta)
         self._estimated = list(estimated)
-        self._whitener = np.linalg.inv(np.linalg.cholesky(increment.covariance))
+        self._whitener = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(increment.covariance)))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
-        delta, by_parameter = self._delta(values)
-        relative = se2.between(values[0], values[1])
-        error = se2.log(se2.between(delta, relative))
-        inverse = self._whitener @ np.linalg.inv(se2.right_jacobian(error))
-        blocks = [-inverse @ se2.adjoint(se2.inverse(relative)), inverse]
-        if self._estimated:
-            blocks.append(-self._whitener @ np.linalg.inv(se2.right_jacobian(-error)) @ by_parameter)
-        return self._whitener @ error, blocks
+        residual, *blocks = linearize(values[0], values[1], *self._delta(values), self._whitener)
+        return residual, blocks if self._estimated else blocks[:2]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""
@@ -188,5 +189,5 @@ class OdometryFactor:
             return self._increment.delta, np.zeros((3, 0))
         parameters = np.zeros(len(PARAMETERS))
         parameters[self._estimated] = values[2]
-        delta, jacobian = recalibrated(self._increment, parameters)
-        return delta, jacobian[:, self._estimated]
+        delta, jacobian = recalibrate(self._arc, self._increment.duration, parameters)
+        return delta, np.ascontiguousarray(jacobian[:, self._estimated])
