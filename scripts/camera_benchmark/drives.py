@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
@@ -81,15 +81,20 @@ class Seconds:
 
 def log_of(drive: Drive, folder: Path) -> tuple[Log, Seconds]:
     """The log of a drive with the features of its images and without a map of points; these are kept in ``folder``."""
-    settings = drive.settings()
-    log = simulate(settings, drive.seed)
-    path = folder / f"{_key(drive)}.npz"
-    if not path.exists():
-        _write_features(drive, settings, path)
-    stream, seconds = _read_features(drive, path)
+    keep_features([drive], folder)
+    log = simulate(drive.settings(), drive.seed)
+    stream, seconds = _read_features(drive, _path(drive, folder))
     streams = {**log.streams, "camera": stream}
     rig = log.rig.model_copy(update={"sensors": (*log.rig.sensors, "camera")})
     return replace(log, streams=streams, rig=rig), seconds
+
+
+def keep_features(drives: Sequence[Drive], folder: Path) -> None:
+    """Find the features of a drive that are not yet in ``folder``; ``drives`` differ in what is looked for alone."""
+    missing = [drive for drive in drives if not _path(drive, folder).exists()]
+    if missing:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_features(missing, folder)
 
 
 def written(drive: Drive, folder: Path) -> Log:
@@ -141,30 +146,39 @@ def compressed(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, JPEG)[1], cv2.IMREAD_COLOR))
 
 
-def _write_features(drive: Drive, settings: SimulationSettings, path: Path) -> None:
-    finder = extractor(drive.feature, drive.count)
-    contents, times = [], [perf_counter()]
-    render = 0.0
-    for image in images(settings, drive.seed):
-        render += perf_counter() - times[-1]
-        contents.append(encode(*finder.detectAndCompute(image)))
-        times.append(perf_counter())
-    found = [decode(content) for content in contents]
-    camera = settings.rig.camera
-    assert camera is not None
-    started = perf_counter()
-    tracks = follow([f.pixels for f in found], [f.descriptors for f in found], camera.model(), binary=finder.binary)
-    seconds = np.array((render, times[-1] - times[0] - render, perf_counter() - started))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(
-            file,
-            stamps=film(settings, drive.seed).stamps,
-            content=np.frombuffer(b"".join(contents), dtype=np.uint8),
-            lengths=np.array([len(content) for content in contents]),
-            tracks=np.concatenate(tracks),
-            seconds=seconds,
+def _write_features(drives: Sequence[Drive], folder: Path) -> None:
+    settings = drives[0].settings()
+    assert settings.rig.camera is not None
+    finders = [extractor(drive.feature, drive.count) for drive in drives]
+    contents: list[list[bytes]] = [[] for _ in drives]
+    render, find = 0.0, np.zeros(len(drives))
+    before = perf_counter()
+    for image in images(settings, drives[0].seed):
+        render += perf_counter() - before
+        for i, finder in enumerate(finders):
+            before = perf_counter()
+            contents[i].append(encode(*finder.detectAndCompute(image)))
+            find[i] += perf_counter() - before
+        before = perf_counter()
+    for i, drive in enumerate(drives):
+        found = [decode(content) for content in contents[i]]
+        before = perf_counter()
+        tracks = follow(
+            [f.pixels for f in found],
+            [f.descriptors for f in found],
+            settings.rig.camera.model(),
+            binary=finders[i].binary,
         )
+        seconds = np.array((render, find[i], perf_counter() - before))
+        with replacing(_path(drive, folder)) as temporary, temporary.open("wb") as file:
+            np.savez(
+                file,
+                stamps=film(settings, drive.seed).stamps,
+                content=np.frombuffer(b"".join(contents[i]), dtype=np.uint8),
+                lengths=np.array([len(content) for content in contents[i]]),
+                tracks=np.concatenate(tracks),
+                seconds=seconds,
+            )
 
 
 def _read_features(drive: Drive, path: Path) -> tuple[FeatureStream, Seconds]:
@@ -178,6 +192,10 @@ def _read_features(drive: Drive, path: Path) -> tuple[FeatureStream, Seconds]:
             for stamp, f, tracks in zip(t.tolist(), found, numbers, strict=True)
         ]
         return FeatureStream(t, frames), Seconds(*stored["seconds"].tolist())
+
+
+def _path(drive: Drive, folder: Path) -> Path:
+    return folder / f"{_key(drive)}.npz"
 
 
 def _key(drive: Drive) -> str:

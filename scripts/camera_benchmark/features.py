@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from benchmarking.report import Report
 
-from camera_benchmark.drives import COUNT, Drive, log_of, map_of, with_map
-from camera_benchmark.office import BEST, CONFIGS
+from camera_benchmark.drives import COUNT, Drive, keep_features, log_of, map_of, with_map
+from camera_benchmark.office import BEST, CONFIGS, FIRST
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import ACCURACY, Attempt, accuracy_cells, attempts, failures, succeeded
+from factorgraph_loc.log import FeatureStream
 
 SEEDS = 4
 DURATION = 300.0  # s
-FIRST = 8000
 FEATURES = ("colour", "sift", "orb")
 RUNS = ("smoother, camera", BEST)
 
@@ -42,20 +42,15 @@ class Outcome:
 def section(options: CameraOptions) -> Report:
     report = Report("features", options)
     count, duration = options.count(SEEDS), options.seconds(DURATION)
-    jobs = [
-        Job(Drive(FIRST + i, FIRST + i, duration, feature=feature), options.drives)
-        for i in range(count)
-        for feature in FEATURES
-    ]
-    labels = [f"{job.drive.feature}, seed {job.drive.seed}" for job in jobs]
-    outcomes = report.collect(localized, jobs, labels)
+    jobs = [Job(Drive(FIRST + i, FIRST + i, duration), options.drives) for i in range(count)]
+    outcomes = report.collect(localized, jobs, [f"seed {job.drive.seed}" for job in jobs])
     report.say(
         f"{count} rendered offices of {duration:.0f} s, as above, with each feature, at most {COUNT} in an image. *Matched*: "
         "points of the map that an image shows. Times are those of one core, with the other one busy"
     )
     accuracy, counts = [], []
     for feature in FEATURES:
-        of_feature = {jobs[i].drive.seed: one for i, one in outcomes.items() if jobs[i].drive.feature == feature}
+        of_feature = {jobs[i].drive.seed: by_feature[feature] for i, by_feature in outcomes.items()}
         found = {seed: outcome.runs for seed, outcome in of_feature.items()}
         failures(report, found)
         for label in RUNS:
@@ -73,17 +68,25 @@ def section(options: CameraOptions) -> Report:
     return report
 
 
-def localized(job: Job) -> Outcome:
-    """Both runs on one drive with one feature."""
-    log, seconds = log_of(job.drive, job.folder)
-    points = map_of(job.drive, job.folder)
+def localized(job: Job) -> dict[str, Outcome]:
+    """Both runs on one drive with each feature, which are found in the same images."""
+    drives = {feature: replace(job.drive, feature=feature) for feature in FEATURES}
+    for variants in (list(drives.values()), [drive.mapping() for drive in drives.values()]):
+        keep_features(variants, job.folder)
+    return {feature: with_feature(drive, job.folder) for feature, drive in drives.items()}
+
+
+def with_feature(drive: Drive, folder: Path) -> Outcome:
+    log, seconds = log_of(drive, folder)
+    points = map_of(drive, folder)
     runs = attempts(with_map(log, points), {label: CONFIGS[label] for label in RUNS})
-    frames = log.streams["camera"].frame  # type: ignore[attr-defined]
+    stream = log.streams["camera"]
+    assert isinstance(stream, FeatureStream)
     return Outcome(
         runs,
         len(points),
-        float(np.mean([len(frame.pixels) for frame in frames])),
+        float(np.mean([len(frame.pixels) for frame in stream.frame])),
         runs[RUNS[0]].seen,
-        1e3 * seconds.find / len(frames),
-        1e3 * seconds.follow / len(frames),
+        1e3 * seconds.find / len(stream.t),
+        1e3 * seconds.follow / len(stream.t),
     )

@@ -16,6 +16,7 @@ from benchmarking.report import Report
 
 from camera_benchmark.drives import COUNT, RATE, Drive, log_of, map_of, with_map
 from camera_benchmark.options import CameraOptions
+from camera_benchmark.report import NOTHING
 from factorgraph_loc.experiments.images import prepare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation import film, preset, simulate, with_images
@@ -123,13 +124,13 @@ def estimators(report: Report, duration: float) -> None:
         "points and, where said, a round of all eight antennas, with the estimate after it. *Second half*: of the run"
     )
     rows = []
-    for i, (ms, points) in sorted(found.items()):
+    for i, (ms, points, learnt) in sorted(found.items()):
         steps, half = jobs[i].steps, ms[len(ms) // 2 :]
         median, p99, worst = np.median(ms), np.percentile(ms, 99), ms.max()
         step = f"{median:.2f} / {p99:.2f} / {worst:.1f}"
         later = f"{np.median(half):.2f} / {np.percentile(half, 99):.2f}"
-        rows.append((steps.what, steps.config.estimator, step, later, steps.target, f"{points:.1f}"))
-    heads = ("what", "estimator", "median / p99 / max [ms]", "second half", "target", "points an image")
+        rows.append((steps.what, steps.config.estimator, step, later, steps.target, f"{points:.1f}", learnt))
+    heads = ("what", "estimator", "median / p99 / max [ms]", "second half", "target", "points an image", "learnt")
     report.table(heads, rows)
 
 
@@ -186,12 +187,14 @@ def spent(owner: object, name: str) -> Iterator[list[float]]:
         setattr(owner, name, function)
 
 
-def timed(job: Job) -> tuple[np.ndarray, float]:
-    """Milliseconds (M,) of each step, and how many points an image has in the mean."""
+def timed(job: Job) -> tuple[np.ndarray, float, str]:
+    """Milliseconds (M,) of each step, how many points an image has in the mean, and of how many the filter knows the depth."""
     run(simulate(preset("office", changed(job.steps, WARM_UP)), SEED + 1), job.steps.config)
     log = simulate(preset("office", changed(job.steps, job.duration)), SEED)
     _, counts = np.unique(log.streams["sightings"].t, return_counts=True)
-    return run(log, job.steps.config).timings.update_ms, float(counts.mean())
+    result = run(log, job.steps.config)
+    learnt = str(len(result.learnt.landmarks)) if job.steps.config.estimator == "monoslam" else NOTHING
+    return result.timings.update_ms, float(counts.mean()), learnt
 
 
 def changed(steps: Steps, duration: float) -> dict[str, Any]:
