@@ -17,9 +17,10 @@ from factorgraph_loc.estimators.seen_points import DISAGREES, EXACT, MOST
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision import consensus
-from factorgraph_loc.vision.association import Associator, spread_out
+from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose
 from factorgraph_loc.vision.relocalization import located
+from factorgraph_loc.vision.spread import spread_out
 from factors.se2 import Array
 
 APART = 15.0  # px between a new point and all others

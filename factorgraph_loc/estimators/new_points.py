@@ -193,21 +193,3 @@ def _triangulate(
             if np.abs(step).max() < SETTLED:
                 break
     return Triangulated(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))
-
-
-def spread_out(pixels: Array, priority: Sequence[int], count: int, width: int, height: int) -> list[int]:
-    """At most ``count`` of ``pixels`` (K, 2), spread over an image of ``width`` x ``height``: cell by cell of a grid in turn, of
-    each cell those with the highest ``priority`` (K,) first."""
-    if len(pixels) <= count:
-        return list(range(len(pixels)))
-    side = np.sqrt(width * height / count)
-    cells = np.floor(pixels / side).astype(int)
-    order = sorted(range(len(pixels)), key=lambda i: -priority[i])
-    taken: dict[tuple[int, int], int] = {}
-    turns = []
-    for i in order:
-        cell = (int(cells[i, 0]), int(cells[i, 1]))
-        taken[cell] = taken.get(cell, 0) + 1
-        turns.append(taken[cell])
-    ranked = sorted(range(len(order)), key=lambda j: turns[j])
-    return sorted(order[j] for j in ranked[:count])

@@ -16,9 +16,10 @@ from factorgraph_loc.estimators.robust_update import Update, robust_update, upda
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Estimated
-from factorgraph_loc.vision.association import Associator, spread_out
+from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
+from factorgraph_loc.vision.spread import spread_out
 from factors import reprojection, se2
 from factors.odometry import Increment
 from factors.reprojection import FOCAL, TIME_OFFSET, CameraModel

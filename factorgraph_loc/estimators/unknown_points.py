@@ -20,7 +20,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.graph_parts import Addition, Guess, Keyframe
 from factorgraph_loc.estimators.local_bundle import bundled
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
-from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of, spread_out
+from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of
 from factorgraph_loc.estimators.refound_points import refound
 from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, lifted
@@ -28,6 +28,7 @@ from factorgraph_loc.estimators.variables import Node, Values, point_key
 from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
+from factorgraph_loc.vision.spread import spread_out
 from factors import reprojection, se2
 from factors.point_sighting import PointSightings
 from factors.reprojection import CameraModel, recalibrated
@@ -114,10 +115,10 @@ class UnknownPoints:
         names = self._named(m, rows, lifted(model, *guess), graph)
         pixels = np.asarray(m.pixels[rows], dtype=float)
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
-        chosen = spread_out(pixels, priority, PER_KEYFRAME + WAITING, self.model.width, self.model.height)
+        chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
         rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
         old = [i for i, name in enumerate(names) if name in self._points]
-        few = spread_out(pixels[old], [0] * len(old), PER_KEYFRAME, self.model.width, self.model.height)
+        few = spread_out(pixels[old], PER_KEYFRAME).tolist()
         old = [old[i] for i in few]
         points = [self._points[names[i]] for i in old]
         guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph)

@@ -186,18 +186,3 @@ def _gates(spreads: Array) -> tuple[Array, Array]:
     shrink = np.minimum(1.0, LARGEST_GATE**2 / largest)
     gates = shrink[:, None, None] * gates + SMALLEST_GATE**2 * np.eye(2)
     return np.asarray(np.linalg.inv(gates), dtype=float), np.sqrt(shrink * largest + SMALLEST_GATE**2)
-
-
-def spread_out(pixels: Array, count: int) -> Integers:
-    """Places of at most ``count`` of ``pixels`` (K, 2), ascending, spread over the image: round by round one of each cell."""
-    if len(pixels) <= count:
-        return np.arange(len(pixels))
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    cell = max(math.sqrt(float(np.prod(high - low)) / count), 1.0)
-    _, cells = np.unique(np.floor((pixels - low) / cell), axis=0, return_inverse=True)
-    cells = cells.ravel()
-    order = np.argsort(cells, kind="stable")
-    starts = np.searchsorted(cells[order], cells[order])
-    rounds = np.empty(len(pixels), dtype=np.int64)
-    rounds[order] = np.arange(len(pixels)) - starts  # how many of its cell come before
-    return np.sort(np.argsort(rounds, kind="stable")[:count])

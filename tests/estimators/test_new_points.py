@@ -14,7 +14,6 @@ from factorgraph_loc.estimators.new_points import (
     Sighting,
     Triangulated,
     sightings_of,
-    spread_out,
     triangulate,
 )
 from factors.graph import jacobian_factor
@@ -162,20 +161,6 @@ def test_what_waits_is_bounded() -> None:
     waiting.forget(40)
     assert waiting.count("once") == 0
     assert waiting.count("always") >= FEWEST
-
-
-def test_few_are_taken_from_all_over_the_image() -> None:
-    rng = np.random.default_rng(23)
-    crowd = rng.uniform((0.0, 0.0), (80.0, 80.0), (300, 2))
-    others = np.array([(x, y) for x in (200.0, 400.0, 600.0) for y in (100.0, 300.0, 460.0)])
-    pixels = np.concatenate((crowd, others))
-    priority = [0] * len(pixels)
-    priority[5] = 1
-    chosen = spread_out(pixels, priority, 20, 640, 480)
-    assert len(chosen) == 20
-    assert set(range(300, 309)) <= set(chosen)
-    assert 5 in chosen
-    assert spread_out(pixels[:10], priority[:10], 20, 640, 480) == list(range(10))
 
 
 def test_gtsam_s_factor_is_ours() -> None:

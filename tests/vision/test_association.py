@@ -5,13 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.measurements import CameraFrame
 from factorgraph_loc.points import PointMap
-from factorgraph_loc.vision.association import Associator, spread_out
+from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import CameraPose, agreeing, compatible
 from factorgraph_loc.vision.relocalization import found_on_floor, located
 from factors import reprojection, se2
@@ -238,18 +236,3 @@ def test_garbage_agrees_on_nothing():
     noise = np.broadcast_to(np.eye(2), (20, 2, 2))
     right = agreeing(MODEL, CameraPose(*HERE, spread(0.05, 0.2)), points, pixels, noise)
     assert np.count_nonzero(right) <= 5
-
-
-@given(st.integers(1, 60), st.integers(1, 40), st.integers(0, 1000))
-def test_what_is_spread_out_is_chosen_from_all_over_the_image(size, count, seed):
-    pixels = np.random.default_rng(seed).uniform(0.0, 100.0, (size, 2))
-    chosen = spread_out(pixels, count)
-    assert len(chosen) == min(size, count) == len(set(chosen.tolist()))
-    assert (np.diff(chosen) > 0).all()
-
-
-def test_crowded_pixels_leave_room_for_lonely_ones():
-    crowd = np.random.default_rng(0).uniform(0.0, 5.0, (500, 2))
-    lonely = np.array(((600.0, 400.0), (600.0, 10.0), (10.0, 400.0)))
-    chosen = spread_out(np.concatenate((crowd, lonely)), 20)
-    assert {500, 501, 502} <= set(chosen.tolist())

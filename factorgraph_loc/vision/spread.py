@@ -1,0 +1,28 @@
+"""A choice of pixels that is spread over an image: neighbours tell nearly the same."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_loc.vision.keypoints import Integers
+from factors.se2 import Array
+
+
+def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None) -> Integers:
+    """Places of at most ``count`` of ``pixels`` (K, 2), ascending: cell by cell of a grid in turn, of each cell those with the
+    highest ``priority`` (K,) first, else in their order."""
+    if len(pixels) <= count:
+        return np.arange(len(pixels))
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    side = max(math.sqrt(float(np.prod(high - low)) / count), 1.0)
+    _, cells = np.unique(np.floor((pixels - low) / side), axis=0, return_inverse=True)
+    cells = cells.ravel()
+    order = np.lexsort((np.zeros(len(pixels)) if priority is None else -np.asarray(priority), cells))
+    turns = np.empty(len(pixels), dtype=np.int64)
+    turns[order] = np.arange(len(pixels)) - np.searchsorted(
+        cells[order], cells[order]
+    )  # how many of its cell come before
+    return np.sort(np.argsort(turns, kind="stable")[:count])
