@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,8 @@ def said(one: Attempt, right: Attempt) -> str:
     if one.failure:
         return short(one.failure)
     parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]
-    parts += [short(text) for text in one.events if text not in right.events]
+    events = Counter(re.sub(r" since [\d.]+ s", "", text) for text in one.events if text not in right.events)
+    parts += [short(text) + (f" ({times} times)" if times > 1 else "") for text, times in events.items()]
     for name, key in (("NIS", "nis.camera.mean_per_dof"), ("rejected", "rejected.total"), ("late", "late.total")):
         now, before = one.figures.get(key), right.figures.get(key)
         if now is not None and before is not None and abs(now - before) > 0.2 * abs(before):

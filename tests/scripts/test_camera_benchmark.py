@@ -114,6 +114,8 @@ def test_what_is_said_is_what_the_fault_adds():
 
     assert said(wrong, right) == "images are grey; NIS 1 → 4"
     assert said(right, right) == NOTHING
+    lost = replace(right, events=("lost since 3.5 s; goes on", "lost since 7.0 s; goes on"))
+    assert said(lost, right) == "lost; goes on (2 times)"
     assert said(Attempt(None, {}, failure="room: no"), right) == "room: no"
 
 
