@@ -7,6 +7,7 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Annotated
@@ -24,6 +25,10 @@ from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node,
 from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
+
+SOLVE_INTERVAL = (
+    0.45  # s: how long images may wait for the solver; until then they update the newest pose, as a filter would
+)
 
 
 class SmootherSettings(GraphSettings):
@@ -48,6 +53,11 @@ class Smoother(RelocatingGraph):
         # where landmarks are estimated an update takes long: what is seen between keyframes waits for the next one
         self._waits = settings.landmarks != "known"
         self._waiting = Addition()
+        # pixels of known points place the robot so well by themselves that the solver need not see each image at once, unless
+        # it is to learn from them how the camera is mounted
+        known = self._points.known and settings.landmarks == "known" and not self._camera_constants.names
+        self._defers = known and (settings.lag is None or settings.lag >= 2.0 * SOLVE_INTERVAL)
+        self._solved = -math.inf  # the time of the newest keyframe in the solver
         # of each keyframe: its causal estimate, and the final one where it has left the window
         self._filtered: list[tuple[Array, Array]] = []
         self._left: list[tuple[Array, Array]] = []
@@ -83,17 +93,24 @@ class Smoother(RelocatingGraph):
         return self._filtered[keyframe][0]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        self._filtered.append((addition.values[keyframe.key], spread))
-        self._leave(keyframe.t, [k for k in self._constants if k not in addition.values and not is_point(k)])
+        guess = addition.values[keyframe.key], spread
+        self._filtered.append(guess)
+        if self._defers and keyframe.t < self._solved + SOLVE_INTERVAL:
+            self._wait([self._odometry_node(keyframe), *addition.nodes], addition.values, guess)
+            return
         self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        if self._waits and guess is not None:
-            self._waiting.nodes += addition.nodes
-            self._waiting.values |= addition.values
-            self._pose, self._covariance = guess
+        if guess is not None and (self._waits or (self._defers and keyframe.t < self._solved + SOLVE_INTERVAL)):
+            self._wait(addition.nodes, addition.values, guess)
             return
         self._update(addition.nodes, addition.values)
+
+    def _wait(self, nodes: Sequence[Node], values: Values, guess: Guess) -> None:
+        """Keep what is to enter the solver with its next update; until then the newest pose is ``guess``."""
+        self._waiting.nodes += nodes
+        self._waiting.values |= values
+        self._pose, self._covariance = guess
 
     def _current(self, key: int) -> Array:
         return self._solver.value(key)
@@ -107,6 +124,8 @@ class Smoother(RelocatingGraph):
     def _update(self, nodes: Sequence[Node], values: Values) -> None:
         newest = self._keyframes[-1]
         nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
+        self._solved = newest.t
+        self._leave(newest.t, [k for k in self._constants if k not in values and not is_point(k)])
         try:
             self._solver.update(nodes, values, newest.t)
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
@@ -184,7 +203,7 @@ class Smoother(RelocatingGraph):
         The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of, and so do
         constants and landmarks.
         """
-        self._solver = self._new_solver()
+        self._solver, self._waiting, self._solved = self._new_solver(), Addition(), newest.t
         oldest, *others = self._keyframes[len(self._left) :]
         pose, spread = self._filtered[oldest.index]
         means, spreads = self._constants, self._spreads
