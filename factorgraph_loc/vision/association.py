@@ -37,7 +37,9 @@ MARGIN = 20.0  # px around the image in which a point may be predicted
 SAME = 4.0  # px: points and features that are nearer may be one
 SAME_POINT = 0.15  # m: points that are nearer may be one
 CHANCE = 0.02  # share of the map's different points that look more alike than a match may
-FEWEST = 3  # matches: fewer may agree with the prediction by chance
+# matches, and their share of what could be seen: fewer may agree with the prediction by chance. Of an office that the map does not
+# know up to 2 % of the features agree
+FEWEST, LEAST_SHARE = 3, 0.05
 SAMPLED = 300  # views, to tell that
 FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # matches that must agree on a place without a prediction, and their share
 
@@ -121,8 +123,10 @@ class Associator:
             return Associations(rows[:0], seen[:0], int(kept.sum()))
         camera = CameraPose(position, rotation, covariance)
         right = agreeing(model, camera, points[rows], features[seen], spreads[rows])
-        wrong = int(np.count_nonzero(~right))
-        return Associations(ahead[rows[right]], seen[right], int(kept.sum()), wrong)
+        expected, agreed = int(kept.sum()), int(np.count_nonzero(right))
+        if agreed < LEAST_SHARE * min(expected, len(features)):
+            right[:] = False
+        return Associations(ahead[rows[right]], seen[right], expected, int(np.count_nonzero(~right)))
 
     def relocalized(self, frame: CameraFrame) -> tuple[Array, Array, Array, Associations] | None:
         """Position (3,), rotation (3, 3) and covariance (6, 6), as in :meth:`guided`, of the camera, with what it sees; None where

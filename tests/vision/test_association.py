@@ -236,3 +236,19 @@ def test_garbage_agrees_on_nothing():
     noise = np.broadcast_to(np.eye(2), (20, 2, 2))
     right = agreeing(MODEL, CameraPose(*HERE, spread(0.05, 0.2)), points, pixels, noise)
     assert np.count_nonzero(right) <= 5
+
+
+@pytest.mark.parametrize(("kept", "believed"), [(0.02, False), (0.15, True)])
+def test_few_that_agree_of_many_expected_are_not_believed(kept, believed):
+    """As in a place that the map does not know, where a few agree by chance."""
+    rng = np.random.default_rng(8)
+    points = mapped(rng, wall_points(rng, 3000))
+    covariance = spread(0.01, 0.03)
+    frame, shown = picture(rng, points, clutter=0)
+    strange = np.arange(len(shown)) >= max(4, int(kept * len(shown)))
+    descriptors = np.where(strange[:, None], rng.standard_normal(frame.descriptors.shape), frame.descriptors)
+    frame = replace(frame, descriptors=descriptors.astype(np.float32))
+    found = Associator(points, MODEL).guided(frame, *predicted(rng, covariance), covariance)
+    assert found.expected > 400
+    assert (len(found) > 0) == believed
+    assert found.rejected >= 4 or believed
