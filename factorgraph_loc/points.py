@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
 from factors.se2 import Array
@@ -19,6 +20,9 @@ from factors.se2 import Array
 POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+VIEW = ("from_x", "from_y", "from_z", "size")
+KINDS: tuple[str, ...] = get_args(FrontendSettings.model_fields["feature"].annotation)
+ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,7 @@ def write_points(points: PointMap, path: Path) -> None:
     columns["feature"] = [points.feature if v >= 0 else "" for v in views.tolist()]
     if len(points.owners):
         shown = views >= 0
-        for axis, name in enumerate(("from_x", "from_y", "from_z")):
+        for axis, name in enumerate(VIEW[:3]):
             columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
         columns["size"] = np.where(shown, points.sizes[views], np.nan)
         columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
@@ -95,7 +99,10 @@ def write_points(points: PointMap, path: Path) -> None:
 
 
 def read_points(path: Path) -> PointMap:
-    """Read ``NAME.points.parquet``; InputError names file and column of what is wrong."""
+    """Read ``NAME.points.parquet``; InputError names file, row (from 1) and column of what is wrong.
+
+    Rows of one point must agree on its place. Covariances must be positive semi-definite.
+    """
     try:
         table = pl.read_parquet(path)
     except (OSError, pl.exceptions.PolarsError) as error:
@@ -103,26 +110,37 @@ def read_points(path: Path) -> PointMap:
     missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
-    numbers = {name: _numbers(table, name, path) for name in COLUMNS[1:]}
-    for name, values in numbers.items():
-        if len(bad := np.flatnonzero(~np.isfinite(values))):
-            raise bad_field(path, name, float(values[bad[0]]), "a finite number", row=int(bad[0]) + 1)
+    every = np.arange(len(table))
+    numbers = {name: _finite(table, name, every, path) for name in COLUMNS[1:]}
     rows: dict[str, int] = {}
-    labels = [str(name) for name in table["point"].to_list()]
+    labels = _texts(table, "point")
+    if "" in labels:
+        raise bad_field(path, "point", "", "the name of a point", row=labels.index("") + 1)
     owner = np.array([rows.setdefault(name, len(rows)) for name in labels], dtype=np.int64)
     _, first = np.unique(owner, return_index=True)
+    for name, values in numbers.items():
+        expected = values[first][owner]
+        if len(bad := np.flatnonzero(values != expected)):
+            i = int(bad[0])
+            stated = f"{float(expected[i])!r} as in row {first[owner[i]] + 1} of point {labels[i]}"
+            raise bad_field(path, name, float(values[i]), stated, row=i + 1)
     positions = np.column_stack([numbers[axis] for axis in "xyz"])
     covariances = np.empty((len(rows), 3, 3))
     for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
         covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
-    features = [str(name) for name in table["feature"].to_list()]
+    _check_covariances(covariances, tuple(rows), first, path)
+    features = _texts(table, "feature")
     kinds = sorted({name for name in features if name})
+    if unknown := [name for name in kinds if name not in KINDS]:
+        raise bad_field(path, "feature", unknown[0], " or ".join(KINDS), row=features.index(unknown[0]) + 1)
     if len(kinds) > 1:
         raise InputError(f"{path}: has features of the kinds {', '.join(kinds)}, expected one kind")
     if not kinds:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])
-    columns = [_numbers(table, name, path)[shown] for name in ("from_x", "from_y", "from_z", "size")]
+    columns = [_finite(table, name, shown, path) for name in VIEW]
+    if len(bad := np.flatnonzero(columns[3] <= 0.0)):
+        raise bad_field(path, "size", float(columns[3][bad[0]]), "a number above 0", row=int(shown[bad[0]]) + 1)
     return PointMap(
         tuple(rows),
         positions[first],
@@ -135,10 +153,33 @@ def read_points(path: Path) -> PointMap:
     )
 
 
-def _numbers(table: pl.DataFrame, name: str, path: Path) -> Array:
+def _texts(table: pl.DataFrame, name: str) -> list[str]:
+    """A column as text, empty where nothing stands in it."""
+    return ["" if cell is None else str(cell) for cell in table[name].to_list()]
+
+
+def _finite(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
+    """The numbers (R,) of a column in ``rows`` (R,)."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
-    return np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)
+    values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
+    if len(bad := np.flatnonzero(~np.isfinite(values))):
+        raise bad_field(path, name, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]) + 1)
+    return values
+
+
+def _check_covariances(covariances: Array, names: Sequence[str], first: NDArray[np.int64], path: Path) -> None:
+    least, _, most = np.linalg.eigvalsh(covariances).T
+    if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
+        i = int(bad[0])
+        given = tuple(float(covariances[i][place]) for place in UPPER)
+        raise bad_field(
+            path,
+            f"covariance ({', '.join(COLUMNS[4:])}) of point {names[i]}",
+            given,
+            "a positive semi-definite matrix",
+            row=int(first[i]) + 1,
+        )
 
 
 def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, path: Path) -> NDArray[Any]:

@@ -109,7 +109,10 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
     if points is not None:
         if not isinstance(points, str):
             raise InputError(f"{source}: points is {points!r}, expected the name of a file")
-        content = {**content, "points": read_points(inside(folder, points, source))}
+        path = inside(folder, points, source)
+        if not path.exists():
+            raise InputError(f"{source}: points names {points!r}, which is missing")
+        content = {**content, "points": read_points(path)}
     return parse_model(World, content, source)
 
 

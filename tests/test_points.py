@@ -82,6 +82,19 @@ def written(tmp_path):
     return write
 
 
+def in_row(table, row, **cells):
+    """The table with other ``cells`` in one row."""
+    there = pl.int_range(len(table)) == row
+    return table.with_columns(
+        pl.when(there).then(pl.lit(v, pl.Float64)).otherwise(pl.col(c)).alias(c) for c, v in cells.items()
+    )
+
+
+def test_a_flat_covariance_is_one(written):
+    table = lambda t: t.with_columns(xx=pl.lit(4.0), xy=pl.lit(2.0), yy=pl.lit(1.0), xz=0.0, yz=0.0, zz=0.0)  # noqa: E731
+    assert read_points(written(table)).covariances[2].tolist() == [[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -91,6 +104,16 @@ def written(tmp_path):
         (lambda t: t.drop("from_x"), "has no column from_x"),
         (lambda t: t.with_columns(x=pl.lit("far")), "has no column x of numbers"),
         (lambda t: t.with_columns(z=pl.lit(float("nan"))), "z is nan, expected a finite number"),
+        (lambda t: t.with_columns(point=pl.Series(["p0", "p1", None, "p2"])), ":3: point is '', expected the name"),
+        (lambda t: in_row(t, 2, x=7.0), ":3: x is 7.0, expected "),
+        (lambda t: in_row(t, 2, yz=7.0), " as in row 2 of point p1"),
+        (lambda t: t.with_columns(xx=pl.lit(-5.0)), ":1: covariance (xx, xy, xz, yy, yz, zz) of point p0 is (-5.0, "),
+        (lambda t: in_row(t, 3, xx=0.0, xy=1.0), ":4: covariance (xx, xy, xz, yy, yz, zz) of point p2 is (0.0, 1.0, "),
+        (lambda t: in_row(t, 1, size=float("nan")), ":2: size is nan, expected a finite number"),
+        (lambda t: in_row(t, 1, size=0.0), ":2: size is 0.0, expected a number above 0"),
+        (lambda t: in_row(t, 0, from_x=float("inf")), ":1: from_x is inf, expected a finite number"),
+        (lambda t: in_row(t, 2, from_z=None), ":3: from_z is nan, expected a finite number"),
+        (lambda t: t.with_columns(feature=pl.lit("surf")), ":1: feature is 'surf', expected colour or sift or orb"),
         (lambda t: t.with_columns(feature=pl.Series(["sift", "orb", "orb", "orb"])), "kinds orb, sift"),
         (lambda t: t.with_columns(descriptor=pl.Series([b"1234", b"12345678", b"1234", b"1234"])), "differ in their"),
         (lambda t: t.with_columns(descriptor=pl.Series([b"12345"] * 4)), "differ in their length"),

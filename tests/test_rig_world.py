@@ -154,3 +154,10 @@ def test_bad_tables_of_tags(tmp_path, rows, fragment):
         read_world(tmp_path / "a.world.toml")
     assert fragment in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_table_of_points_that_is_missing(tmp_path):
+    (tmp_path / "hall.world.toml").write_text('points = "hall.points.parquet"\n')
+    message = f"{tmp_path / 'hall.world.toml'}: points names 'hall.points.parquet', which is missing"
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_world(tmp_path / "hall.world.toml")
