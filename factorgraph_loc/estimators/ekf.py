@@ -134,6 +134,8 @@ class Ekf(Filter):
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
         records: list[_Record] = self._records
+        if not records:  # nothing told where an unknown start was
+            return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         smoothed = records[-1].updated
         poses, covariances = [smoothed.pose], [smoothed.covariance[:3, :3]]
         for after, record in zip(records[:0:-1], records[-2::-1], strict=True):

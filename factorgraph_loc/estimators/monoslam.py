@@ -99,6 +99,7 @@ class Monoslam(Filter):
     """The filter; see the module."""
 
     takes_pixels = True
+    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
     _state: SlamState
 
     def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
@@ -158,6 +159,8 @@ class Monoslam(Filter):
         records: list[_Record] = self._records
         smooth = self._smooth and self._settings.landmarks == "known"
         size = ROBOT if self._by_velocity else POSE
+        if not records:
+            return []
         newest = records[-1]
         found = [(newest.t, newest.robot, newest.covariance)]
         for after, here in zip(records[:0:-1], records[-2::-1], strict=True):

@@ -142,6 +142,8 @@ class Looker:
     def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
         """Features of an image that are points of the map, and how many were expected."""
         if self._associator is None:
+            if not self._grows:
+                self._diagnostics.ignore("camera", len(m.pixels))
             return [], 0
         if m.feature != self._associator.feature:
             self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))

@@ -47,6 +47,7 @@ class RelocatingGraph(MeasuringGraph):
     """A graph estimator that finds its place; see the module."""
 
     takes_pixels = True
+    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:
         super().__init__(setup, settings)

@@ -68,6 +68,8 @@ class _Image:
 class SpaceBatch(Monoslam):
     """The batch in space; see the module."""
 
+    estimates_points = False
+
     def __init__(self, setup: Setup, settings: SpaceBatchSettings) -> None:
         if settings.landmarks != "known" or settings.planar:
             raise InputError("space_batch: takes points of a known map and a robot in space, expected planar = false")

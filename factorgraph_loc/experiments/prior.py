@@ -20,6 +20,7 @@ POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
 VAGUE_HEADING_SIGMA = 0.1  # rad, where the reference's heading is no measurement
 
+KNOWN = "reference, log or X,Y,HEADING"
 EXPECTED = "reference, log, unknown or X,Y,HEADING"
 
 

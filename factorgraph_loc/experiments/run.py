@@ -19,14 +19,14 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate, PosePrior, SpaceEstimator
+from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator
 from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.experiments.doubts import never_localized, without_points, without_tags
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
-from factorgraph_loc.experiments.prior import EXPECTED, resolve_prior
+from factorgraph_loc.experiments.prior import KNOWN, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
-from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
 from factors.se2 import Array
@@ -78,7 +78,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
-            f"expected a prior {EXPECTED}"
+            f"expected a prior {KNOWN}"
         )
 
     report = progress or (lambda _: None)
@@ -120,8 +120,9 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
             *_doubts(log, sensors),
             *unread,
             *prepared.warnings,
-            *_without_tags(log, config.estimator, estimator.diagnostics),
-            *_never_localized(log, loop.estimates, final),
+            *without_points(log, sensors, config.estimator, estimator, settings),
+            *without_tags(log, config.estimator, estimator.diagnostics),
+            *never_localized(log, sensors, loop.estimates, final),
         ),
         causal_space=_in_space(loop.estimates),
         final_space=estimator.space_trajectory() if isinstance(estimator, SpaceEstimator) else None,
@@ -307,26 +308,6 @@ def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     if "odometry" not in sensors and "twist" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
-
-
-def _without_tags(log: Log, estimator: str, diagnostics: Diagnostics) -> tuple[str, ...]:
-    rounds = diagnostics.ignored.get("rfid", 0)
-    if not rounds or estimator == "dead_reckoning":  # which says so by its name
-        return ()
-    return (f"{log.name}: {estimator} takes no tags: all {rounds} inventory rounds are ignored",)
-
-
-def _never_localized(log: Log, estimates: Sequence[PoseEstimate], final: Trajectory) -> tuple[str, ...]:
-    found = {e.status for e in estimates}
-    if "localized" in found or ("ambiguous" not in found and len(final)):  # or it says nothing before the end
-        return ()
-    several, nothing = (
-        ("its landmarks leave several places possible", "no landmark of the map was seen")
-        if log.world.landmarks or not log.world.tags
-        else ("its tags leave several places possible", "no tag of the map was read")
-    )
-    why = several if "ambiguous" in found else nothing
-    return (f"{log.name}: never localized: {why}",)
 
 
 def _versions() -> dict[str, str]:

@@ -173,3 +173,14 @@ def test_points_behind_the_camera_and_at_its_place_do_no_harm(name, log):
     positions[20:30] *= -1.0
     result = run(replace(log, world=World(points=replace(points, positions=positions))), CONFIGS[name])
     assert final_rmse(result, log) < CLEAN
+
+
+@pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother", "batch"])
+def test_a_place_that_no_image_shows(name, log):
+    """An unknown start, and none of the names is in the map: there is no trajectory, and a word about it."""
+    elsewhere = with_sightings(log, point=["nowhere"] * len(log.streams["sightings"].t))
+    result = run(elsewhere, replace(CONFIGS[name], prior="unknown"))
+    assert set(result.status) == {"unlocalized"}
+    assert (result.final.t.shape, result.final.poses.shape) == ((0,), (0, 3))
+    assert result.final.covariances.shape == (0, 3, 3)
+    assert result.warnings == ("room: never localized: no point of the map was found in an image",)

@@ -260,3 +260,10 @@ def test_features_become_points_and_are_found_again(drive):
     result = run(log, RunConfig("monoslam", {"landmarks": "unknown"}, ("odometry", "camera")))
     assert 20 < len(result.learnt.landmarks) <= 100
     assert score(result, log)["aligned.position_rmse"] < 0.2
+
+
+def test_there_is_no_trajectory_before_the_start(drive):
+    log = drive(1, 2.0)
+    setup = Setup(log.rig, log.world, SENSORS, np.random.default_rng(0))
+    found = create("monoslam", setup, settings_of("monoslam", {})).trajectory()
+    assert (found.poses.shape, found.covariances.shape) == ((0, 3), (0, 3, 3))

@@ -134,7 +134,8 @@ def test_missing_priors(log):
         run(log, RunConfig("fake", prior="log"))
     with pytest.raises(InputError, match="has no reference"):
         run(replace(log, reference=None), RunConfig("fake", prior="reference"))
-    with pytest.raises(InputError, match="fake cannot start from an unknown pose"):
+    message = "fake cannot start from an unknown pose .*, expected a prior reference, log or X,Y,HEADING"
+    with pytest.raises(InputError, match=message):
         run(log, RunConfig("fake", prior="unknown"))
 
 

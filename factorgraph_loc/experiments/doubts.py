@@ -1,0 +1,66 @@
+"""What a run says of itself where the map and what was measured do not come together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate
+from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
+from factorgraph_loc.files import FileModel
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+
+
+def without_tags(log: Log, estimator: str, diagnostics: Diagnostics) -> tuple[str, ...]:
+    """Scans of tags went to an estimator that takes none."""
+    rounds = diagnostics.ignored.get("rfid", 0)
+    if not rounds or estimator == "dead_reckoning":  # which says so by its name
+        return ()
+    return (f"{log.name}: {estimator} takes no tags: all {rounds} inventory rounds are ignored",)
+
+
+def without_points(
+    log: Log, sensors: Sequence[str], name: str, estimator: Estimator, settings: FileModel
+) -> tuple[str, ...]:
+    """A camera that is used, a map without points that it could find, and an estimator (by its ``name``) that needs them."""
+    used = [sensor for sensor in OF_CAMERA if sensor in sensors]
+    points = log.world.points
+    if not used or not getattr(estimator, "takes_pixels", False):
+        return ()
+    if points is not None and len(points.owners if used == [CAMERA] else points):
+        return ()
+    if getattr(settings, "visual_odometry", False):
+        return ()
+    others = ""
+    if getattr(estimator, "estimates_points", False):
+        if getattr(settings, "landmarks", "known") != "known":
+            return ()
+        others = f", or {name}.landmarks=unknown"
+    return (f"{log.name}: the map has no points that a camera could find: give --world{others}",)
+
+
+def never_localized(
+    log: Log, sensors: Sequence[str], estimates: Sequence[PoseEstimate], final: Trajectory
+) -> tuple[str, ...]:
+    """An unknown start that nothing told, in terms of what ``sensors`` find in the map."""
+    found = {e.status for e in estimates}
+    if "localized" in found or ("ambiguous" not in found and len(final)):  # or it says nothing before the end
+        return ()
+    world = log.world
+    kinds = []
+    if world.landmarks and "bearing_range" in sensors:
+        kinds.append(("landmarks", "no landmark of the map was seen"))
+    if world.tags and "rfid" in sensors:
+        kinds.append(("tags", "no tag of the map was read"))
+    if world.points is not None and any(sensor in sensors for sensor in OF_CAMERA):
+        kinds.append(("points", "no point of the map was found in an image"))
+    names = " and ".join(name for name, _ in kinds)
+    if not kinds:
+        why = "the map has nothing that its sensors could find"
+    elif "ambiguous" in found:
+        why = f"its {names} leave several places possible"
+    elif len(kinds) > 1:  # an estimator need not take all of them
+        why = f"its {names} did not tell the place"
+    else:
+        why = kinds[0][1]
+    return (f"{log.name}: never localized: {why}",)

@@ -1,0 +1,101 @@
+"""What a run says of itself where the map and what was measured do not come together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import FeatureStream, SightingStream
+from factorgraph_loc.measurements import CameraFrame
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import World
+
+NO_POINTS = "straight: the map has no points that a camera could find: give --world"
+STAMPS = np.array([0.3, 0.7])
+
+
+@pytest.fixture
+def blank(log):
+    """The short log with a camera whose images show features that no map has, and pixels of an unknown name; no map."""
+    nothing = np.zeros((12, 32), dtype=np.uint8)
+    frames = [
+        CameraFrame(float(t), "orb", np.full((12, 2), 50.0), np.ones(12), nothing, np.arange(12) + 12 * i)
+        for i, t in enumerate(STAMPS)
+    ]
+    streams = {
+        "odometry": log.streams["odometry"],
+        "bearing_range": log.streams["bearing_range"],
+        "camera": FeatureStream(STAMPS, frames),
+        "sightings": SightingStream(STAMPS, ["x", "x"], np.full(2, 50.0), np.full(2, 60.0)),
+    }
+    camera = CameraSettings(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+    rig = Rig(sensors=("odometry", "camera"), bearing_range=log.rig.bearing_range, camera=camera)
+    return replace(log, rig=rig, world=World(), streams=streams)
+
+
+def with_points(log, views):
+    """The log in a map of one point, with so many views of it."""
+    points = replace(
+        PointMap.of(["a"], np.array([[5.0, 0.0, 0.3]])),
+        feature="orb" if views else "",
+        owners=np.zeros(views, dtype=np.int64),
+        descriptors=np.full((views, 32), 255, dtype=np.uint8),
+        seen_from=np.zeros((views, 3)),
+        sizes=np.ones(views),
+    )
+    return replace(log, world=log.world.model_copy(update={"points": points}))
+
+
+@pytest.mark.parametrize("sensor", ["camera", "sightings"])
+@pytest.mark.parametrize(
+    ("name", "settings", "hint"),
+    [
+        ("ekf", {}, ""),
+        ("ekf", {"landmarks": "unknown"}, ""),
+        ("particle_filter", {"particles": 50}, ""),
+        ("smoother", {}, ", or smoother.landmarks=unknown"),
+        ("batch", {}, ", or batch.landmarks=unknown"),
+        ("monoslam", {}, ", or monoslam.landmarks=unknown"),
+    ],
+)
+def test_a_camera_in_a_map_without_points(blank, sensor, name, settings, hint):
+    result = run(blank, RunConfig(name, settings, ("odometry", sensor)))
+    assert result.warnings == (NO_POINTS + hint,)
+    assert sum(result.diagnostics.ignored.values()) == (24 if sensor == "camera" else 2)
+
+
+@pytest.mark.parametrize("name", ["smoother", "monoslam"])
+def test_points_that_are_estimated_need_no_map(blank, name):
+    assert run(blank, RunConfig(name, {"landmarks": "unknown"}, ("odometry", "camera"))).warnings == ()
+
+
+def test_nothing_is_missed_where_no_camera_is_used(blank):
+    assert run(blank, RunConfig("ekf", sensors=("odometry",))).warnings == ()
+    assert run(blank, RunConfig("dead_reckoning", sensors=("odometry", "camera"))).warnings == ()
+    assert run(blank, RunConfig("smoother", {"visual_odometry": True}, ("odometry", "camera"))).warnings == ()
+
+
+def test_images_need_points_that_look_like_something(blank):
+    assert run(with_points(blank, 2), RunConfig("ekf", sensors=("odometry", "camera"))).warnings == ()
+    named = with_points(blank, 0)
+    assert run(named, RunConfig("ekf", sensors=("odometry", "camera"))).warnings == (NO_POINTS,)
+    assert run(named, RunConfig("ekf", sensors=("odometry", "sightings"))).warnings == ()
+
+
+def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank, log):
+    def why(log, *sensors):
+        result = run(log, RunConfig("smoother", sensors=("odometry", *sensors), prior="unknown"))
+        return result.warnings[-1].removeprefix("straight: never localized: ")
+
+    assert why(with_points(blank, 2), "camera") == "no point of the map was found in an image"
+    assert why(with_points(blank, 2), "bearing_range", "camera") == "no point of the map was found in an image"
+    assert why(blank, "bearing_range") == "the map has nothing that its sensors could find"
+    both = with_points(replace(blank, world=log.world), 2)
+    assert why(both, "camera") == "no point of the map was found in an image"
+    unseen = replace(log.streams["bearing_range"], landmark=["x", "y"] * 4)
+    both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
+    assert why(both, "bearing_range") == "no landmark of the map was seen"
+    assert why(both, "bearing_range", "camera") == "its landmarks and points did not tell the place"
