@@ -185,6 +185,7 @@ class Eye:
 
 
 def joined(first: Sights, second: Sights) -> Sights:
+    """The rows of both, ``first`` before ``second``."""
     if not len(first) or not len(second):
         return first if len(first) else second
     names = Sights.__dataclass_fields__

@@ -106,6 +106,7 @@ class Origin:
 
 
 def standstill(robot: RobotState) -> Step:
+    """No motion: the step to a second measurement of the same time."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
@@ -220,6 +221,7 @@ def log(rotation: Array) -> Array:
 
 
 def about_z(angle: float) -> Array:
+    """The rotation (3, 3) by ``angle`` [rad] about z, counter-clockwise as seen from above."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 

@@ -32,10 +32,12 @@ def pale(rng: np.random.Generator) -> Colour:
 
 
 def wood(rng: np.random.Generator) -> Colour:
+    """A colour of wood."""
     return _colour(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.65), rng.uniform(0.4, 0.8))
 
 
 def filled(height: int, width: int, colour: Colour) -> Canvas:
+    """A canvas (H, W, 3) of one colour."""
     return np.full((height, width, 3), colour, dtype=np.uint8)
 
 

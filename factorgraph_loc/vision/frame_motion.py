@@ -52,11 +52,6 @@ class FrameMotion:
     information: Array
     agrees: NDArray[np.bool_]
 
-    @property
-    def only_turn(self) -> bool:
-        """Whether the direction of the way is not told."""
-        return not self.information[:2].any()
-
 
 def frame_motion(
     model: CameraModel, first: Array, second: Array, predicted: Increment, rng: np.random.Generator
