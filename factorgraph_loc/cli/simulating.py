@@ -60,7 +60,10 @@ def simulate(
     from factorgraph_loc.simulation import simulate as make
 
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
-    settings = _settings(what, _changes(named, set_ or []))
+    changes = _changes(named, set_ or [])
+    if "images" in changes and not images:
+        raise InputError("--image-rate or --set images.KEY tells how images are made, expected --images with it")
+    settings = _settings(what, changes)
     looks = None
     if recorded is not None:
         looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))

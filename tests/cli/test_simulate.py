@@ -86,7 +86,9 @@ def test_nothing_is_rendered_for_a_folder_that_holds_something(fgloc, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("office", "--image-rate", 0), "images.rate is 0"),
+        (("office", "--images", "--image-rate", 0), "images.rate is 0"),
+        (("office", "--image-rate", 5), "expected --images with it"),
+        (("office", "--set", "images.exposure=0.01"), "expected --images with it"),
         (("ofice",), "did you mean office?"),
         (("missing.toml",), "missing.toml: cannot be read"),
         (("office", "--seeds", "5:5"), "expected a number such as 3, or a range"),
