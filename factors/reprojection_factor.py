@@ -85,7 +85,8 @@ class ReprojectionFactor:
         if self.offset_covariance is not None or self.point_covariances is not None:
             spread = np.zeros((len(error), 2, 2)) + np.eye(2)
             if self.offset_covariance is not None:
-                spread += by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
+                # all points have this error in common: together they must not seem to be rid of it
+                spread += len(error) * by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
             if self.point_covariances is not None:
                 spread += scale**2 * by_point @ self.point_covariances @ by_point.transpose(0, 2, 1)
             whitener = np.linalg.inv(np.linalg.cholesky(spread))

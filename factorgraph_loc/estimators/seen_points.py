@@ -30,6 +30,7 @@ DISAGREES = "camera: does not agree with the others"  # why a sighting is reject
 CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
 FEW_SHARE = 0.3  # of named points, and
 FEW, MANY = 6, 20  # of points that are found by what they look like, where so many are expected: they are missed
+UNSURE = 1.0  # m: a prediction that is known no better may miss the map altogether
 MOST = 100  # points of one image that are used: more tell hardly more, as the errors of neighbours in a map are alike
 EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
 # A pixel is so sharp that one step from a poor prediction does not lead to the optimum
@@ -186,7 +187,8 @@ class KnownPoints:
         assert self.associator is not None
         seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
         self.used = seen.features
-        self.missed = len(seen) < FEW and min(seen.expected, len(m.pixels)) >= MANY
+        unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
+        self.missed = len(seen) < FEW and (unsure or min(seen.expected, len(m.pixels)) >= MANY)
         if seen.rejected:
             self._diagnostics.reject(DISAGREES, seen.rejected)
         if len(seen) == 0:
