@@ -25,7 +25,7 @@ from factorgraph_loc.readers import load, write_native
 from factorgraph_loc.readers.native import RunFile
 from factorgraph_loc.rig import BearingRangeSettings, ImuSettings, Rig
 from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.world import Landmark, World, read_world
 
 
 def test_what_is_read(native, one):
@@ -340,7 +340,8 @@ def test_the_example_of_the_documentation(tmp_path, one, monkeypatch):
     # the run.toml with every key, and the lines of Python
     whole = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]
     parse_model(RunFile, tomllib.loads(whole), "run.toml")
-    (lines,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(compile(lines, "log-format.md", "exec"), {})
+    for lines in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(lines, "log-format.md", "exec"), {})
+    assert read_world(tmp_path / "markers.world.toml").points.names == ("marker-7", "marker-9")
     assert (tmp_path / "copy" / "odometry.parquet").is_file()
