@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from factorgraph_loc.files import FileModel
 from factors import reprojection
@@ -19,6 +19,7 @@ Pixel = Annotated[float, Field(ge=-1e5, le=1e5, description="px")]
 Side = Annotated[int, Field(ge=16, le=100_000, description="px")]
 Metres = Annotated[float, Field(ge=0.0, le=10.0, description="m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0, description="rad")]
+WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
 class CameraUncertainty(FileModel):
@@ -78,6 +79,16 @@ class CameraSettings(FileModel):
     tempering: Annotated[float, Field(gt=0.0, le=1.0, description="exponent of the likelihood")] = 0.1
     frontend: FrontendSettings = FrontendSettings()
     uncertainty: CameraUncertainty = CameraUncertainty()
+
+    @model_validator(mode="after")
+    def _is_invertible(self) -> CameraSettings:
+        pixel = reprojection.folded(self.model())
+        if pixel is not None:
+            raise ValueError(
+                f"the distortion {self.distortion} cannot be inverted at the pixel ({pixel[0]:g}, {pixel[1]:g}), expected a lens "
+                f"that neither folds its image nor sees more than {WIDEST_ANGLE:.0f} degrees off its axis"
+            )
+        return self
 
     def model(self) -> CameraModel:
         return CameraModel(

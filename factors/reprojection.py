@@ -5,8 +5,11 @@ pixel (fx x + cx, fy y + cy) of its distorted direction (x, y), with radial and 
 Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as OpenCV and ``gtsam.Cal3DS2`` have it. The noise
 of a pixel is Gaussian in its core; the loss of Huber (1964) limits the pull of a point that is wrong.
 
-Points that are nearer than :data:`NEAREST` or behind the camera are taken as that far away, and are seen far outside of the
-image: nothing throws, and every value is finite.
+That polynomial grows along the radius only up to where the lens would fold the image; directions farther out, outside of the image
+of a lens that can be inverted, are continued straight outwards, so that what lies there is not seen in the image.
+
+Points that are nearer than :data:`~factors.reprojection_kernels.NEAREST` or behind the camera are taken as that far away, and are
+seen far outside of the image: nothing throws, and every value is finite.
 """
 
 from __future__ import annotations
@@ -16,18 +19,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
-import numba
 import numpy as np
 
-from factors import se2
+from factors import reprojection_kernels, se2
+from factors.reprojection_kernels import Lens
 from factors.se2 import Array
 
 # the constants of a camera that can be estimated: its place [m] and small turns [rad] about the robot's axes, the
 # logarithm of its focal length, and how much later it saw than its stamp says [s]
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
-NEAREST = 0.05  # m in front of the camera
-WIDEST = 4.0  # square of x^2 + y^2 beyond which the distortion grows no more: its polynomial means nothing there
+WIDEST = 4.0  # of x^2 + y^2: farther out, 63 degrees off the axis, no polynomial of distortion is used
+GRID = 33  # rows and columns of pixels at which a lens is checked
+NONE = 1e-9  # of a distorted direction: no difference
 
 # columns: the camera's axes in the frame of a robot that looks along its x axis, z up
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
@@ -99,7 +103,7 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 
 def project(model: CameraModel, points: Array) -> Array:
     """Pixels (K, 2) of ``points`` (K, 3) in the camera's frame."""
-    return np.asarray(_project(model.intrinsics(), np.ascontiguousarray(points, dtype=float))[0])
+    return np.asarray(reprojection_kernels.project(_lens(model), np.ascontiguousarray(points, dtype=float))[0])
 
 
 def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
@@ -110,11 +114,22 @@ def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
     return np.asarray((local - model.position) @ model.rotation)
 
 
+def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
+    """Position (3,) and rotation (3, 3) in the world of the camera of a robot in space, at ``position`` with ``rotation``."""
+    return position + rotation @ model.position, rotation @ model.rotation
+
+
+def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
+    """The inverse of :func:`mounted`: position and rotation of the robot whose camera is at ``position`` (3,) with ``rotation``."""
+    turn = rotation @ model.rotation.T
+    return position - turn @ model.position, turn
+
+
 def camera_pose(model: CameraModel, pose: Array) -> tuple[Array, Array]:
     """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``pose`` (3,)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-    return np.array((pose[0], pose[1], 0.0)) + turn @ model.position, turn @ model.rotation
+    return mounted(model, np.array((pose[0], pose[1], 0.0)), turn)
 
 
 def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
@@ -125,25 +140,39 @@ def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Arra
 
 
 def undistorted(model: CameraModel, pixels: Array) -> Array:
-    """Directions (K, 2), as (x, y) at depth 1 in the camera's frame, of ``pixels`` (K, 2)."""
-    x0 = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
-    k1, k2, p1, p2 = model.distortion
-    xy = x0.copy()
-    for _ in range(20):  # fixed point: contracts by about k1 r^2 each time
-        x, y = xy[:, 0], xy[:, 1]
-        rr = np.minimum(x * x + y * y, WIDEST)
-        radial = 1.0 + k1 * rr + k2 * rr * rr
-        shift = np.column_stack((2 * p1 * x * y + p2 * (rr + 2 * x * x), p1 * (rr + 2 * y * y) + 2 * p2 * x * y))
-        xy = (x0 - shift) / np.maximum(radial, 0.1)[:, None]
-    return xy
+    """Directions (K, 2), as (x, y) at depth 1 in the camera's frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
+    Newton's method."""
+    seen = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
+    return np.asarray(reprojection_kernels.undistorted(_lens(model), np.ascontiguousarray(seen))[0])
+
+
+def rays(model: CameraModel, pixels: Array) -> Array:
+    """The points (K, 3) at depth 1 in the camera's frame that are seen at ``pixels`` (K, 2)."""
+    return np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
+
+
+def folded(model: CameraModel) -> Array | None:
+    """A pixel (2,) at which the lens is not invertible, of a grid over the image with its corners; None where there is none.
+
+    It is invertible up to where its polynomial is used, as long as the determinant of its Jacobian stays positive.
+    """
+    if not any(model.distortion):
+        return None
+    u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in (model.width, model.height))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    lens = _lens(model)
+    seen = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
+    directions, errors = reprojection_kernels.undistorted(lens, seen)
+    bad = ~(errors < NONE) | (lens[8] * np.sum(directions**2, axis=1) >= 1.0)
+    return np.asarray(pixels[np.argmax(bad)]) if bad.any() else None
 
 
 def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     """Pixels (K, 2) of ``points`` (K, 3) seen from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame
     perturbation (K, 2, 3), by the points (K, 2, 3), and by small changes of :data:`PARAMETERS` (K, 2, 8), of which that by the
     time offset is zero here, as it needs the robot's velocity."""
-    found: tuple[Array, Array, Array, Array] = _linearize(
-        model.intrinsics(), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
+    found: tuple[Array, Array, Array, Array] = reprojection_kernels.linearize(
+        _lens(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
     )
     return found
 
@@ -155,7 +184,7 @@ def linearize_in_space(
     world; their Jacobians by the camera's perturbation (K, 2, 6), turn first, then shift, both in the camera's frame as
     ``gtsam.Pose3`` has them, and by the points (K, 2, 3)."""
     local = (np.asarray(points, dtype=float) - position) @ rotation
-    pixels, by_local = _project(model.intrinsics(), np.ascontiguousarray(local))
+    pixels, by_local = reprojection_kernels.project(_lens(model), np.ascontiguousarray(local))
     by_camera = np.empty((len(local), 2, 6))
     # a turn w moves the point in the camera's frame by -w x p
     by_camera[..., :3] = by_local @ _cross_matrices(local)
@@ -175,9 +204,9 @@ def log_likelihood(
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
     else:
         whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
-    arguments = (model.intrinsics(), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
+    arguments = (_lens(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
     return model.tempering * np.asarray(
-        _log_likelihood(
+        reprojection_kernels.log_likelihood(
             *arguments,
             np.ascontiguousarray(points, dtype=float),
             np.ascontiguousarray(pixels, dtype=float),
@@ -189,8 +218,7 @@ def log_likelihood(
 
 def huber_loss(squared: Array, scale: float) -> Array:
     """The loss of squared whitened residuals: half of them up to ``scale`` standard deviations, linear beyond."""
-    size = np.sqrt(squared)
-    return np.where(size <= scale, 0.5 * squared, scale * (size - 0.5 * scale))
+    return np.asarray(reprojection_kernels.huber_losses(np.ravel(squared), scale)).reshape(np.shape(squared))
 
 
 def huber_weight(squared: Array, scale: float) -> Array:
@@ -206,105 +234,13 @@ def _cross_matrices(v: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True)
-def _pixel(k: Array, p0: float, p1: float, p2: float, jacobian: Array) -> tuple[float, float]:
-    """The pixel of a point, and into ``jacobian`` (2, 3) how it depends on the point."""
-    near = p2 < NEAREST
-    z = NEAREST if near else p2
-    x, y = p0 / z, p1 / z
-    r2 = x * x + y * y
-    wide = r2 > WIDEST
-    rr = WIDEST if wide else r2
-    d = 0.0 if wide else 1.0  # derivative of rr by r2
-    radial = 1.0 + k[4] * rr + k[5] * rr * rr
-    slope = (k[4] + 2.0 * k[5] * rr) * d
-    xd = x * radial + 2.0 * k[6] * x * y + k[7] * (rr + 2.0 * x * x)
-    yd = y * radial + k[6] * (rr + 2.0 * y * y) + 2.0 * k[7] * x * y
-    xx = radial + 2.0 * x * x * slope + 2.0 * k[6] * y + k[7] * (2.0 * x * d + 4.0 * x)
-    xy = 2.0 * x * y * slope + 2.0 * k[6] * x + 2.0 * k[7] * y * d
-    yx = 2.0 * x * y * slope + 2.0 * k[6] * x * d + 2.0 * k[7] * y
-    yy = radial + 2.0 * y * y * slope + k[6] * (2.0 * y * d + 4.0 * y) + 2.0 * k[7] * x
-    fx, fy = k[0] / z, k[1] / z
-    jacobian[0, 0], jacobian[0, 1] = fx * xx, fx * xy
-    jacobian[1, 0], jacobian[1, 1] = fy * yx, fy * yy
-    jacobian[0, 2] = 0.0 if near else -fx * (xx * x + xy * y)
-    jacobian[1, 2] = 0.0 if near else -fy * (yx * x + yy * y)
-    return k[0] * xd + k[2], k[1] * yd + k[3]
-
-
-@numba.njit(cache=True)
-def _project(k: Array, points: Array) -> tuple[Array, Array]:
-    n = len(points)
-    pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
-    for i in range(n):
-        p = points[i]
-        pixels[i, 0], pixels[i, 1] = _pixel(k, p[0], p[1], p[2], jacobians[i])
-    return pixels, jacobians
-
-
-@numba.njit(cache=True)
-def _linearize(
-    k: Array, position: Array, rotation: Array, pose: Array, points: Array
-) -> tuple[Array, Array, Array, Array]:
-    n = len(points)
-    pixels, by_pose, by_point = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
-    by_parameters = np.zeros((n, 2, 8))
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    by_local, by_robot = np.empty((2, 3)), np.empty((2, 3))
-    for i in range(n):
-        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
-        rx, ry, rz = c * dx + s * dy, c * dy - s * dx, points[i, 2]  # in the robot's frame
-        ax, ay, az = rx - position[0], ry - position[1], rz - position[2]
-        lx = rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az
-        ly = rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az
-        lz = rotation[0, 2] * ax + rotation[1, 2] * ay + rotation[2, 2] * az
-        u, v = _pixel(k, lx, ly, lz, by_local)
-        pixels[i, 0], pixels[i, 1] = u, v
-        for r in range(2):
-            for j in range(3):
-                by_robot[r, j] = (
-                    by_local[r, 0] * rotation[j, 0] + by_local[r, 1] * rotation[j, 1] + by_local[r, 2] * rotation[j, 2]
-                )
-            b0, b1, b2 = by_robot[r, 0], by_robot[r, 1], by_robot[r, 2]
-            by_pose[i, r, 0], by_pose[i, r, 1], by_pose[i, r, 2] = -b0, -b1, b0 * ry - b1 * rx
-            by_point[i, r, 0], by_point[i, r, 1], by_point[i, r, 2] = c * b0 - s * b1, s * b0 + c * b1, b2
-            by_parameters[i, r, 0], by_parameters[i, r, 1], by_parameters[i, r, 2] = -b0, -b1, -b2
-            by_parameters[i, r, 3] = b1 * az - b2 * ay
-            by_parameters[i, r, 4] = b2 * ax - b0 * az
-            by_parameters[i, r, 5] = b0 * ay - b1 * ax
-        by_parameters[i, 0, 6] = u - k[2]
-        by_parameters[i, 1, 6] = v - k[3]
-    return pixels, by_pose, by_point, by_parameters
-
-
-@numba.njit(cache=True)
-def _log_likelihood(
-    k: Array,
-    position: Array,
-    rotation: Array,
-    poses: Array,
-    points: Array,
-    pixels: Array,
-    whiteners: Array,
-    scale: float,
-) -> Array:
-    out = np.empty(len(poses))
-    unused = np.empty((2, 3))
-    for n in range(len(poses)):
-        c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
-        total = 0.0
-        for i in range(len(points)):
-            dx, dy = points[i, 0] - poses[n, 0], points[i, 1] - poses[n, 1]
-            ax, ay, az = c * dx + s * dy - position[0], c * dy - s * dx - position[1], points[i, 2] - position[2]
-            lx = rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az
-            ly = rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az
-            lz = rotation[0, 2] * ax + rotation[1, 2] * ay + rotation[2, 2] * az
-            u, v = _pixel(k, lx, ly, lz, unused)
-            eu, ev = u - pixels[i, 0], v - pixels[i, 1]
-            w = whiteners[i]
-            a, b = w[0, 0] * eu + w[0, 1] * ev, w[1, 0] * eu + w[1, 1] * ev
-            squared = a * a + b * b
-            size = math.sqrt(squared)
-            total += 0.5 * squared if size <= scale else scale * (size - 0.5 * scale)
-        out[n] = -total
-    return out
+def _lens(model: CameraModel) -> Lens:
+    """What the kernels know of a camera: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which its
+    polynomial is used: where the radial part grows no more, at most :data:`WIDEST`; 0 without distortion, for everywhere."""
+    end = 0.0
+    if any(model.distortion):
+        k1, k2, *_ = model.distortion
+        # the radial part's slope at q = x^2 + y^2 is 1 + 3 k1 q + 5 k2 q^2: a quadratic of 1 / q
+        square = 9.0 * k1 * k1 - 20.0 * k2
+        end = max(1.0 / WIDEST, 0.5 * (math.sqrt(square) - 3.0 * k1) if square > 0.0 else 0.0)
+    return (*map(float, (model.fx, model.fy, model.cx, model.cy, *model.distortion)), end)

@@ -37,6 +37,11 @@ def test_a_rig_needs_nothing_but_what_it_has(tmp_path):
     assert Rig().time_offset("bearing_range") == 0.0
 
 
+def test_a_strong_wide_lens_is_a_camera():
+    lens = {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0, "distortion": (-0.3, 0.09, 0.0, 0.0)}
+    assert Rig.model_validate({"camera": lens}).camera.model().distortion == lens["distortion"]
+
+
 def test_the_example_of_the_documentation(tmp_path):
     page = (Path(__file__).parents[1] / "docs" / "rig.md").read_text()
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
@@ -70,6 +75,10 @@ BAD_RIGS = {
     "misspelt and so missing": ("[bearing_range]\nrange_sigm = 1\n", "did you mean range_sigma? (and 1 more)"),
     "word": ('[odometry]\nlag = "long"\n', "odometry.lag is 'long'"),
     "nan": ("[odometry]\nlag = nan\n", "odometry.lag is nan"),
+    "folded lens": (
+        "[camera]\nfx = 500\nfy = 500\ncx = 320\ncy = 240\ndistortion = [-0.3, 0, 0, 0]\n",
+        "the distortion (-0.3, 0.0, 0.0, 0.0) cannot be inverted at the pixel (-0.5, -0.5), expected a lens that neither folds",
+    ),
     "not TOML": ("[odometry\n", "is not TOML"),
 }
 

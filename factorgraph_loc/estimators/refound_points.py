@@ -15,6 +15,7 @@ from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.matching import match_guided
 from factors import reprojection
 from factors.reprojection import CameraModel
+from factors.reprojection_kernels import NEAREST
 from factors.se2 import Array
 
 NOISE = 3.0  # px: of a point's place in the image beside what the pose does to it
@@ -35,7 +36,7 @@ def refound(
         return []
     seen, by_camera, _ = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
     depth = ((positions - camera.position) @ camera.rotation)[:, 2]
-    near = np.flatnonzero(model.contains(seen) & (depth > reprojection.NEAREST) & (depth < FARTHEST))
+    near = np.flatnonzero(model.contains(seen) & (depth > NEAREST) & (depth < FARTHEST))
     if not len(near):
         return []
     jacobian = by_camera[near]

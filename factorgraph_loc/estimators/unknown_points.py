@@ -33,6 +33,7 @@ from factors import reprojection, se2
 from factors.point_sighting import PointSightings
 from factors.reprojection import CameraModel, recalibrated
 from factors.reprojection_factor import ReprojectionFactor
+from factors.reprojection_kernels import NEAREST
 from factors.se2 import Array
 
 PER_KEYFRAME, WAITING = 40, 60  # points that are seen from one, and that wait
@@ -277,7 +278,7 @@ class UnknownPoints:
             return
         position = graph.current(point.key)
         _, depth = reprojection.predict(model, pose, position[None])
-        if depth[0] < reprojection.NEAREST:
+        if depth[0] < NEAREST:
             return
         point.strikes, point.last = 0, keyframe.t
         _, _, by_point, _ = reprojection.linearize(model, pose, position[None])
