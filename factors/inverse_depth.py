@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factors.reprojection import CameraModel, linearize_in_space, undistorted
+from factors.reprojection import CameraModel, linearize_in_space, rays
 from factors.se2 import Array
 
 SIZE = 6  # values of a point
@@ -68,8 +68,7 @@ def begin(
 ) -> tuple[Array, Array, Array]:
     """The ray (6,) of a ``pixel`` (2,) seen for the first time, from a camera as of :func:`linearize`; how it depends on the
     camera's perturbation (6, 6), and on the pixel and the inverse depth (6, 3) (section IV)."""
-    flat = undistorted(model, pixel[None])[0]
-    local = np.array((flat[0], flat[1], 1.0))
+    (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])
     ahead = rotation @ local
     x, y, z = ahead.tolist()

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
-from factors.reprojection import CameraModel, linearize_in_space, undistorted
+from factors.reprojection import CameraModel, linearize_in_space, rays
 from factors.se2 import Array
 
 SHARED = 0.5  # share of the information that counts of a motion whose images are those of its neighbours too
@@ -102,11 +102,11 @@ def from_epipole(pairs: RayPairs, motion: Array) -> Array:
     x, y = translation(pairs.position, motion)
     c, s = math.cos(motion[2]), math.sin(motion[2])
     found = []
-    for rays, noise, tx, ty in (
+    for seen, noise, tx, ty in (
         (pairs.first, pairs.first_noise, x, y),
         (pairs.second, pairs.second_noise, c * x + s * y, c * y - s * x),
     ):
-        across = np.hypot(np.hypot(rays[:, 2] * ty, rays[:, 2] * tx), rays[:, 0] * ty - rays[:, 1] * tx)
+        across = np.hypot(np.hypot(seen[:, 2] * ty, seen[:, 2] * tx), seen[:, 0] * ty - seen[:, 1] * tx)
         sigma = np.sqrt(np.einsum("kij,kij->k", noise, noise) / 2.0)
         found.append(across / (sigma * max(math.hypot(tx, ty), 1e-12)))
     return np.asarray(np.minimum(*found))
@@ -138,12 +138,12 @@ class VisualOdometryFactor:
 
 
 def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
-    rays = np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
-    _, by_camera, _ = linearize_in_space(model, np.zeros(3), np.eye(3), rays)
+    local = rays(model, pixels)
+    _, by_camera, _ = linearize_in_space(model, np.zeros(3), np.eye(3), local)
     # a shift of the camera moves the point the other way
     by_ray = -by_camera[:, :, 3:5]
     noise = model.sigma * np.linalg.inv(by_ray)
-    return np.ascontiguousarray(rays @ model.rotation.T), np.ascontiguousarray(model.rotation[:, :2] @ noise)
+    return np.ascontiguousarray(local @ model.rotation.T), np.ascontiguousarray(model.rotation[:, :2] @ noise)
 
 
 @numba.njit(cache=True)

@@ -49,7 +49,7 @@ from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
 from factors.odometry import Increment
-from factors.reprojection import huber_weight
+from factors.reprojection import carrier, huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: a step of the iterated update that needs no further one
@@ -287,9 +287,8 @@ class Monoslam(Filter):
 
     def _standing(self, camera: CameraPose, eye: Eye) -> SlamState | None:
         """The state of a robot whose ``camera`` was found; None if it would float or tilt on a floor."""
-        s, model = self._settings, eye.model
-        rotation = camera.rotation @ model.rotation.T
-        position = camera.position - rotation @ model.position
+        s = self._settings
+        position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
         covariance = _starting()
         back = np.linalg.inv(eye.lift)

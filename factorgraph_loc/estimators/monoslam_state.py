@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from factorgraph_loc.estimators.robust_update import GATE
 from factorgraph_loc.estimators.space_motion import ROBOT, RobotState, Step, cross
 from factors import inverse_depth
-from factors.reprojection import CameraModel, linearize_in_space
+from factors.reprojection import CameraModel, linearize_in_space, mounted
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -139,7 +139,7 @@ class Eye:
 
     def pose(self, robot: RobotState) -> tuple[Array, Array]:
         """Position and rotation of the camera in the world."""
-        return robot.position + robot.rotation @ self.model.position, robot.rotation @ self.model.rotation
+        return mounted(self.model, robot.position, robot.rotation)
 
     def spread(self, covariance: Array) -> Array:
         """The covariance (6, 6) of the camera's perturbation, from that of the error state."""

@@ -39,7 +39,7 @@ class Sighting:
 
 def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sighting]:
     """Of ``pixels`` (K, 2) seen from a keyframe."""
-    rays = np.column_stack((reprojection.undistorted(model, pixels), np.ones(len(pixels))))
+    rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     return [Sighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
 

@@ -12,7 +12,7 @@ from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
 from factorgraph_loc.log import Log, SightingStream
 from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.trajectory3 import Trajectory3
-from factors.reprojection import CameraModel, linearize_in_space
+from factors.reprojection import linearize_in_space, mounted
 from factors.se2 import Array
 
 DOF = 6
@@ -86,7 +86,7 @@ def reprojection_residuals(found: Trajectory3, log: Log, sensor: str = "sighting
     for k in range(len(times)):
         here = np.flatnonzero(which == k)
         seen = points.positions[[points.index[stream.point[i]] for i in rows[here].tolist()]]
-        out[here] = -_pixels(model, poses.positions[k], poses.rotations[k], seen)
+        out[here] = -linearize_in_space(model, *mounted(model, poses.positions[k], poses.rotations[k]), seen)[0]
     return out + np.column_stack((stream.u[rows], stream.v[rows]))
 
 
@@ -97,10 +97,6 @@ def spread_of(residuals: Array) -> dict[str, float]:
         figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
         figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
     return figures
-
-
-def _pixels(model: CameraModel, position: Array, rotation: Array, points: Array) -> Array:
-    return linearize_in_space(model, position + rotation @ model.position, rotation @ model.rotation, points)[0]
 
 
 def _rows(found: Trajectory3, rows: Integers) -> Trajectory3:

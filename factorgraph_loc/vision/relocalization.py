@@ -76,8 +76,7 @@ def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array | None = None
 ) -> FoundOnFloor | None:
     """The pose of a robot on the floor whose camera was found at ``camera``; None where it floats, tilts or is not determined."""
-    rotation = camera.rotation @ model.rotation.T
-    position = camera.position - rotation @ model.position
+    position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
     if abs(position[2]) > FLOATS or tilt > TILTS:
         return None
