@@ -15,10 +15,15 @@ from factors.reprojection import (
     CameraModel,
     huber_loss,
     huber_weight,
+    in_camera,
     linearize,
+    project,
     recalibrated,
 )
+from factors.reprojection_kernels import NEAREST
 from factors.se2 import Array
+
+BEHIND = 100.0  # standard deviations that a sighting of a point behind the camera is off by
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +76,14 @@ class ReprojectionFactor:
         at = values[0] if offset is None else se2.compose(values[0], offset)
         pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
         error = (pixels - self.pixels) / self.model.sigma
+        if self.free and in_camera(here.model, at, here.points)[0, 2] < NEAREST:
+            # nothing behind a camera is seen by it: no way leads from there to where it is
+            error, by_pose, by_point, by_parameters = (
+                BEHIND + 0.0 * error,
+                0.0 * by_pose,
+                0.0 * by_point,
+                0.0 * by_parameters,
+            )
         scale = 1.0 / self.model.sigma
         by_pose = scale * by_pose
         blocks = [by_pose]
@@ -95,6 +108,14 @@ class ReprojectionFactor:
         if offset is not None:
             blocks[0] = blocks[0] @ se2.adjoint(se2.inverse(offset))
         return error, blocks
+
+    def is_astray(self, pose: Array, point: Array) -> bool:
+        """Whether a free ``point`` (3,) cannot be what was seen by a robot at the variable's ``pose`` (3,): it lies behind the
+        camera, or is seen :data:`BEHIND` standard deviations away."""
+        at = pose if self.offset is None else se2.compose(pose, self.offset)
+        local = in_camera(self.model, at, point[None])
+        error = (project(self.model, local) - self.pixels) / self.model.sigma
+        return bool(local[0, 2] < NEAREST or np.sum(error**2) > BEHIND**2)
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> ReprojectionFactor:
         """The factor on the pose alone, at given constants (one array (P,), or none) and position (3,) of a free point."""

@@ -54,6 +54,9 @@ class Batch(RelocatingGraph):
                 values, width = self._problem(width).solve(values, ITERATIONS_PER_WIDTH).values, width / 2.0
             # either way may end in the worse optimum
             best = min(best, problem.solve(values), key=lambda s: s.cost)
+        if self._drop_astray(self._keyframes, best.values):
+            problem = self._problem()
+            best = problem.solve(best.values)
         covariances = self._settle(problem, best.values)
         return np.array([best.values[k.key] for k in self._keyframes]), covariances
 

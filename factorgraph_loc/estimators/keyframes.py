@@ -5,6 +5,8 @@ from __future__ import annotations
 import bisect
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -40,8 +42,11 @@ from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
+from factors.reprojection_factor import ReprojectionFactor
 from factors.rfid_factor import RfidFactor
 from factors.se2 import Array
+
+FEWEST_SIGHTINGS = 3  # of a point that is estimated
 
 
 class KeyframeGraph(ABC):
@@ -224,6 +229,24 @@ class KeyframeGraph(ABC):
                     factors.append((factor, node.keys))
         return Problem(factors, natives)
 
+    def _drop_astray(self, keyframes: Sequence[Keyframe], values: Values) -> bool:
+        """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
+        left. Returns whether there were any."""
+        astray = {id(node): node for k in keyframes for node in k.nodes if _is_astray(node, values)}
+        if not astray:
+            return False
+        left = Counter(_point(node) for k in self._keyframes for node in k.nodes if id(node) not in astray)
+        for keyframe in keyframes:
+            kept = [
+                n
+                for n in keyframe.nodes
+                if id(n) not in astray and (_point(n) is None or left[_point(n)] >= FEWEST_SIGHTINGS)
+            ]
+            if len(kept) < len(keyframe.nodes):
+                self.diagnostics.reject("camera: not where it was seen", len(keyframe.nodes) - len(kept))
+                keyframe.nodes[:] = kept
+        return True
+
     def _settle(self, problem: Problem, values: Values) -> Array:
         """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""
         covariances = problem.covariances(values, values)
@@ -236,3 +259,16 @@ class KeyframeGraph(ABC):
         steps = [self._recalibrated(k.from_previous) for k in self._keyframes if k.from_previous is not None]
         ticks = [replace(tick, since=self._recalibrated(tick.since)) for tick in self._ticks]
         return between_keyframes(ticks, steps, poses, covariances)
+
+
+def _is_astray(node: Node, values: Values) -> bool:
+    factor = node.factor
+    if not isinstance(factor, ReprojectionFactor) or not factor.free:
+        return False
+    return factor.is_astray(values[node.keys[0]], values[node.keys[-1]])
+
+
+def _point(node: Node) -> int | None:
+    """The unknown point that a node is a sighting of."""
+    free = isinstance(node.factor, ReprojectionFactor) and node.factor.free
+    return node.keys[-1] if free else None

@@ -71,6 +71,7 @@ class Smoother(RelocatingGraph):
         elif isinstance(self._solver, FullHistory):
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
             values |= {key: self._solver.value(key) for key in self._constants}
+            self._drop_astray(self._keyframes, values)
             problem = self._problem()
             values = problem.solve(values).values
             return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
@@ -144,7 +145,10 @@ class Smoother(RelocatingGraph):
         self._filtered[newest.index] = (self._pose, self._covariance)
         for key in touched:
             if key in (ODOMETRY_KEY, SENSOR_KEY) or is_point(key):
-                self._constants[key] = self._solver.value(key)
+                value = self._solver.value(key)
+                if not np.all(np.isfinite(value)):
+                    raise RuntimeError("the solution is not finite")
+                self._constants[key] = value
             else:
                 self._constants[key], self._spreads[key] = self._marginal(key)
 
@@ -218,12 +222,13 @@ class Smoother(RelocatingGraph):
         for key, mean in means.items():
             noise = gtsam.noiseModel.Gaussian.Covariance(spreads[key])
             nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
+        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
+        self._drop_astray(others, guesses)
         for keyframe in others:
             there = (node for node in keyframe.nodes if all(not is_pose(k) or k >= oldest.key for k in node.keys))
             nodes += [self._odometry_node(keyframe), *there]
         # of those that are both, ours never throw
         nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
-        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
         self._solver.update(nodes, guesses, newest.t)
         self._read(newest, self._constants)
 

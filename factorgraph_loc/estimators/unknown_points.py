@@ -30,6 +30,7 @@ from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.spread import spread_out
 from factors import reprojection, se2
+from factors.graph import VectorPriorFactor
 from factors.point_sighting import PointSightings
 from factors.reprojection import CameraModel, recalibrated
 from factors.reprojection_factor import ReprojectionFactor
@@ -40,6 +41,9 @@ PER_KEYFRAME, WAITING = 40, 60  # points that are seen from one, and that wait
 STRIKES = 2
 ANCHORED = 4  # points of the graph that place a keyframe well: to SLACK pixels
 SLACK = 2.0  # px
+OPEN = np.full(3, 30.0)  # m: sightings may leave a point open, but not farther than a building is wide
+LOST = 10.0  # s for which a point is looked for: later on, in a building, too many others look like it
+AGREED = 0.5  # share of points that must agree, of those not seen for longer: looks that are alike agree by chance
 RECENT = 5.0  # s: a point that was seen since has the error of the track now
 REVISITED = 6  # points not seen for longer that together are right, whatever the others say
 HORIZON, BUNDLE = 60, 8  # keyframes back that sightings may wait, and that are adjusted together
@@ -145,6 +149,9 @@ class UnknownPoints:
                 self._look(m, rows[names.index(name)], name, lifted(model, *guess).position)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
+            prior = Node((key,), VectorPriorFactor(found.position, OPEN), 3)
+            keyframe.nodes.append(prior)
+            addition.nodes.append(prior)
             for sighting in seen:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
         return pose, guess[1]
@@ -158,7 +165,8 @@ class UnknownPoints:
         self._again_as = {track: name for track, name in self._again_as.items() if name in self._points}
         names: list[Hashable] = [self._again_as.get(track, track) for track in m.tracks[list(rows)].tolist()]
         seen = set(names)
-        lost = [name for name in self._points if name not in seen and name in self._looks]
+        lately = [name for name, point in self._points.items() if m.t - point.last < LOST]
+        lost = [name for name in lately if name not in seen and name in self._looks]
         free = [i for i, name in zip(rows, names, strict=True) if name not in self._points]
         positions = np.array([graph.values[self._points[name].key] for name in lost]).reshape(-1, 3)
         place = {row: i for i, row in enumerate(rows)}
@@ -241,7 +249,8 @@ class UnknownPoints:
         recent = np.array([t - point.last < RECENT for point in points])
         right = np.zeros(len(points), dtype=bool)
         placed = guess
-        for which, enough in ((recent, FEWEST), (~recent, REVISITED)):
+        revisited = max(REVISITED, math.ceil(AGREED * np.count_nonzero(~recent)))
+        for which, enough in ((recent, FEWEST), (~recent, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
