@@ -26,7 +26,7 @@ from factorgraph_loc.simulation import preset, simulate
 
 RUNS, DURATION = 50, 120.0  # s; identified points
 RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # s; images
-FIRST = 5000
+FIRST, FIRST_RENDERED = 5000, 7000  # the latter are those of the section office
 POINTS = 600
 NO_MAP = {"landmarks": "unknown"}
 TARGET = 0.15  # m
@@ -60,14 +60,14 @@ def section(options: CameraOptions) -> Report:
         "The start is known to 0.1 m and 0.05 rad, and but for tags nothing tells of it later. *Aligned*: with the final "
         f"trajectory laid on the reference, which takes the error of the start away. Target: {TARGET} m"
     )
-    for name, runs, usual, folder in (
-        ("identified", RUNS, DURATION, None),
-        ("rendered", RENDERED_RUNS, RENDERED_DURATION, options.drives),
+    for name, runs, usual, first, folder in (
+        ("identified", RUNS, DURATION, FIRST, None),
+        ("rendered", RENDERED_RUNS, RENDERED_DURATION, FIRST_RENDERED, options.drives),
     ):
         count, duration = options.count(runs), options.seconds(usual)
         if folder is not None:
             count = min(count, runs)
-        jobs = [Job(Drive(FIRST + i, FIRST + i, duration), folder) for i in range(count)]
+        jobs = [Job(Drive(first + i, first + i, duration), folder) for i in range(count)]
         outcomes = report.collect(mapped, jobs, [f"{name}, seed {job.drive.seed}" for job in jobs])
         found = {jobs[i].drive.seed: outcome for i, outcome in outcomes.items()}
         failures(report, found)
