@@ -396,3 +396,18 @@ def test_the_names_of_the_constants_are_in_the_order_of_the_columns():
         assert np.sign(moved[before]) == after
     change = np.eye(8)[reprojection.FOCAL] * np.log(1.05)
     assert recalibrated(model, change).fx == pytest.approx(525.0)
+
+
+def test_a_free_point_behind_the_camera_is_astray_and_pulls_at_nothing():
+    pose = np.array((0.5, -0.2, 0.3))
+    position, rotation = reprojection.camera_pose(WIDE, pose)
+    ahead, behind = position + rotation @ (0.1, 0.2, 2.0), position + rotation @ (0.1, 0.2, -2.0)
+    pixel = reprojection.predict(WIDE, pose, ahead[None])[0]
+    factor = ReprojectionFactor(WIDE, np.zeros((1, 3)), pixel, free=True)
+    assert not factor.is_astray(pose, ahead)
+    assert not factor.is_astray(pose, ahead + rotation @ (0.1, 0.0, 0.0))
+    assert factor.is_astray(pose, behind)
+    assert factor.is_astray(pose, position + rotation @ (2.0, 0.2, 2.0))
+    _, blocks = factor.linearize([pose, behind])
+    assert not np.any(np.concatenate(blocks, axis=1))
+    assert factor.cost([pose, behind]) > factor.cost([pose, ahead + rotation @ (0.1, 0.0, 0.0)])
