@@ -76,7 +76,7 @@ class CameraSettings(FileModel):
     yaw: Angle = 0.0
     pixel_sigma: Annotated[float, Field(gt=0.0, le=100.0, description="px")] = 1.0
     robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
-    tempering: Annotated[float, Field(gt=0.0, le=1.0, description="exponent of the likelihood")] = 0.1
+    tempering: Annotated[float, Field(gt=0.0, le=1.0, description="exponent of the likelihood")] = 0.03
     frontend: FrontendSettings = FrontendSettings()
     uncertainty: CameraUncertainty = CameraUncertainty()
 
