@@ -19,6 +19,7 @@ from factors.bearing_range import (
     whitened,
     whitened_all,
 )
+from factors.displaced import carried, delayed, displaced
 from factors.se2 import Array
 
 
@@ -82,18 +83,13 @@ class BearingRangeFactor:
             blocks.append(by_sensor[..., list(self.estimated)])
         if self.free:
             blocks.append(by_point)
-        if self.offset_covariance is not None or self.point_covariances is not None:
-            spread = np.zeros((len(error), 2, 2)) + np.eye(2)
-            if self.offset_covariance is not None:
-                spread += by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
-            if self.point_covariances is not None:
-                spread += by_point @ self.point_covariances @ by_point.transpose(0, 2, 1)
-            whitener = np.linalg.inv(np.linalg.cholesky(spread))
-            error = np.einsum("kij,kj->ki", whitener, error)
-            blocks = [whitener @ block for block in blocks]
-        if offset is not None:
-            blocks[0] = blocks[0] @ se2.adjoint(se2.inverse(offset))
-        return error, blocks
+        spread = None
+        if self.point_covariances is not None:
+            spread = carried(by_point, self.point_covariances)
+        if self.offset_covariance is not None:
+            own = carried(by_pose, self.offset_covariance)
+            spread = own if spread is None else spread + own
+        return displaced(error, blocks, offset, spread)
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
         """The factor on the pose alone, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
@@ -104,9 +100,7 @@ class BearingRangeFactor:
             changes = np.zeros(len(PARAMETERS))
             changes[list(self.estimated)] = parameters[0]
             model = recalibrated(model, changes)
-            if self.twist is not None and changes[TIME_OFFSET] != 0.0:
-                later = se2.exp(self.twist * changes[TIME_OFFSET])
-                offset = later if offset is None else se2.compose(offset, later)
+            offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
         points = self.points if point is None else point[None]
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
 

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from factors import se2
+from factors.displaced import carried, delayed, displaced
 from factors.reprojection import (
     PARAMETERS,
     TIME_OFFSET,
@@ -95,19 +96,14 @@ class ReprojectionFactor:
             blocks.append(by_parameters[..., list(self.estimated)])
         if self.free:
             blocks.append(scale * by_point)
-        if self.offset_covariance is not None or self.point_covariances is not None:
-            spread = np.zeros((len(error), 2, 2)) + np.eye(2)
-            if self.offset_covariance is not None:
-                # all points have this error in common: together they must not seem to be rid of it
-                spread += len(error) * by_pose @ self.offset_covariance @ by_pose.transpose(0, 2, 1)
-            if self.point_covariances is not None:
-                spread += scale**2 * by_point @ self.point_covariances @ by_point.transpose(0, 2, 1)
-            whitener = np.linalg.inv(np.linalg.cholesky(spread))
-            error = np.einsum("kij,kj->ki", whitener, error)
-            blocks = [whitener @ block for block in blocks]
-        if offset is not None:
-            blocks[0] = blocks[0] @ se2.adjoint(se2.inverse(offset))
-        return error, blocks
+        spread = None
+        if self.point_covariances is not None:
+            spread = carried(scale * by_point, self.point_covariances)
+        if self.offset_covariance is not None:
+            # all points have this error in common: together they must not seem to be rid of it
+            common = len(error) * carried(by_pose, self.offset_covariance)
+            spread = common if spread is None else spread + common
+        return displaced(error, blocks, offset, spread)
 
     def is_astray(self, pose: Array, point: Array) -> bool:
         """Whether a free ``point`` (3,) cannot be what was seen by a robot at the variable's ``pose`` (3,): it lies behind the
@@ -126,9 +122,7 @@ class ReprojectionFactor:
             changes = np.zeros(len(PARAMETERS))
             changes[list(self.estimated)] = parameters[0]
             model = recalibrated(model, changes)
-            if self.twist is not None and changes[TIME_OFFSET] != 0.0:
-                later = se2.exp(self.twist * changes[TIME_OFFSET])
-                offset = later if offset is None else se2.compose(offset, later)
+            offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
         points = self.points if point is None else point[None]
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
 

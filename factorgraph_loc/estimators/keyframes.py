@@ -23,6 +23,7 @@ from factorgraph_loc.estimators.base import (
 )
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt, between_keyframes
 from factorgraph_loc.estimators.motion import Motion, propagate
+from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.unknown_points import UnknownPoints
@@ -45,8 +46,6 @@ from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
 from factors.reprojection_factor import ReprojectionFactor
 from factors.rfid_factor import RfidFactor
 from factors.se2 import Array
-
-FEWEST_SIGHTINGS = 3  # of a point that is estimated
 
 
 class KeyframeGraph(ABC):

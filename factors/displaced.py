@@ -1,0 +1,35 @@
+"""What factors of sightings share: a pose variable that lies a known motion before the sighting, and noise that is widened."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factors import se2
+from factors.se2 import Array
+
+
+def displaced(
+    error: Array, blocks: list[Array], offset: Array | None, spread: Array | None
+) -> tuple[Array, list[Array]]:
+    """Whitened residuals (K, 2) with Jacobians (K, 2, d), the first of them by the pose at the sighting's time, as those of a
+    factor on the pose ``offset`` (3,) before it, with ``spread`` (K, 2, 2) added to the unit noise; None where there is none."""
+    if spread is not None:
+        whitener = np.linalg.inv(np.linalg.cholesky(np.eye(2) + spread))
+        error = np.einsum("kij,kj->ki", whitener, error)
+        blocks = [whitener @ block for block in blocks]
+    if offset is not None:
+        blocks = [blocks[0] @ se2.adjoint(se2.inverse(offset)), *blocks[1:]]
+    return error, blocks
+
+
+def carried(jacobian: Array, covariance: Array) -> Array:
+    """The covariance (K, 2, 2) that a ``covariance`` (..., d, d) makes through a ``jacobian`` (K, 2, d)."""
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
+
+
+def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
+    """The ``offset`` (3,) of a sighting that came so much later, of a robot with the velocity ``twist`` (3,)."""
+    if twist is None or seconds == 0.0:
+        return offset
+    later = se2.exp(twist * seconds)
+    return later if offset is None else se2.compose(offset, later)
