@@ -1,0 +1,1 @@
+"""Active localization: where to drive to know where the robot is."""

@@ -1,0 +1,49 @@
+"""What may be set of an active run: the robot, when it knows its place, and how a policy chooses."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from factorgraph_loc.files import FileModel
+
+Metres = Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+Dimension = Literal["x", "y", "heading"]
+
+
+class PolicySettings(FileModel):
+    """How the next way is chosen. ``horizon`` [m]: length of the longest candidates. ``replan`` [m]: how far the robot goes before
+    it chooses anew. ``per_metre`` and ``per_second``: what a way costs, in nats. ``samples``: particles of the belief that the
+    expectation is taken over. ``dimensions``: whose entropy counts."""
+
+    horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 6.0
+    replan: Metres = 2.0
+    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.05
+    per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
+    samples: Annotated[int, Field(ge=8, le=10_000)] = 128
+    dimensions: Annotated[tuple[Dimension, ...], Field(min_length=1)] = ("x", "y")
+
+
+class ActiveSettings(FileModel):
+    """An active run. ``policy``: see :class:`PolicySettings`. ``particles``: of ``active_mcl``.
+
+    ``speed`` and ``turn_rate`` of the robot; ``clearance`` [m] to walls, nearer than which it does not go; ``sight`` [m]: how far
+    its proximity sensor sees them. ``start``: the true (x, y, heading), by default anywhere in free space. The robot knows its
+    place once the standard deviations of position (along the longest axis) and heading are below ``position_limit`` [m] and
+    ``heading_limit`` [rad], and its errors too. It gives up after ``max_metres`` or ``max_seconds``.
+    """
+
+    policy: PolicySettings = PolicySettings()
+    particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
+    speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
+    turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
+    clearance: Annotated[float, Field(ge=0.05, le=2.0, description="m")] = 0.3
+    sight: Metres = 3.0
+    start: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    position_limit: Metres = 0.3
+    heading_limit: Annotated[float, Field(gt=0.0, le=math.pi, description="rad, not degrees")] = math.radians(10.0)
+    max_metres: Metres = 100.0
+    max_seconds: Annotated[float, Field(gt=0.0, le=36_000.0, description="s")] = 600.0
