@@ -6,9 +6,9 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation.free_space import distance_to_walls
 from factorgraph_loc.simulation.pixels import pixel_stream, surface_normals
 from factorgraph_loc.simulation.settings import PixelSettings
-from factorgraph_loc.simulation.trajectories import distance_to_walls
 from factorgraph_loc.simulation.worlds import STANDOFF
 from factorgraph_loc.world import World
 from factors import reprojection

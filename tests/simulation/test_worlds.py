@@ -7,9 +7,9 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.simulation import PRESETS, preset
+from factorgraph_loc.simulation.free_space import distance_to_walls
 from factorgraph_loc.simulation.settings import WorldSettings
 from factorgraph_loc.simulation.sightings import crosses
-from factorgraph_loc.simulation.trajectories import distance_to_walls
 from factorgraph_loc.simulation.worlds import STANDOFF, make_world
 
 
