@@ -85,6 +85,7 @@ def convert(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    json: Json = False,
 ) -> None:
     """Write a log in the native format: a folder of tables that any program can read."""
     from factorgraph_loc.readers import write_native
@@ -93,7 +94,10 @@ def convert(
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
     write_native(loaded, out, format=format.value)
-    typer.echo(f"wrote {out}")
+    if json:
+        show.document({"log": loaded.name, "folder": str(out), "files": sorted(path.name for path in out.iterdir())})
+    else:
+        typer.echo(f"wrote {out}")
 
 
 def _print(log: Log, found: Inspection) -> None:

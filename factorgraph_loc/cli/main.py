@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import traceback
 from typing import Annotated, Any
 
 import typer
@@ -13,6 +15,8 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
 DEBUG = "--debug"
+INTERRUPTED = 130  # as shells count it: 128 and the number of the signal
+UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
 
 
 class Commands(TyperGroup):
@@ -32,15 +36,18 @@ class Commands(TyperGroup):
                 raise
             typer.echo(f"error: {' '.join(str(error).split())}", err=True)
             raise typer.Exit(error.exit_code) from error
+        except KeyboardInterrupt as stop:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from stop
 
 
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input.",
+    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, 70 a fault of the program, "
+    "130 interrupted.",
 )
 app.command()(inspecting.datasets)
 app.command()(inspecting.info)
@@ -75,4 +82,8 @@ def fgloc(
 def main() -> None:
     """The entry point of ``fgloc``."""
     use_one_thread()
-    app()
+    try:
+        app()
+    except Exception as error:
+        traceback.print_exc()
+        sys.exit(error.exit_code if isinstance(error, FglocError) else UNFORESEEN)

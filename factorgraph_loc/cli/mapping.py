@@ -42,7 +42,14 @@ def map_(
     log: LogName,
     out: OutWorld,
     estimator: Annotated[
-        str, typer.Option("--estimator", "-e", metavar="NAME", help=f"One of {', '.join(MAPPERS)}.")
+        str,
+        typer.Option(
+            "--estimator",
+            "-e",
+            metavar="NAME",
+            help=f"One of {', '.join(MAPPERS)}.",
+            autocompletion=lambda incomplete: [name for name in MAPPERS if name.startswith(incomplete)],
+        ),
     ] = MAPPERS[0],
     extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
     of: Annotated[

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,10 +21,16 @@ LogName = Annotated[
     typer.Argument(
         metavar="LOG",
         help="A name that `fgloc datasets` lists, a manifest, a folder in the native format, or any path with --reader.",
+        autocompletion=completion.logs,
     ),
 ]
 LogNames = Annotated[
-    list[str], typer.Argument(metavar="LOG...", help="Names that `fgloc datasets` lists, manifests, folders.")
+    list[str],
+    typer.Argument(
+        metavar="LOG...",
+        help="Names that `fgloc datasets` lists, manifests, folders.",
+        autocompletion=completion.logs,
+    ),
 ]
 DataRoot = Annotated[
     Path | None, typer.Option(help="Folder that the manifests' paths start from; else the environment's FGLOC_DATA.")
@@ -36,6 +43,14 @@ RigFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml 
 WorldFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .world.toml in place of the log's own map.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results.")]
+Estimator = Annotated[
+    str,
+    typer.Option("--estimator", "-e", metavar="NAME", help="The estimator.", autocompletion=completion.estimator),
+]
+Estimators = Annotated[
+    str,
+    typer.Option("--estimators", "-e", metavar="A,B", help="The estimators.", autocompletion=completion.estimators),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results that are there already.")]
 Sensors = Annotated[
     str | None, typer.Option(metavar="A,B", help="Sensors that the estimators may use; else those of the rig.")
@@ -45,12 +60,16 @@ Prior = Annotated[
     typer.Option(
         metavar="PRIOR",
         help="Where a run starts: reference, log, unknown or X,Y,HEADING [m, m, rad]; else the log's start, else the reference.",
+        autocompletion=completion.prior,
     ),
 ]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="NAME.KEY=VALUE", help="Setting of an estimator, e.g. smoother.lag=10; may be repeated."
+        "--set",
+        metavar="NAME.KEY=VALUE",
+        help="Setting of an estimator, e.g. smoother.lag=10; may be repeated.",
+        autocompletion=completion.setting,
     ),
 ]
 

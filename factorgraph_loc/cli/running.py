@@ -11,6 +11,8 @@ import typer
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import (
     DataRoot,
+    Estimator,
+    Estimators,
     Json,
     LogName,
     LogNames,
@@ -53,7 +55,7 @@ SPACE_COLUMNS = {
 
 def run(
     log: LogName,
-    estimator: Annotated[str, typer.Option("--estimator", "-e", metavar="NAME", help="The estimator.")],
+    estimator: Estimator,
     out: Out,
     sensors: Sensors = None,
     prior: Prior = None,
@@ -96,7 +98,7 @@ def run(
 
 def compare(
     logs: LogNames,
-    estimators: Annotated[str, typer.Option("--estimators", "-e", metavar="A,B", help="The estimators.")],
+    estimators: Estimators,
     out: Out,
     seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
     jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from factorgraph_loc.cli import show
-from factorgraph_loc.cli.options import DataRoot, LogOptions, key_and_value, parse_seeds
+from factorgraph_loc.cli import completion, show
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value, parse_seeds
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +18,12 @@ if TYPE_CHECKING:
 
 def simulate(
     what: Annotated[
-        str, typer.Argument(metavar="PRESET", help="office, sparse, bursty, corridor, warehouse, or a TOML file.")
+        str,
+        typer.Argument(
+            metavar="PRESET",
+            help=f"{', '.join(completion.PRESETS)}, or a TOML file.",
+            autocompletion=completion.preset,
+        ),
     ],
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FOLDER", help="To write; with --seeds, a folder of them.")
@@ -39,7 +44,11 @@ def simulate(
     ] = None,
     recorded: Annotated[
         str | None,
-        typer.Option(metavar="LOG", help="Draw each read from those of this recording, with its antennas (semi-real)."),
+        typer.Option(
+            metavar="LOG",
+            help="Draw each read from those of this recording, with its antennas (semi-real).",
+            autocompletion=completion.logs,
+        ),
     ] = None,
     images: Annotated[
         bool, typer.Option("--images", help="With what a camera sees: the building is rendered.")
@@ -52,6 +61,7 @@ def simulate(
         typer.Option(min=0, metavar="N", help="Of the world alone, for several drives through one; else --seed."),
     ] = None,
     data_root: DataRoot = None,
+    json: Json = False,
 ) -> None:
     """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
@@ -67,6 +77,7 @@ def simulate(
     looks = None
     if recorded is not None:
         looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
+    written = []
     folders = [out if seeds is None else out / f"{settings.name}-{number}" for number in chosen]
     for number, folder in zip(chosen, folders, strict=True):
         log = make(settings, number, looks)
@@ -79,7 +90,12 @@ def simulate(
                 write_native(log, folder)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
-        typer.echo(f"wrote {folder}")
+        if not json:
+            typer.echo(f"wrote {folder}")
+        span = log.span()
+        written.append({"log": log.name, "seed": number, "span": span[1] - span[0], "folder": str(folder)})
+    if json:
+        show.document(written[0] if seeds is None else written)
 
 
 def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path) -> None:

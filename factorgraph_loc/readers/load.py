@@ -13,8 +13,9 @@ from factorgraph_loc.files import inside, nearest, parse_model
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers import registry as readers
-from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, manifests, read_manifest
+from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
+from factorgraph_loc.shipped import manifests
 from factorgraph_loc.world import World, read_world
 
 RUN_FILE = "run.toml"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sysconfig
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-import factorgraph_loc
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml
 from factorgraph_loc.log import StartPose
+from factorgraph_loc.shipped import manifests
 
-SHIPPED = Path("share", "factorgraph-loc", "datasets")  # below the data path of an installation
 DATA_ROOT = "FGLOC_DATA"
 
 
@@ -65,27 +63,6 @@ class Dataset:
     licence: str
     origin: str
     present: bool
-
-
-def manifests() -> dict[str, Path]:
-    """The manifests that ship with the project: name -> file, by name."""
-    for folder in manifest_folders():
-        found = {
-            file.stem: file
-            for file in sorted(folder.glob("*.toml"))
-            if not file.name.endswith((".rig.toml", ".world.toml"))
-        }
-        if found:
-            return found
-    return {}
-
-
-def manifest_folders() -> list[Path]:
-    """Where the shipped manifests may be: in a source checkout beside the package, else where an installer puts data."""
-    checkout = Path(factorgraph_loc.__file__).resolve().parent.parent
-    folders = [checkout / "datasets"] if (checkout / "pyproject.toml").is_file() else []
-    user = sysconfig.get_path("data", sysconfig.get_preferred_scheme("user"))
-    return [*folders, Path(sysconfig.get_path("data")) / SHIPPED, Path(user) / SHIPPED]
 
 
 def read_manifest(file: Path) -> Manifest:

@@ -1,0 +1,64 @@
+"""What the shell completes, and that it does not make people wait."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from factorgraph_loc.cli import completion
+from factorgraph_loc.estimators.registry import ESTIMATORS
+from factorgraph_loc.readers import manifests
+from factorgraph_loc.simulation import PRESETS
+
+FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+
+
+def completed(line: str) -> list[str]:
+    """What bash would be given for the last word of a line."""
+    words = line.split(" ")
+    about = {"_FGLOC_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    command = [sys.executable, "-c", "import sys; sys.argv[0] = 'fgloc'\n" + FGLOC[2]]
+    done = subprocess.run(command, env=os.environ | about, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_the_names_are_those_of_the_registries():
+    assert set(completion.ESTIMATORS) == set(ESTIMATORS)
+    assert set(completion.PRESETS) == set(PRESETS)
+    assert completion.logs("") == list(manifests())
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("fgloc simu", ["simulate"]),
+        ("fgloc run plaza", ["plaza1", "plaza2"]),
+        ("fgloc compare plaza2 woods-r", ["woods-r1", "woods-r3", "woods-r5"]),
+        ("fgloc run plaza2 -e sm", ["smoother"]),
+        ("fgloc compare plaza2 -e ekf,smoother,s", ["ekf,smoother,switching", "ekf,smoother,space_batch"]),
+        ("fgloc simulate c", ["corridor"]),
+        ("fgloc run plaza2 -e ekf --prior u", ["unknown"]),
+        ("fgloc run plaza2 -e ekf --set ek", ["ekf."]),
+        ("fgloc run no-such-log", []),  # the shell goes on with files
+    ],
+)
+def test_words_are_completed(line, expected):
+    assert completed(line) == expected
+
+
+def test_completion_loads_no_numerical_libraries():
+    code = (
+        "import sys, factorgraph_loc.cli.main\n"
+        "from factorgraph_loc.cli import completion\n"
+        "assert completion.logs('plaza') and completion.estimators('ekf,') and completion.preset('')\n"
+        "print(sorted({'numpy', 'gtsam', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_for_a_shell_is_shown(shell, fgloc):
+    done = fgloc("--show-completion", shell)
+    assert done.exit_code == 0
+    assert "_COMPLETE" in done.stdout
