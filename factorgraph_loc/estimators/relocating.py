@@ -96,8 +96,16 @@ class RelocatingGraph(MeasuringGraph):
         return PoseEstimate(self._t, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self) -> Belief:
-        """The belief behind :meth:`estimate`; before the start all places that the sightings allow."""
-        return super().belief() if self._prior is not None else Belief(tuple(self._modes()))
+        """The belief behind :meth:`estimate`; before the start all places that the sightings allow, and the particles of who
+        seeks by scans."""
+        if self._prior is not None:
+            return super().belief()
+        modes = tuple(self._modes())
+        if self._finder is None or self._searched is None or self._camera.newest is not None:
+            return Belief(modes)
+        poses, weights = self._finder.particles
+        since = self._motion.relative(self._searched, self._motion.state(self._t))
+        return Belief(modes, se2.compose(poses, since.delta), weights)
 
     def _modes(self) -> list[Mode]:
         found = self._relocalizer.hypotheses if self._finder is None else self._finder.hypotheses

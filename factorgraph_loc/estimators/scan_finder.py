@@ -44,6 +44,11 @@ class ScanFinder:
         """The pose at the last scan if one hypothesis is clear, else None."""
         return self._seeker.best if self._seeker is not None else None
 
+    @property
+    def particles(self) -> tuple[Array, Array]:
+        """Poses (N, 3) at the last scan and their weights (N,); none where nothing is sought."""
+        return self._seeker.particles if self._seeker is not None else (np.empty((0, 3)), np.empty(0))
+
     def add(self, odometry: ChainState, looks: Looks, evidence: float = 0.0) -> bool:
         """Take a scan; ``evidence``: log-probability of it under the track, where there is one. Scans from its time on that were
         taken before are forgotten. False if no seeker took it."""

@@ -13,11 +13,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Mode, PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, cell_numbers, effective_size, largest_share, normalised, systematic
+from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
 from factorgraph_loc.estimators.motion import Motion
 from factors import se2
 from factors.odometry import ChainState
@@ -27,7 +26,6 @@ from factors.se2 import Array
 DENSITY = 25.0  # particles per m^2 and rad at first
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # times as many particles, at most, after a resampling
-KERNEL = 0.25  # of the distance between particles
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
 FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anywhere at a resampling, and their weight together
 # Variance of the odometry, times this: the constants of the odometry, which are not estimated here, err as well.
@@ -97,12 +95,17 @@ class Seeker:
         self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
         return True
 
+    @property
+    def particles(self) -> tuple[Array, Array]:
+        """Poses (N, 3) at the last scan and their weights (N,), of all hypotheses; none before the first scan."""
+        return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
+
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Poses (N, 3) at the last scan, drawn from all hypotheses; none before the first scan."""
         if self._cloud is None:
             return np.empty((0, 3))
         rows = systematic(self._cloud.weights, rng, count)
-        return self._jittered(self._cloud, rows, rng)
+        return kld.jittered(self._cloud.poses, rows, rng)
 
     def _is_clear(self) -> bool:
         if self._scans_with_reads < CLEAR_SCANS or len(self._tags) < CLEAR_TAGS or self._cloud is None:
@@ -146,18 +149,10 @@ class Seeker:
     def _resample(self, cloud: Cloud) -> None:
         rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
-        poses = np.concatenate((self._jittered(cloud, rows, self._rng), self._anywhere(FRESH)))
+        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
         log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
         self._cloud = _cloud(poses, log_weights)
-
-    def _jittered(self, cloud: Cloud, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
-        """Particles (N, 3) drawn from kernels on the particles ``rows`` (N,), as wide as befits how densely those, each of them
-        once, lie in the cells."""
-        poses = cloud.poses[rows]
-        cells = len(np.unique(cell_numbers(poses, kld.CELL)))
-        width = KERNEL * kld.CELL * (cells / len(np.unique(rows))) ** (1.0 / 3.0)
-        return se2.compose(poses, se2.exp(rng.standard_normal(poses.shape) * width))
 
     def _anywhere(self, count: int) -> Array:
         """Poses (N, 3), evenly over the bounds and all headings, one in each layer of each axis (Latin hypercube)."""

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factorgraph_loc.estimators import registry
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import Log, RfidStream, cut, join
+from factorgraph_loc.measurements import IncrementOdometry, RfidScan, Tick
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 
@@ -164,3 +166,29 @@ def test_what_the_map_or_the_rig_lacks_is_counted() -> None:
     assert result.diagnostics.ignored["tag not in the map"] > 100
     assert result.diagnostics.ignored["antenna that the rig lacks"] == 160
     assert score(result, poorer)["causal.position_rmse"] < 0.3
+
+
+def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:
+    log = office()
+    sensors = ("odometry", "rfid")
+    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(1))
+    smoother = registry.create("smoother", setup, registry.settings_of("smoother", {}))
+    assert smoother.belief().particles is None
+    scans = 0
+    for m in log.measurements(sensors):
+        smoother.process(m)
+        scans += isinstance(m, RfidScan)
+        if scans == 2:
+            break
+    first = smoother.belief()
+    assert first.particles is not None
+    assert first.weights is not None
+    assert np.isclose(first.weights.sum(), 1.0)
+    middle = first.modes[0].pose
+    near = np.hypot(*(first.particles - middle)[:, :2].T) < 3.0
+    assert first.weights[near].sum() > 0.3 * first.modes[0].weight
+    smoother.process(IncrementOdometry(m.t + 0.4, 0.2, 0.0, 0.0))
+    smoother.process(Tick(m.t + 0.4))
+    moved = smoother.belief().particles
+    assert moved is not None
+    assert np.allclose(np.hypot(*(moved - first.particles)[:, :2].T), 0.2, atol=0.02)

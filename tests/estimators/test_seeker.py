@@ -76,6 +76,8 @@ def test_the_place_is_found_and_claimed(seed):
     assert abs(se2.wrap_scalar(error[2])) < math.radians(15.0)
     assert sum(m.weight for m in seeker.hypotheses) == pytest.approx(1.0, abs=0.02)
     drawn = seeker.sample(np.random.default_rng(0), 500)
+    poses, weights = seeker.particles
+    assert np.allclose(weights @ poses[:, :2], drawn[:, :2].mean(axis=0), atol=0.1)
     assert np.linalg.norm(drawn[:, :2].mean(axis=0) - seeker.best.pose[:2]) < 0.1
 
 
