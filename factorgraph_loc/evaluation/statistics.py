@@ -55,7 +55,8 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 found.append(head | {"log": log} | _difference(scores[None]) | counts)
             used = [scores for scores, _ in pairs.values() if len(scores)]
             if len(used) >= ENOUGH_LOGS:
-                low, high = _interval(used)
+                drawn = draw_pooled(used)
+                low, high = bounds(drawn[:, 0] - drawn[:, 1])
                 per_log = np.sqrt([np.mean(np.square(scores), axis=0) for scores in used])
                 counts = {"pairs": sum(map(len, used)), "left_out": sum(missing for _, missing in pairs.values())}
                 total = _difference(per_log[:, None]) | {"low": low, "high": high}
@@ -64,11 +65,16 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _pairs(rows: Sequence[Row], log: str, a: str, b: str, metric: str) -> tuple[Array, int]:
-    """Scores (K, 2) of ``a`` and ``b`` by common seed, and how many pairs are missing."""
     by_seed = [
         {r["seed"]: r.get(metric) for r in rows if r["log"] == log and r["estimator"] == name} for name in (a, b)
     ]
-    seeds = sorted(set().union(*by_seed))
+    return pair_seeds(*by_seed)
+
+
+def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
+    """Scores (K, 2) of ``a`` and ``b`` by common seed, and how many pairs are missing; None: a run that has no score."""
+    by_seed = (a, b)
+    seeds = sorted(set(a) | set(b))
     both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
     if any(
         len(s) == 1 for s in by_seed
@@ -87,19 +93,28 @@ def _difference(scores: Array) -> dict[str, Any]:
     return {"value_a": a, "value_b": b, "difference": a - b, "low": None, "high": None}
 
 
-def _interval(clusters: Sequence[Array]) -> tuple[float, float]:
-    """95 % interval of the pooled difference; ``clusters``: for each log, paired scores (K, 2)."""
+def bounds(figures: Array) -> tuple[float, float]:
+    """The 95 % interval of a figure, from what a bootstrap drew of it (D,)."""
+    tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
+    low, high = np.percentile(figures, (tail, 100.0 - tail))
+    return float(low), float(high)
+
+
+def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
+    """Bootstrap of C pooled figures, (DRAWS, C): logs are drawn, and seeds within each.
+
+    ``clusters``: for each log, the scores (K, C) of its K seeds. Pooled is the root mean square over logs of that over seeds, each
+    log counted once, or without ``rms`` the mean of the means.
+    """
     rng = np.random.default_rng(_SEED)
     sizes = np.array([len(c) for c in clusters])
-    squares = np.zeros((len(clusters), sizes.max(), 2))
+    scores = np.zeros((len(clusters), sizes.max(), clusters[0].shape[1]))
     for i, cluster in enumerate(clusters):
-        squares[i, : len(cluster)] = np.square(cluster)
+        scores[i, : len(cluster)] = np.square(cluster) if rms else cluster
     logs = rng.integers(len(clusters), size=(DRAWS, len(clusters)))
     size = sizes[logs][..., None]
     seeds = (rng.random((*logs.shape, sizes.max())) * size).astype(int)
     drawn = np.arange(sizes.max()) < size  # a log with fewer seeds draws fewer
-    means = np.sum(squares[logs[..., None], seeds] * drawn[..., None], axis=2) / size
-    pooled = np.sqrt(np.mean(means, axis=1))
-    tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
-    low, high = np.percentile(pooled[:, 0] - pooled[:, 1], (tail, 100.0 - tail))
-    return float(low), float(high)
+    means = np.sum(scores[logs[..., None], seeds] * drawn[..., None], axis=2) / size
+    pooled = np.mean(means, axis=1)
+    return np.asarray(np.sqrt(pooled) if rms else pooled)

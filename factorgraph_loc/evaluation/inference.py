@@ -1,0 +1,206 @@
+"""What scores say of many runs: pooled figures, differences, whether they could be chance, and how large they are.
+
+Runs are paired by log and seed, and logs are what a statement is made of: with six logs or more there is an interval and a test
+over logs. With one log and six seeds or more both are over its seeds, and say something of this log only. Between these the logs
+stand side by side and nothing is tested.
+
+Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin 1(6), 1945, with zeros as of Pratt, "Remarks on
+zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation, Kerby,
+"The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons: Holm, "A simple sequentially rejective multiple
+test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of the NEES: Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 2001, section 5.4, for as many values as are independent (Geyer, "Practical Markov chain
+Monte Carlo", Statistical Science 7(4), 1992, section 3.3).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2, norm, rankdata
+
+from factorgraph_loc.evaluation.metrics import CONFIDENCE
+from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pooled, pair_seeds
+from factors.se2 import Array
+
+SIGNIFICANT = 1.0 - CONFIDENCE
+_EXACT = 60  # pairs up to which the signed-rank distribution is counted out
+
+Seeds = Mapping[int, float | None]  # the score of each seed, None where a run has none
+ByLog = Mapping[str, Seeds]
+Units = Literal["logs", "seeds"]
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """A figure over logs. ``low`` and ``high``: 95 % interval over ``units``, None where these are too few; ``least`` and ``most``:
+    the range over logs, or over seeds where there is one log."""
+
+    value: float
+    low: float | None
+    high: float | None
+    least: float
+    most: float
+    units: Units
+    count: int
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """``a`` minus ``b``: below 0, the scores of ``a`` are the lower.
+
+    ``difference`` of the pooled figures, with the 95 % interval ``low`` to ``high``; ``p`` (two-sided) and ``effect`` (-1 to 1) of
+    the signed-rank test. Interval and test are over ``count`` ``units``, None where these are too few. ``by_log``: both figures of
+    each log, (value_a, value_b). ``pairs``: how many runs of each are compared; ``left_out``: how many lack a partner.
+    """
+
+    difference: float
+    low: float | None
+    high: float | None
+    p: float | None
+    effect: float | None
+    units: Units
+    count: int
+    by_log: dict[str, tuple[float, float]]
+    pairs: int
+    left_out: int
+
+
+def pooled(scores: ByLog, *, rms: bool) -> Pooled | None:
+    """A figure pooled over seeds, then over logs, each log counted once: root mean square, or else the mean. None without any."""
+    clusters = [np.array([[v] for v in seeds.values() if v is not None]).reshape(-1, 1) for seeds in scores.values()]
+    clusters = [cluster for cluster in clusters if len(cluster)]
+    if not clusters:
+        return None
+    per_log = np.array([_average(cluster, rms)[0] for cluster in clusters])
+    units, enough = _units(clusters)
+    low, high = bounds(draw_pooled(clusters, rms=rms)[:, 0]) if enough else (None, None)
+    spread = clusters[0] if units == "seeds" else per_log
+    value = float(_average(per_log[:, None], rms)[0])
+    return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread))
+
+
+def contrast(a: ByLog, b: ByLog, *, rms: bool) -> Contrast | None:
+    """Compare two sets of runs by the logs and seeds that both have; None if they have none in common.
+
+    One that ran with one seed is paired with each seed of the other.
+    """
+    found = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
+    left_out = sum(missing for _, missing in found.values()) + sum(len(b[log]) for log in b if log not in a)
+    left_out += sum(len(a[log]) for log in a if log not in b)
+    clusters = {log: scores for log, (scores, _) in found.items() if len(scores)}
+    if not clusters:
+        return None
+    by_log = {log: _average(scores, rms) for log, scores in clusters.items()}
+    total = _average(np.array(list(by_log.values())), rms)
+    units, enough = _units(list(clusters.values()))
+    pairs = next(iter(clusters.values())) if units == "seeds" else np.array(list(by_log.values()))
+    low, high, p, effect = None, None, None, None
+    if enough:
+        drawn = draw_pooled(list(clusters.values()), rms=rms)
+        low, high = bounds(drawn[:, 0] - drawn[:, 1])
+        p, effect = signed_rank(pairs[:, 0] - pairs[:, 1]), rank_biserial(pairs[:, 0] - pairs[:, 1])
+    return Contrast(
+        difference=float(total[0] - total[1]),
+        low=low,
+        high=high,
+        p=p,
+        effect=effect,
+        units=units,
+        count=len(pairs),
+        by_log={log: (float(x), float(y)) for log, (x, y) in by_log.items()},
+        pairs=sum(map(len, clusters.values())),
+        left_out=left_out,
+    )
+
+
+def signed_rank(differences: Array) -> float:
+    """Two-sided p of Wilcoxon's signed-rank test that differences (N,) lie symmetrically around 0; exact up to 60."""
+    ranks = _ranks(differences)
+    doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(int)  # ranks of ties are halves
+    if not len(doubled):
+        return 1.0
+    total = int(doubled.sum())
+    positive = int(np.rint(2.0 * ranks[differences > 0.0].sum()))
+    extreme = min(positive, total - positive)
+    if len(doubled) > _EXACT:
+        # the continuity correction is half a step of the sum of ranks, which here is doubled
+        z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
+        return min(1.0, 2.0 * float(norm.cdf(z)))
+    ways = np.zeros(total + 1)
+    ways[0] = 1.0
+    for rank in doubled.tolist():
+        ways[rank:] += ways[:-rank].copy()
+    return min(1.0, 2.0 * float(ways[: extreme + 1].sum() / ways.sum()))
+
+
+def rank_biserial(differences: Array) -> float:
+    """Matched-pairs rank-biserial correlation of differences (N,): 1 if all are above 0, -1 if all are below, 0 if they balance."""
+    ranks = _ranks(differences)
+    total = float(ranks[differences != 0.0].sum())
+    return float(ranks[differences > 0.0].sum() - ranks[differences < 0.0].sum()) / total if total else 0.0
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """p values corrected for their number as of Holm: those below 0.05 are significant together. None is not tested, and stays."""
+    tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for before, (p, i) in enumerate(tested):
+        largest = max(largest, min(1.0, (len(tested) - before) * p))
+        corrected[i] = largest
+    return corrected
+
+
+def least_p(count: int) -> float:
+    """The smallest p that :func:`signed_rank` can give with ``count`` differences."""
+    return float(2.0 ** (1 - count))
+
+
+def independent_count(values: Array) -> float:
+    """As how many independent values a series (N,) counts in its mean: N over its integrated autocorrelation time, at least 1.
+
+    The autocorrelations are summed over pairs of lags until a pair is no longer positive (Geyer's initial positive sequence).
+    """
+    n = len(values)
+    centred = values - np.mean(values)
+    power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
+    covariances = np.fft.irfft(power)[:n]
+    if n < 2 or covariances[0] <= 0.0:
+        return 1.0
+    correlations = covariances / covariances[0]
+    pairs = correlations[0 : n - n % 2].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0.0)
+    time = 2.0 * float(pairs[: ends[0] if len(ends) else None].sum()) - 1.0
+    return max(1.0, min(float(n), n / max(time, 1.0)))
+
+
+def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
+    """The 95 % band of the mean over logs of their mean NEES per degree of freedom, where covariances are right.
+
+    ``counts``: how many independent values each log has. The mean over logs has the variance of a chi-square with as many degrees
+    of freedom as match it.
+    """
+    matched = dof * len(counts) ** 2 / float(np.sum(1.0 / np.asarray(counts, dtype=float)))
+    tail = (1.0 - CONFIDENCE) / 2.0
+    return float(chi2.ppf(tail, matched) / matched), float(chi2.ppf(1.0 - tail, matched) / matched)
+
+
+def _ranks(differences: Array) -> Array:
+    """Ranks of the sizes; zeros take the lowest and count for no side."""
+    return np.asarray(rankdata(np.abs(differences)))
+
+
+def _average(scores: Array, rms: bool) -> Array:
+    """Over the rows of ``scores`` (K, C)."""
+    return np.asarray(np.sqrt(np.mean(np.square(scores), axis=0)) if rms else np.mean(scores, axis=0))
+
+
+def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
+    """What a statement is made of, and whether it is enough."""
+    if len(clusters) == 1:
+        return "seeds", len(clusters[0]) >= ENOUGH_LOGS
+    return "logs", len(clusters) >= ENOUGH_LOGS
