@@ -12,7 +12,6 @@ from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_valu
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
-    from factorgraph_loc.log import Log
     from factorgraph_loc.simulation import SimulationSettings
 
 
@@ -65,68 +64,40 @@ def simulate(
 ) -> None:
     """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
-    from factorgraph_loc.readers import write_native
+    from factorgraph_loc import api
     from factorgraph_loc.simulation import recorded_looks
-    from factorgraph_loc.simulation import simulate as make
 
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
-    changes = _changes(named, set_ or [])
+    changes = nested_changes(named, set_ or [])
     if "images" in changes and not images:
         raise InputError("--image-rate or --set images.KEY tells how images are made, expected --images with it")
-    settings = _settings(what, changes)
+    settings = settings_of(what, changes)
     looks = None
     if recorded is not None:
         looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
     written = []
-    folders = [out if seeds is None else out / f"{settings.name}-{number}" for number in chosen]
-    for number, folder in zip(chosen, folders, strict=True):
-        log = make(settings, number, looks)
+    for number in chosen:
+        folder = out if seeds is None else out / f"{settings.name}-{number}"
+        with show.progress(folder.name, counted=True) as tell:
+            log = api.simulate(settings, number, recorded=looks, images=images, out=folder, progress=tell)
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
-        try:
-            if images:
-                _write_with_images(log, settings, number, folder)
-            else:
-                write_native(log, folder)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
         if not json:
             typer.echo(f"wrote {folder}")
-        span = log.span()
-        written.append({"log": log.name, "seed": number, "span": span[1] - span[0], "folder": str(folder)})
+        first, last = log.span()
+        written.append({"log": log.name, "seed": number, "span": last - first, "folder": str(folder)})
     if json:
         show.document(written[0] if seeds is None else written)
 
 
-def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path) -> None:
-    """The images go to a folder beside the log's first, so that there is a whole log or none."""
-    import os
-    import tempfile
-
-    from factorgraph_loc.readers import write_native
-    from factorgraph_loc.readers.native import require_new
-    from factorgraph_loc.simulation import with_images
-
-    require_new(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside,
-        show.progress(log.name, counted=True) as tell,
-    ):
-        workers = os.cpu_count() or 1
-        write_native(with_images(log, settings, seed, Path(beside), workers=workers, tell=tell), folder)
-
-
-def _settings(what: str, changes: dict[str, Any]) -> SimulationSettings:
+def settings_of(what: str, changes: dict[str, Any]) -> SimulationSettings:
     """Those of a preset, or of a file where the name looks like one."""
-    from factorgraph_loc.simulation import preset, read_settings
+    from factorgraph_loc.simulation import named_settings
 
-    if what.endswith(".toml"):
-        return read_settings(Path(what), changes)
-    return preset(what, changes)
+    return named_settings(what, changes)
 
 
-def _changes(named: dict[str, float | None], texts: list[str]) -> dict[str, Any]:
+def nested_changes(named: dict[str, float | None], texts: list[str]) -> dict[str, Any]:
     """The options as nested tables; the named ones go before ``--set``."""
     changes: dict[str, Any] = {}
     pairs = [key_and_value(text, "--set") for text in texts]

@@ -2,7 +2,7 @@
 
 from factorgraph_loc.simulation.filming import Film, film, with_images
 from factorgraph_loc.simulation.recorded import recorded_looks
-from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, preset, read_settings
+from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, named_settings, preset, read_settings
 from factorgraph_loc.simulation.simulate import simulate
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "Film",
     "SimulationSettings",
     "film",
+    "named_settings",
     "preset",
     "read_settings",
     "recorded_looks",

@@ -286,6 +286,11 @@ def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> Simul
     return settings.model_copy(update={"rig": placed(settings.rig, folder)})
 
 
+def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
+    """The settings of a preset, or of a file where ``what`` looks like one."""
+    return read_settings(Path(what), changes) if what.endswith(".toml") else preset(what, changes)
+
+
 def _preset(name: Any, source: object) -> dict[str, Any]:
     if not isinstance(name, str) or name not in PRESETS:
         raise InputError(f"{source}: preset is {name!r}{nearest(str(name), list(PRESETS))}")
