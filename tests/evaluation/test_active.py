@@ -1,0 +1,158 @@
+"""Tables and pictures of robots that seek their place, from runs whose figures are known."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.active import (
+    difference_cells,
+    differences,
+    metres_text,
+    summaries,
+    summary_cells,
+)
+from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
+from factorgraph_loc.world import Tag, World
+
+
+def row(policy, seed, metres, *, world="hall", localized=True, **changes):
+    """A run; ``changes`` of its other figures."""
+    return {
+        "world": world,
+        "policy": policy,
+        "estimator": "active_mcl",
+        "seed": seed,
+        "status": "ok",
+        "reason": None,
+        "localized": localized,
+        "metres": metres,
+        "seconds": 2.0 * metres,
+        "error_position": 0.1,
+        "error_heading": math.radians(5.0),
+        "claimed_wrong": False,
+        "steps": 3,
+        "planning_ms": 20.0,
+        "planning_ms_max": 50.0,
+        **changes,
+    }
+
+
+def crashed(policy, seed):
+    """A run that told nothing."""
+    known = {"world": "hall", "policy": policy, "estimator": "active_mcl", "seed": seed, "status": "failed"}
+    return {**dict.fromkeys(row("", 0, 0.0)), **known, "reason": "it broke"}
+
+
+@pytest.fixture
+def rows():
+    """Two policies on ten seeds: the second drives twice as far and is not localized on two of them; one run broke."""
+    first = [row("information", seed, 10.0 + seed) for seed in range(9)] + [crashed("information", 9)]
+    second = [row("random", seed, 20.0 + 2.0 * seed) for seed in range(8)]
+    lost = [row("random", seed, 100.0, localized=False, claimed_wrong=seed == 8) for seed in (8, 9)]
+    return [*first, *second, *lost]
+
+
+def test_a_run_that_does_not_get_there_is_beyond_all_others(rows):
+    first, second = summaries(rows)
+    assert (first["policy"], first["runs"], first["failures"]) == ("information", 10, 1)
+    assert (first["median"], first["p90"]) == (14.5, 18.0)
+    assert (second["median"], second["p90"], second["failures"]) == (29.0, math.inf, 2)
+    assert second["claimed_wrong"] == 1
+    assert second["error_position"] == pytest.approx(0.1)
+    assert 0.0 < second["failures_low"] < 0.2 < second["failures_high"]
+
+
+def test_policies_are_compared_on_the_same_seeds(rows):
+    (found,) = differences(rows)
+    assert (found["a"], found["b"], found["pairs"]) == ("information", "random", 10)
+    assert found["ratio"] == pytest.approx(0.5)
+    assert found["difference"] == pytest.approx(-14.5)
+    assert found["ratio_low"] <= found["ratio"] <= found["ratio_high"] < 1.0
+    assert (found["failed_only_a"], found["failed_only_b"]) == (0, 1)
+    assert found["p"] == 1.0
+    (fewer,) = differences([one for one in rows if one["policy"] == "information" or one["seed"] < 4])
+    assert fewer["pairs"] == 4
+    assert fewer["difference"] == pytest.approx(11.5 - 23.0)
+
+
+def test_worlds_are_told_apart(rows):
+    other = [row(policy, seed, 5.0, world="store") for policy in ("information", "random") for seed in range(3)]
+    found = differences([*rows, *other])
+    assert [(one["world"], one["pairs"]) for one in found] == [("hall", 10), ("store", 3)]
+    assert found[1]["ratio"] == 1.0
+
+
+def test_tables_say_what_never_came(rows):
+    header, lines = summary_cells(rows)
+    assert all(len(line) == len(header) for line in lines)
+    cells = dict(zip(header, lines[1], strict=True))
+    assert (cells["median [m]"], cells["90 % [m]"], cells["[deg]"]) == ("29.0", "never", "5.0")
+    assert cells["failed (95 %)"].startswith("2 (")
+    header, lines = difference_cells(rows)
+    assert dict(zip(header, lines[0], strict=True))["failed only first / second"] == "0 / 1"
+    assert metres_text(math.nan) == "–"
+
+
+def test_runs_that_all_fail_have_a_table_and_a_picture():
+    rows = [crashed(policy, seed) for policy in ("information", "random") for seed in range(2)]
+    assert summary_cells(rows)[1][0][3:5] == ["2", "never"]
+    assert difference_cells(rows)[1][0][4] == "– (-∞ to ∞)"
+    comparison(rows).draw_without_rendering()
+
+
+def test_the_picture_of_a_comparison_counts_what_came_and_what_did_not(rows):
+    figure = comparison(rows)
+    boxes, shares = figure.axes
+    assert [label.get_text() for label in boxes.get_xticklabels()] == ["information", "random"]
+    assert [text.get_text() for text in boxes.texts] == ["1 of 10\nnever", "2 of 10\nnever"]
+    ends = [float(line.get_ydata()[-1]) for line in shares.lines]
+    assert ends == pytest.approx([0.9, 0.8])
+    assert float(np.interp(14.5, *shares.lines[0].get_data())) == pytest.approx(0.5, abs=0.06)
+
+
+def walls(width, depth):
+    corners = ((0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth), (0.0, 0.0))
+    return tuple((*a, *b) for a, b in itertools.pairwise(corners))
+
+
+def track(count):
+    """A run of so many decisions, whose belief is half as wide after each."""
+    rng = np.random.default_rng(0)
+    decisions = []
+    for i in range(count):
+        pose = np.array((1.0 + i, 1.5, 0.0))
+        ways = tuple(pose + np.array(((0.0, 0.0, 0.0), (1.0, side, 0.0))) for side in (-0.5, 0.0, 0.5))
+        particles = pose + 2.0**-i * rng.standard_normal((200, 3))
+        decisions.append(Decision(2.0 * i, pose, particles, ways, ways[1] if i else None))
+    truth = np.column_stack((np.linspace(1.0, 1.0 + count, 50), np.full(50, 1.5), np.zeros(50)))
+    world = World(tags={"T": Tag(x=2.0, y=0.0)}, walls=walls(12.0, 3.0))
+    return SeekingTrack("a run", world, truth, 2.0 * count, decisions)
+
+
+def labels(figure):
+    return {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_the_picture_of_a_run_shows_what_was_proposed_chosen_and_believed():
+    figure = run_picture(track(9))
+    maps = [axis for axis in figure.axes if axis.get_title().startswith("after")]
+    assert [axis.get_title() for axis in maps] == [f"after {2 * i}.0 m" for i in (0, 2, 3, 5, 6, 8)]
+    drawn = {line.get_label(): line for line in maps[1].lines}
+    assert {"walls", "tags", "belief", "candidates", "chosen", "robot (true)"} <= set(drawn)
+    np.testing.assert_allclose(drawn["chosen"].get_xydata(), ((3.0, 1.5), (4.0, 1.5)))
+    assert "chosen" not in {line.get_label() for line in maps[0].lines}  # nothing was taken
+    assert "way (true)" in {line.get_label() for line in maps[-1].lines}
+    assert {"chosen", "way (true)"} <= labels(figure)
+    (belief,) = [axis for axis in figure.axes if axis.get_ylabel() == "spread of the belief [m]"]
+    spread = belief.lines[0].get_ydata()
+    assert len(spread) == 9
+    # of 200 particles: farther off than 20 % in one of 2,000 draws
+    np.testing.assert_allclose(spread[1:] / spread[:-1], 0.5, rtol=0.2)
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_a_short_run_has_a_picture_too(count):
+    figure = run_picture(track(count))
+    assert sum(axis.get_title().startswith("after") for axis in figure.axes) == count
