@@ -65,14 +65,7 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     try:
-        causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
-        write_tum(result.final, temporary / "final.tum", log.t0_ns)
-        write_tum(causal, temporary / "causal.tum", log.t0_ns)
-        estimates(result, log).write_parquet(temporary / "estimates.parquet")
-        write_toml(temporary / "config.toml", result.config)
-        write_text(temporary / "learnt.json", _json(learnt_tables(result.learnt)))
-        write_text(temporary / "events.csv", events(result, log).write_csv())
-        write_text(temporary / "metrics.json", _json(scores))
+        write_files(result, log, scores, temporary)
         remove_run(out)
         out.mkdir(exist_ok=True)
         for name in FILES:
@@ -80,6 +73,18 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return scores
+
+
+def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
+    """Write the files of a run with these scores into an empty folder; see :func:`write_run`."""
+    causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
+    write_tum(result.final, folder / "final.tum", log.t0_ns)
+    write_tum(causal, folder / "causal.tum", log.t0_ns)
+    estimates(result, log).write_parquet(folder / "estimates.parquet")
+    write_toml(folder / "config.toml", result.config)
+    write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))
+    write_text(folder / "events.csv", events(result, log).write_csv())
+    write_text(folder / "metrics.json", _json(scores))
 
 
 def write_plots(result: RunResult, log: Log, out: Path) -> None:

@@ -1,0 +1,228 @@
+"""The file that says what an experiment is: logs, estimators, sensors, seeds, and settings to sweep over."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.files import FileModel, nearest, parse_model, read_toml
+
+SIMULATION = "simulation"  # the first word of settings of simulated logs
+METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")
+Name = Annotated[str, Field(min_length=1)]
+Seed = Annotated[int, Field(ge=0)]
+Scalar = str | int | float | bool
+
+
+def _seeds(value: Any) -> Any:
+    """``"0:5"`` and 3 as tuples; a list stays what it is."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return (value,)
+    if isinstance(value, str):
+        try:
+            return tuple(parse_seeds(value, "the value"))
+        except InputError as error:
+            raise ValueError(str(error)) from error
+    return value
+
+
+def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        name = f"{before}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value
+
+
+class LogEntry(FileModel):
+    """Logs: ``log``, a name that ``fgloc datasets`` lists, a path from the file's folder on, or a glob over either, with
+    ``reader``, ``options`` of the reader, and files ``rig`` and ``world`` in place of the log's own; or ``simulate``, a preset or
+    a TOML file, with changed ``settings`` and ``seeds``, a log of each."""
+
+    log: Name | None = None
+    reader: Name | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+    rig: Name | None = None
+    world: Name | None = None
+    simulate: Name | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+
+    _parse_seeds = field_validator("seeds", mode="before")(_seeds)
+
+    @model_validator(mode="after")
+    def _is_one(self) -> LogEntry:
+        if (self.log is None) == (self.simulate is None):
+            raise ValueError("expected either log or simulate")
+        others = ("settings", "seeds") if self.log is not None else ("reader", "options", "rig", "world")
+        if wrong := [name for name in others if name in self.model_fields_set]:
+            raise ValueError(f"{wrong[0]} says nothing about {'log' if self.log is not None else 'simulate'}")
+        return self
+
+
+class EstimatorEntry(FileModel):
+    """An estimator by its ``name``, with ``settings``; ``label``: what the results call it, by default its name."""
+
+    name: Name
+    label: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def shown(self) -> str:
+        """The label."""
+        return self.label or self.name
+
+
+class Sweep(FileModel):
+    """Settings by dotted name, ``LABEL.KEY`` or ``simulation.KEY``, and the values that each takes. ``mode``: ``grid``, every
+    value with every other, or ``list``, the first with the first, the second with the second."""
+
+    mode: Literal["grid", "list"] = "grid"
+    over: Mapping[str, tuple[Scalar, ...]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flatten(cls, content: Any) -> Any:
+        if not isinstance(content, Mapping):
+            return content
+        rest = {key: value for key, value in content.items() if key != "mode"}
+        mode = {"mode": content["mode"]} if "mode" in content else {}
+        return mode | {"over": dict(_flat(rest))}
+
+    @model_validator(mode="after")
+    def _has_values(self) -> Sweep:
+        for key, values in self.over.items():
+            if not values:
+                raise ValueError(f"{key} has no values")
+        if self.mode == "list" and len({len(values) for values in self.over.values()}) > 1:
+            raise ValueError(f"a list needs as many values of each of {', '.join(self.over)}")
+        return self
+
+    def points(self) -> list[dict[str, Scalar]]:
+        """What is set together, one after the other; one empty point if nothing is swept."""
+        combined = (
+            zip(*self.over.values(), strict=True) if self.mode == "list" else itertools.product(*self.over.values())
+        )
+        return [dict(zip(self.over, values, strict=True)) for values in combined] or [{}]
+
+
+class ReportSettings(FileModel):
+    """``metrics``: the scores that the report shows; ``baseline``: the label that the others are compared with."""
+
+    metrics: Annotated[tuple[Name, ...], Field(min_length=1)] = METRICS
+    baseline: str | None = None
+
+
+class Limits(FileModel):
+    """Of one run: ``memory`` [10^6 bytes] that its process may hold, by default the machine's share of it; ``time`` [s]."""
+
+    memory: Annotated[float, Field(gt=0.0)] | None = None
+    time: Annotated[float, Field(gt=0.0)] = 3600.0
+
+
+class Experiment(FileModel):
+    """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
+    default those of each log's rig; ``prior``: where runs start; ``seeds``: of the estimators."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
+    out: Name | None = None
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
+    estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1)]
+    sensors: tuple[tuple[Name, ...] | None, ...] = (None,)
+    prior: Name | None = None
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    sweep: Sweep = Sweep()
+    report: ReportSettings = ReportSettings()
+    limits: Limits = Limits()
+
+    _parse_seeds = field_validator("seeds", mode="before")(_seeds)
+
+    @field_validator("logs", "estimators", mode="before")
+    @classmethod
+    def _named(cls, value: Any, info: Any) -> Any:
+        """A name alone is an entry too."""
+        key = "log" if info.field_name == "logs" else "name"
+        return [{key: one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
+
+    @field_validator("sensors", mode="before")
+    @classmethod
+    def _several(cls, value: Any) -> Any:
+        return [value] if isinstance(value, list) and value and all(isinstance(one, str) for one in value) else value
+
+    @model_validator(mode="after")
+    def _fits(self) -> Experiment:
+        labels = [entry.shown for entry in self.estimators]
+        if twice := [label for label in labels if labels.count(label) > 1]:
+            raise ValueError(f"two estimators are called {twice[0]!r}, expected a label of its own for each")
+        known = {SIMULATION, *labels, *(entry.name for entry in self.estimators)}
+        for key in self.sweep.over:
+            first, _, rest = key.partition(".")
+            if first not in known or not rest:
+                raise ValueError(
+                    f"sweep has {key!r}{nearest(first, list(known))}; expected LABEL.KEY or simulation.KEY"
+                )
+            if first == SIMULATION and not any(entry.simulate for entry in self.logs):
+                raise ValueError(f"sweep has {key!r}, but no log is simulated")
+        baseline = self.report.baseline
+        if baseline is not None and baseline not in labels:
+            raise ValueError(f"report.baseline is {baseline!r}{nearest(baseline, labels)}")
+        return self
+
+    def folder(self) -> Path:
+        """Where the results are."""
+        return Path("out", self.name) if self.out is None else Path(self.out)
+
+
+def read_experiment(path: Path, changes: Sequence[tuple[str, Any]] = ()) -> Experiment:
+    """The experiment of a TOML file. ``changes``: dotted keys of the file with other values; ``LABEL.KEY`` is a setting of an
+    estimator, ``simulation.KEY`` one of all simulated logs. InputError names file, key and what is expected."""
+    content = read_toml(path)
+    for key, value in changes:
+        _change(content, key, value, path)
+    return parse_model(Experiment, content, path)
+
+
+def nested(key: str, value: Any) -> dict[str, Any]:
+    """``a.b`` and 3 as {"a": {"b": 3}}."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return dict(value)
+
+
+def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
+    """Set a dotted key of the file's content; see :func:`read_experiment`."""
+    first, _, rest = key.partition(".")
+    if first in Experiment.model_fields:
+        _set(content, key, value, source)
+        return
+    logs = [one for one in content.get("logs", []) if isinstance(one, dict) and "simulate" in one]
+    estimators = [{"name": one} if isinstance(one, str) else one for one in content.get("estimators", [])]
+    content["estimators"] = estimators
+    chosen = logs if first == SIMULATION else [e for e in estimators if first in (e.get("label"), e.get("name"))]
+    if not chosen or not rest:
+        labels = [str(e.get("label", e.get("name"))) for e in estimators]
+        raise InputError(f"{source}: no key {key}{nearest(first, [*Experiment.model_fields, SIMULATION, *labels])}")
+    for entry in chosen:
+        _set(entry, f"settings.{rest}", value, source)
+
+
+def _set(table: dict[str, Any], key: str, value: Any, source: object) -> None:
+    *parts, last = key.split(".")
+    for part in parts:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{source}: no key {key}, as {part} is {table!r}")
+    table[last] = value
+
+
+def canonical(settings: Mapping[str, Any]) -> str:
+    """Settings as JSON, the same for the same settings."""
+    return json.dumps(settings, sort_keys=True)

@@ -1,0 +1,104 @@
+"""What a run's result depends on, as one key: the log, the configuration, the code, the libraries."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import factorgraph_loc
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.log_source import LogSource
+from factorgraph_loc.files import write_text
+
+LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
+# parts of the package that no run goes through: a change to the report must not undo a night's work
+OUTSIDE = ("cli", "calibration", "planning", "evaluation/report")
+_UNSETTLED = 2.0  # s: a file that young may change again within the same stamp
+
+
+def digest_of(content: Any) -> str:
+    """The sha256 of plain data, as hexadecimal digits."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@lru_cache
+def code_version() -> str:
+    """A digest of the source files that a run can go through."""
+    package = Path(factorgraph_loc.__file__).parent
+    total = hashlib.sha256()
+    for root in (package, package.parent / "factors"):
+        for file in sorted(root.rglob("*")):
+            name = file.relative_to(root).as_posix()
+            if file.suffix in (".py", ".npz") and not (root is package and name.startswith(OUTSIDE)):
+                total.update(f"{root.name}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    return total.hexdigest()
+
+
+@lru_cache
+def library_versions() -> dict[str, str]:
+    """The versions of what computes, by name."""
+    return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
+
+
+def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
+    """The key of a run: of a log's digest, and its effective configuration as plain data."""
+    return digest_of(
+        {"log": log_digest, "config": dict(config), "code": code_version(), "libraries": library_versions()}
+    )
+
+
+def read_cache(file: Path) -> dict[str, Any]:
+    """A JSON object that was kept; empty if it is not there or damaged, for it can be made again."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+class FileDigests:
+    """The sha256 of files; with ``cache``, a JSON file, by path, size and time of change, so that a file is read once."""
+
+    def __init__(self, cache: Path | None) -> None:
+        self._cache = cache
+        self._new = False
+        self._known: dict[str, list[Any]] = {} if cache is None else read_cache(cache)
+
+    def of_source(self, source: LogSource) -> str:
+        """The digest of what a log is made from; InputError if a file is not there."""
+        files = {name: self.of_file(path) for name, path in source.files().items()}
+        return digest_of({"identity": source.identity(), "files": files})
+
+    def of_file(self, path: Path) -> str:
+        """The sha256 of a file; InputError if it cannot be read."""
+        try:
+            stat = path.stat()
+            known = self._known.get(str(path))
+            if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+                return str(known[2])
+            with path.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        if time.time() - stat.st_mtime > _UNSETTLED:
+            self._known[str(path)] = [stat.st_size, stat.st_mtime_ns, found]
+            self._new = True
+        return found
+
+    def save(self) -> None:
+        """Keep what is new."""
+        if self._new and self._cache is not None:
+            write_text(self._cache, json.dumps(self._known))
+            self._new = False
+
+
+def source_digest(source: LogSource) -> str:
+    """The digest of what a log is made from now, every file read; InputError if one is not there."""
+    return FileDigests(None).of_source(source)

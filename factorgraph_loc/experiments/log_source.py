@@ -1,0 +1,181 @@
+"""Where the logs of an experiment come from, as plain data that other processes can load them from.
+
+Nothing numerical is imported until a log is loaded: an experiment whose results are there already must not wait for that.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import read_toml
+from factorgraph_loc.shipped import manifests
+
+if TYPE_CHECKING:
+    from factorgraph_loc.log import Log
+
+RUN_FILE = "run.toml"
+
+
+@dataclass(frozen=True)
+class RecordedSource:
+    """The log at place ``number`` of those that ``log`` stands for, as :func:`~factorgraph_loc.readers.load` takes it.
+
+    ``options``: of the reader, as JSON. ``rig``, ``world``: files in place of the log's own. ``data_root``: where the files of
+    manifests are, by default the environment's FGLOC_DATA.
+    """
+
+    log: str
+    number: int = 0
+    reader: str | None = None
+    options: str = "{}"
+    rig: str | None = None
+    world: str | None = None
+    data_root: str | None = None
+
+    def load_all(self) -> list[Log]:
+        """All logs that ``log`` stands for; InputError as of the reader."""
+        from factorgraph_loc.readers import load  # noqa: PLC0415
+
+        rig, world, root = (None if name is None else Path(name) for name in (self.rig, self.world, self.data_root))
+        options = json.loads(self.options)
+        return load(self.log, data_root=root, reader=self.reader, options=options, rig=rig, world=world)
+
+    def load(self) -> Log:
+        """The log."""
+        return self.load_all()[self.number]
+
+    def files(self) -> dict[str, Path]:
+        """The files that the log is read from, by names that do not depend on where they lie."""
+        given = {"rig": self.rig, "world": self.world}
+        found = [(f"{what}/{name}", file) for what, path in given.items() for name, file in _of_toml(path)]
+        return dict(found) | dict(self._data())
+
+    def identity(self) -> dict[str, Any]:
+        """What, beside the bytes of its files, makes the log what it is."""
+        path = Path(self.log)
+        name = path.stem if path.is_file() else path.name
+        return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
+
+    def _data(self) -> Iterator[tuple[str, Path]]:
+        path = Path(self.log)
+        if self.log in manifests():
+            path = manifests()[self.log]
+        if path.name == RUN_FILE:
+            path = path.parent
+        if path.is_dir():
+            yield from _of_folder(path)
+            return
+        if self.reader is not None or path.suffix != ".toml":
+            yield path.name, path
+            return
+        yield from _of_toml(str(path))
+        content = read_toml(path)
+        if content.get("path") is None:  # the data come with a library, whose version is in the key
+            return
+        from factorgraph_loc.readers.manifests import find_data_root  # noqa: PLC0415
+
+        root = find_data_root(None if self.data_root is None else Path(self.data_root), path)
+        names = list(content.get("checksums", {})) or [str(content["path"])]
+        for name in names:
+            yield from _of_folder(root / name) if (root / name).is_dir() else [(name, root / name)]
+
+
+@dataclass(frozen=True)
+class SimulatedSource:
+    """The log of a ``preset`` (a name, or a TOML file), with changed ``settings`` (JSON) and a ``seed``."""
+
+    preset: str
+    settings: str = "{}"
+    seed: int = 0
+
+    def load_all(self) -> list[Log]:
+        """The log, simulated."""
+        from factorgraph_loc.simulation import preset, read_settings, simulate  # noqa: PLC0415
+
+        changes = json.loads(self.settings)
+        is_file = self.preset.endswith(".toml")
+        settings = read_settings(Path(self.preset), changes) if is_file else preset(self.preset, changes)
+        return [simulate(settings, self.seed)]
+
+    def load(self) -> Log:
+        """The log."""
+        return self.load_all()[0]
+
+    def files(self) -> dict[str, Path]:
+        """The file of the settings, if they are in one, and those that it names."""
+        return dict(_of_toml(self.preset)) if self.preset.endswith(".toml") else {}
+
+    def identity(self) -> dict[str, Any]:
+        """What, beside the bytes of its files, makes the log what it is."""
+        return {"simulated": Path(self.preset).name, "settings": json.loads(self.settings), "seed": self.seed}
+
+
+LogSource = RecordedSource | SimulatedSource
+
+
+def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSource]:
+    """The sources that ``name`` stands for: a known name, a path from ``folder`` on, or a glob over either.
+
+    InputError if there is none. ``others``: fields of the sources.
+    """
+    known = manifests()
+    if name in known:
+        return [RecordedSource(name, **others)]
+    if not any(c in name for c in "*?["):
+        # what is no path either is for the reader to tell
+        return [RecordedSource(str(folder / name) if (folder / name).exists() else name, **others)]
+    found = [k for k in known if Path(k).match(name)]
+    pattern = Path(name)
+    base, below = (Path(pattern.anchor), str(pattern.relative_to(pattern.anchor))) if pattern.anchor else (folder, name)
+    found += [str(path) for path in sorted(base.glob(below)) if others.get("reader") or _is_log(path)]
+    if not found:
+        raise InputError(
+            f"no log matches {name!r}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
+        )
+    return [RecordedSource(one, **others) for one in found]
+
+
+def _is_log(path: Path) -> bool:
+    if path.is_dir():
+        return (path / RUN_FILE).is_file()
+    return path.name == RUN_FILE or (
+        path.suffix == ".toml" and not path.name.endswith((".rig.toml", ".world.toml")) and "reader" in read_toml(path)
+    )
+
+
+def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
+    for file in sorted(folder.rglob("*")):
+        if file.is_file():
+            yield f"{folder.name}/{file.relative_to(folder).as_posix()}", file
+
+
+def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
+    """A file of settings, and the files beside it that it names, and that those name."""
+    if path is None:
+        return
+    waiting, met = [Path(path)], set()
+    while waiting:
+        file = waiting.pop()
+        if file in met:
+            continue
+        met.add(file)
+        yield file.relative_to(Path(path).parent).as_posix(), file
+        if file.suffix == ".toml" and file.is_file():
+            named = (file.parent / text for text in _texts(read_toml(file)) if text and len(text) < 200)
+            waiting += [one for one in named if one.is_relative_to(Path(path).parent) and one.is_file()]
+
+
+def _texts(content: Any) -> Iterator[str]:
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, Mapping):
+        for value in content.values():
+            yield from _texts(value)
+    elif isinstance(content, list):
+        for value in content:
+            yield from _texts(value)

@@ -1,0 +1,17 @@
+"""Seeds as people write them: ``0:10``, ``3``."""
+
+from __future__ import annotations
+
+from factorgraph_loc.errors import InputError
+
+
+def parse_seeds(text: str, source: object = "--seeds") -> range:
+    """``0:10`` as the seeds 0 to 9, ``3`` as the seed 3 alone; InputError names ``source``."""
+    first, colon, end = text.partition(":")
+    try:
+        seeds = range(int(first), int(end) if colon else int(first) + 1)
+    except ValueError:
+        seeds = range(0)
+    if not seeds or seeds[0] < 0:
+        raise InputError(f"{source} is {text!r}, expected a number such as 3, or a range such as 0:10")
+    return seeds

@@ -1,0 +1,71 @@
+"""The files of one run as the store keeps them: those of ``fgloc run``, with all times in ``timings.json``.
+
+What the same run gives on another day is the same to the byte but for that file.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc.evaluation.figures import Track
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.experiments.output import COVARIANCES, FILES, write_files
+from factorgraph_loc.experiments.store import TIMINGS
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+
+TIMING = "timing."  # what begins so is a time
+
+
+def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
+    """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty there.
+
+    ``started``: when it was, by ``perf_counter``, for the time that it took as a whole.
+    """
+    scores = score(result, log)
+    timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
+    untimed = replace(result, timings=replace(result.timings, update_t=np.empty(0), update_ms=np.empty(0)))
+    with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
+        write_files(untimed, log, {k: v for k, v in scores.items() if k not in timings}, Path(folder))
+        files = {name: (Path(folder) / name).read_bytes() for name in FILES}
+    return files | {TIMINGS: timings_file(timings | {"timing.run_seconds": perf_counter() - started})}
+
+
+def timings_file(timings: Mapping[str, Any]) -> bytes:
+    """The content of ``timings.json``; what is not finite is null."""
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in timings.items()}
+    return (json.dumps(plain, indent=2) + "\n").encode()
+
+
+def read_track(estimates: bytes) -> Track:
+    """The trajectories of an ``estimates.parquet``; see :meth:`~factorgraph_loc.experiments.store.Store.track`."""
+    table = pl.read_parquet(io.BytesIO(estimates))
+    t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
+    causal = _trajectory(table.filter((pl.col("kind") == "causal") & _from_localized(table)), t0_ns)
+    final = _trajectory(table.filter(pl.col("kind") == "final"), t0_ns)
+    return Track(causal if len(causal) else None, final, np.empty(0))
+
+
+def _from_localized(table: pl.DataFrame) -> pl.Expr:
+    found = table.filter((pl.col("kind") == "causal") & (pl.col("status") == "localized"))["t_ns"]
+    return pl.col("t_ns") >= (found.min() if len(found) else np.iinfo(np.int64).max)
+
+
+def _trajectory(table: pl.DataFrame, t0_ns: int) -> Trajectory:
+    covariances = np.empty((len(table), 3, 3))
+    for name, (i, j) in COVARIANCES.items():
+        covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    t = (table["t_ns"].to_numpy() - t0_ns) / 1e9
+    return Trajectory(t, table.select("x", "y", "heading").fill_null(np.nan).to_numpy(), covariances)
