@@ -1,1 +1,1 @@
-"""Active localization: where to drive to know where the robot is."""
+"""Where to drive in order to know where one is: candidate paths, what they would tell, and policies that choose among them."""

@@ -1,0 +1,178 @@
+"""Paths that a robot may take: arcs and straight runs, ways to places in free space, and how far walls let it go on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csgraph
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.simulation.free_space import CELL, FreeSpace, chain, dense, straightened
+from factors import se2
+from factors.se2 import Array
+
+STEP = 0.25  # m, between the poses of a path
+DIRECTIONS = 12  # to which a robot may turn before it sets off
+CURVATURES = (-0.6, -0.25, 0.0, 0.25, 0.6)  # rad/m
+SHORT = 0.5  # of the length: straight runs that end earlier
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """``poses`` (S, 3) in the frame of the robot's pose at the start, which is the first of them: one about every :data:`STEP` of
+    the way, and the end; a turn in place is a pose more at the same place. ``kind``: where the path comes from."""
+
+    poses: Array
+    kind: str
+
+    @cached_property
+    def way(self) -> Array:
+        """Metres (S,) driven up to each pose."""
+        steps = se2.log(se2.between(self.poses[:-1], self.poses[1:]))
+        return np.concatenate((np.zeros(1), np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+    @property
+    def length(self) -> float:
+        """Metres driven."""
+        return float(self.way[-1])
+
+    def duration(self, speed: float, turn_rate: float) -> float:
+        """Seconds at ``speed`` [m/s] where no more than ``turn_rate`` [rad/s] is turned."""
+        turns = np.abs(se2.wrap(np.diff(self.poses[:, 2])))
+        return float(np.maximum(np.diff(self.way) / speed, turns / turn_rate).sum())
+
+    def until(self, length: float) -> Path:
+        """The path up to the last pose that is no farther than ``length`` [m] on the way."""
+        return Path(self.poses[self.way <= length + 1e-9], self.kind)
+
+
+def primitives(length: float) -> list[Path]:
+    """Arcs and straight runs of ``length`` [m]: in each of :data:`DIRECTIONS`, after a turn in place, straight and gently curved,
+    and straight half as far; sharper curves to the front. InputError if the length is not above zero."""
+    if not (math.isfinite(length) and length > 0.0):
+        raise InputError(f"horizon is {length:g} m, expected a length above 0")
+    out = []
+    for turn in (2.0 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS).tolist():
+        for curvature in CURVATURES:
+            if turn == 0.0 or abs(curvature) <= CURVATURES[-2]:
+                out.append(_arc(turn, curvature, length))
+        out.append(_arc(turn, 0.0, SHORT * length))
+    return out
+
+
+def waypoint_paths(space: FreeSpace, pose: Array, targets: Array) -> list[Path]:
+    """The shortest paths through free space from ``pose`` (3,) to ``targets`` (K, 2) [m] in the world, by one search for all of
+    them (Dijkstra, 1959), straightened. The robot turns in place towards where each begins, and in its corners.
+
+    A pose that is too close to a wall starts from the free cell that is nearest; a target that is not in free space, or is where
+    the robot is, has no path.
+    """
+    start = _nearest_cell(space, pose[:2])
+    ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
+    _, before = csgraph.dijkstra(space.graph, directed=False, indices=start, return_predecessors=True)
+    out = []
+    for end in ends.tolist():
+        if end < 0 or end == start:
+            continue
+        points = space.centres[chain(before, end)[::-1]]
+        if space.cells(pose[None, :2])[0] >= 0:
+            points[0] = pose[:2]
+        out.append(Path(_driven(pose, straightened(space, points)), "waypoint"))
+    return out
+
+
+def waypoints(space: FreeSpace, count: int) -> Array:
+    """At most ``count`` places (K, 2) [m] spread over free space, each the cell that is farthest from those before (Gonzalez,
+    Theoretical Computer Science 38, 1985), the first the one that is farthest from walls."""
+    i, j = np.nonzero(space.index >= 0)
+    distance = np.empty(len(space.centres))
+    distance[space.index[i, j]] = space.distance[i, j]
+    chosen = [int(np.argmax(distance))]
+    gaps = np.full(len(space.centres), np.inf)
+    while len(chosen) < min(count, len(space.centres)):
+        gaps = np.minimum(gaps, np.hypot(*(space.centres - space.centres[chosen[-1]]).T))
+        chosen.append(int(np.argmax(gaps)))
+    return np.asarray(space.centres[chosen])
+
+
+def free_length(space: FreeSpace, poses: Array, path: Path) -> Array:
+    """How far [m] (M,) along the path robots at ``poses`` (M, 3) in the world get before they are nearer to a wall than the
+    clearance. One that is too near at the start may drive off, as long as it gets farther away from walls."""
+    return np.asarray(path.way[free_steps(space, poses, [path])[0]])
+
+
+def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path]) -> NDArray[np.int64]:
+    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) reach; see :func:`free_length`."""
+    first = np.cumsum([0, *(len(path.poses) for path in paths)])
+    along = np.concatenate([path.poses for path in paths]) if paths else np.empty((0, 3))
+    out = np.empty((len(paths), len(poses)), dtype=np.int64)
+    poses = np.ascontiguousarray(poses, dtype=float)
+    _free_steps(space.index, space.distance, space.origin, poses, along, first, out)
+    return out
+
+
+def _arc(turn: float, curvature: float, length: float) -> Path:
+    """A turn in place and an arc."""
+    count = max(1, math.ceil(length / STEP - 1e-9))
+    way = np.minimum(STEP * np.arange(count + 1), length)
+    driven = se2.exp(np.column_stack((way, np.zeros(len(way)), curvature * way)))
+    if turn == 0.0:
+        return Path(driven, "arc")
+    turned = se2.compose(np.array((0.0, 0.0, turn)), driven)
+    return Path(np.concatenate((np.zeros((1, 3)), turned)), "arc")
+
+
+def _driven(pose: Array, corners: Array) -> Array:
+    """Poses (S, 3) in the frame of ``pose`` (3,) of a robot that drives through ``corners`` (N, 2) of the world."""
+    parts = [np.zeros((1, 3))]
+    start = pose[:2]
+    if np.hypot(*(corners[0] - start)) < 1e-9:
+        corners = corners[1:]
+    for corner in corners:
+        heading = math.atan2(corner[1] - start[1], corner[0] - start[0])
+        points = np.concatenate((start[None], dense(np.stack((start, corner)), STEP)))
+        world = np.column_stack((points, np.full(len(points), heading)))
+        parts.append(se2.between(pose, world))
+        start = corner
+    return np.concatenate(parts)
+
+
+def _nearest_cell(space: FreeSpace, point: Array) -> int:
+    cell = int(space.cells(point[None])[0])
+    return cell if cell >= 0 else int(np.argmin(np.hypot(*(space.centres - point).T)))
+
+
+@numba.njit(cache=True)
+def _free_steps(
+    index: NDArray[np.int64],
+    distance: Array,
+    origin: Array,
+    poses: Array,
+    along: Array,
+    first: NDArray[np.int64],
+    out: NDArray[np.int64],
+) -> None:
+    nx, ny = index.shape
+    for m in range(len(poses)):
+        c, s = math.cos(poses[m, 2]), math.sin(poses[m, 2])
+        for p in range(len(first) - 1):
+            last, leaving, before = 0, True, -1.0
+            for k in range(first[p], first[p + 1]):
+                x = poses[m, 0] + c * along[k, 0] - s * along[k, 1]
+                y = poses[m, 1] + s * along[k, 0] + c * along[k, 1]
+                i, j = math.floor((x - origin[0]) / CELL), math.floor((y - origin[1]) / CELL)
+                if i < 0 or j < 0 or i >= nx or j >= ny:
+                    break
+                if index[i, j] >= 0:
+                    leaving = False
+                elif not leaving or distance[i, j] < before:
+                    break
+                before = distance[i, j]
+                last = k - first[p]
+            out[p, m] = last
