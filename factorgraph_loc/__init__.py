@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         images,
         info,
         load,
+        map,
         run,
         simulate,
     )
@@ -33,6 +34,7 @@ __all__ = [
     "images",
     "info",
     "load",
+    "map",
     "run",
     "simulate",
 ]

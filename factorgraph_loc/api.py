@@ -23,7 +23,7 @@ from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments import compare as comparing
-from factorgraph_loc.experiments import image_localization, output
+from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files import write_text
@@ -47,6 +47,7 @@ __all__ = [
     "images",
     "info",
     "load",
+    "map",
     "run",
     "simulate",
 ]
@@ -207,6 +208,30 @@ def report_beside(out: Path, *, overwrite: bool) -> Path:
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists already; choose another name or give --overwrite")
     return page
+
+
+def map(
+    log: LogLike,
+    out: str | Path,
+    *,
+    of: str | None = None,
+    estimator: str = maps.MAPPERS[0],
+    settings: Settings | None = None,
+    extend: bool = False,
+    poses: str | None = None,
+    tag_height: float | None = None,
+    prior: str | None = None,
+    overwrite: bool = False,
+) -> maps.MadeMap:
+    """Make a map of the landmarks, RFID tags or points in a log; write it to ``out`` (``NAME.world.toml``), with a picture beside.
+
+    See :class:`~factorgraph_loc.experiments.maps.MapOptions` for what is given.
+    """
+    maps.picture_beside(Path(out), overwrite=overwrite)
+    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior)
+    made = maps.make_map(_one(log), options)
+    made.write(Path(out), overwrite=overwrite)
+    return made
 
 
 def images(

@@ -12,6 +12,7 @@ import pytest
 import factorgraph_loc as fgloc
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.rig import read_rig
+from factorgraph_loc.world import read_world
 
 SHORT = {"drive": {"duration": 20.0}, "world": {"tags": 12, "landmarks": 6}}
 
@@ -92,6 +93,15 @@ def test_calibrate_writes_a_rig(tmp_path):
     assert (tmp_path / "cart.report.html").is_file()
     with pytest.raises(InputError, match="exists already"):
         fgloc.calibrate(log, tmp_path / "cart.rig.toml")
+
+
+def test_map_writes_a_world(office, tmp_path):
+    made = fgloc.map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
+    assert set(read_world(tmp_path / "seen.world.toml").landmarks) == set(made.world.landmarks) != set()
+    assert (tmp_path / "seen.map.png").is_file()
+    assert "the robot starts at" in made.frame  # few landmarks in common with the given map
+    with pytest.raises(InputError, match="exists already"):
+        fgloc.map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
 
 
 def test_a_misspelt_name_of_a_log_is_told():

@@ -1,0 +1,254 @@
+"""A map from a log: of its landmarks, of the RFID tags that it read, or of the points in its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from factorgraph_loc.calibration import map_figure, mapping, tag_mapping
+from factorgraph_loc.calibration.camera_poses import posed_frames
+from factorgraph_loc.calibration.mapping import LandmarkMap
+from factorgraph_loc.calibration.point_mapping import PointReport, map_points
+from factorgraph_loc.calibration.tag_mapping import MadeTags
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.evaluation.figures import save
+from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.files import replacing
+from factorgraph_loc.log import Log, StartPose
+from factorgraph_loc.vision.frontend import with_features
+from factorgraph_loc.world import World, write_world
+from factors import se2
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SUFFIX = ".world.toml"
+MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
+START_SIGMA = 1e-3  # m and rad; without a map the start is what defines the frame
+TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
+HEIGHTS = (-10.0, 20.0)  # m
+OF_CAMERA = ("camera", "sightings")
+OF_REFERENCE = "that of the reference"
+SOURCES = {"log": "the log's start", "reference": "its reference"}
+
+Stages = Callable[[str], AbstractContextManager[Callable[[float, float], None]]]
+
+
+@contextmanager
+def silent(_: str) -> Iterator[Callable[[float, float], None]]:
+    """Tells nobody how far a stage is."""
+    yield lambda _done, _total: None
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a map is made.
+
+    ``of``: landmarks, tags or points; None: points where the log has images, landmarks where it has sightings of them, else tags.
+    ``estimator`` and ``settings``: for landmarks. ``extend``: the log's map stays, what it lacks is added; not for points.
+    ``poses``: of the robot, for tags and points: reference, or odometry, which estimates them too; None: the reference if there is
+    one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``prior``: see
+    :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
+    """
+
+    of: str | None = None
+    estimator: str = MAPPERS[0]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    extend: bool = False
+    poses: str | None = None
+    tag_height: float | None = None
+    prior: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MadeMap:
+    """A map: the ``world`` to be written; ``frame``: its frame in words; ``details``: what was found, by what is in it.
+
+    ``warnings``: of the log and the run. ``draw`` makes a picture of it.
+    """
+
+    world: World
+    frame: str
+    details: LandmarkMap | MadeTags | PointReport
+    warnings: tuple[str, ...]
+    draw: Callable[[], Figure]
+
+    def write(self, out: Path, *, overwrite: bool = False) -> None:
+        """Write the map, and its picture beside it. InputError as of :func:`picture_beside`, or if they cannot be written."""
+        picture = picture_beside(out, overwrite=overwrite)
+        try:
+            with replacing(picture) as temporary:
+                save(self.draw(), temporary)
+            write_world(self.world, out)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def picture_beside(out: Path, *, overwrite: bool) -> Path:
+    """The path of the picture beside a map; InputError if the map's name is not one, or something is there already."""
+    name = out.name.removesuffix(SUFFIX)
+    if name in ("", out.name):
+        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {SUFFIX}")
+    if not out.parent.is_dir():
+        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
+    picture = out.with_name(f"{name}.map.png")
+    for path in (out, picture):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists already; choose another name or give --overwrite")
+    return picture
+
+
+def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silent) -> MadeMap:
+    """Make a map of what a log saw. A map that it has is compared, or extended.
+
+    ``stages`` is told the name of each stage, and is then given how much of it is done. Raises InputError for options that do not
+    fit together or the log, RunFailedError if nothing could be located.
+    """
+    options = options or MapOptions()
+    what = _what(log, options)
+    if what == "points":
+        return _of_points(log, options, stages)
+    return _of_tags(log, options, stages) if what == "tags" else _of_landmarks(log, options, stages)
+
+
+def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
+    """What is mapped; InputError for options of another kind of map."""
+    of_landmarks = bool(options.settings) or options.estimator != MAPPERS[0]
+    of_tags = options.tag_height is not None
+    of_others = of_landmarks or of_tags or options.extend
+    of = options.of
+    if of == "points" and of_others:
+        raise InputError("--estimator, --set, --extend and --tag-height are for other maps, but points are mapped here")
+    if of == "points" or (of is None and not of_others and "camera" in log.streams and log.rig.camera is not None):
+        return "points"
+    if of not in (None, "landmarks", "tags"):
+        raise InputError(f"--of is {of!r}, expected landmarks, tags or points")
+    if of == "tags" or (of is None and "bearing_range" not in log.streams and "rfid" in log.streams):
+        if of_landmarks:
+            raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
+        return "tags"
+    if of_tags or options.poses is not None:
+        raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
+    return "landmarks"
+
+
+def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+    estimator, settings = options.estimator, dict(options.settings)
+    if estimator not in MAPPERS:
+        raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
+    if "landmarks" in settings:
+        raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
+    mapping.check(log)
+    if options.extend and not log.world.landmarks:
+        raise InputError(f"{log.name}: has no map that could be extended; leave --extend out")
+    source = ""
+    if options.extend:
+        started, config = log, RunConfig(estimator, settings | {"landmarks": "extended"}, prior=options.prior)
+    else:
+        started, source = _started_exactly(log, options.prior)
+        config = RunConfig(estimator, settings | {"landmarks": "unknown"}, prior="log")
+    with stages(estimator) as report:
+        result = run(started, config, lambda share: report(share, 1.0))
+    made = mapping.make_map(log, result.learnt.landmarks, extend=options.extend)
+    trajectory = se2.compose(made.frame, result.final.poses)
+    frame = "that of the given map" if options.extend or made.judged else f"that of the start: {source}"
+    draw = partial(map_figure.figure, log.name, made, trajectory)
+    return MadeMap(made.world, frame, made, result.warnings, draw)
+
+
+def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+    along_reference = _along_reference(options, there=log.reference is not None)
+    height = options.tag_height
+    if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
+        raise InputError(f"--tag-height is {height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
+    if options.extend and not log.world.tags:
+        raise InputError(f"{log.name}: has no map of tags that could be extended; leave --extend out")
+    prior, frame = (None, OF_REFERENCE) if along_reference else _start_of_tags(log, options)
+    with stages("tags") as report:
+        made = tag_mapping.map_tags(
+            log,
+            "reference" if along_reference else "odometry",
+            prior,
+            extend=options.extend,
+            height=height,
+            progress=lambda share: report(share, 1.0),
+        )
+    if options.extend or (not along_reference and made.made.judged):
+        frame = "that of the given map"
+    return MadeMap(made.world, frame, made, log.warnings, partial(map_figure.tag_figure, log.name, made))
+
+
+def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+    camera = log.rig.camera
+    if camera is None:
+        raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
+    if "camera" not in log.streams:
+        raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+    warnings: tuple[str, ...] = ()
+    frame = OF_REFERENCE
+    if not _along_reference(options, there=log.reference is not None or log.reference3 is not None):
+        log, frame, warnings = _smoothed(log, options.prior, stages)
+    with stages("features") as report:
+        seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
+    posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
+    with stages("points") as report:
+        made = map_points(camera.model(), posed, progress=lambda share: report(share, 1.0))
+    world = log.world.model_copy(update={"name": f"{log.name}-map", "points": made.points})
+    draw = partial(map_figure.point_figure, log.name, made.points, posed.cameras.positions, world.walls)
+    return MadeMap(world, frame, made.report, (*(warnings or log.warnings), *doubts), draw)
+
+
+def _along_reference(options: MapOptions, *, there: bool) -> bool:
+    """Whether the robot's poses are those of the reference; ``there``: there is one that could be used."""
+    if options.poses not in (None, "reference", "odometry"):
+        raise InputError(f"--poses is {options.poses!r}, expected reference or odometry")
+    return there if options.poses is None else options.poses == "reference"
+
+
+def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
+    """The log with a start that is certain, and where that lies, in words."""
+    start, source = resolve_prior(log, prior)
+    if start is None:
+        t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
+    else:
+        t, pose, source = start.t, start.pose, _in_words(start, source)
+    return replace(log, start=StartPose(t, pose, np.full(3, START_SIGMA))), source
+
+
+def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
+    """Where the robot starts, and the frame in words. Without a map in use the start is certain, as it defines the frame."""
+    prior, source = resolve_prior(log, options.prior)
+    if prior is None:
+        if options.extend:
+            raise InputError(
+                f"{log.name}: to extend its map from odometry the start has to be known in it; give --prior"
+            )
+        return None, "that of the start: the first pose is the origin (0, 0, 0)"
+    certain = replace(prior, covariance=tag_mapping.START_SIGMA**2 * np.eye(3))
+    return (prior if options.extend else certain), f"that of the start: {_in_words(prior, source)}"
+
+
+def _in_words(start: PosePrior, source: str) -> str:
+    x, y, heading = start.pose
+    return f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {SOURCES.get(source, '--prior')}"
+
+
+def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tuple[str, ...]]:
+    """The log with the smoother's final trajectory, from all sensors but the camera, in place of its reference; and warnings.
+
+    Its covariances say how well each pose is known, so that images of a place that is visited again still draw it together.
+    """
+    others = tuple(name for name in log.rig.sensors if name in log.streams and name not in OF_CAMERA)
+    started, frame = _started_exactly(log, prior)
+    blind = replace(started, streams={name: s for name, s in log.streams.items() if name not in OF_CAMERA})
+    with stages("smoother") as report:
+        result = run(blind, RunConfig("smoother", sensors=others, prior="log"), lambda share: report(share, 1.0))
+    return replace(log, reference=result.final, reference3=None), f"that of the start: {frame}", result.warnings
