@@ -50,8 +50,9 @@ def rich_table(content: Table) -> None:
 
 
 @contextmanager
-def progress(what: str, *, counted: bool) -> Iterator[Callable[[float, float], None]]:
-    """A bar on stderr while the block lasts, to be told how much is done of how much; silent where stderr is no terminal.
+def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
+    """A bar on stderr while the block lasts, to be told how much is done of how much, and a remark if there is one; silent where
+    stderr is no terminal.
 
     ``counted``: these are numbers of things, shown as such; else a percentage is shown.
     """
@@ -67,10 +68,10 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[[float, float], N
 
     console = Console(stderr=True)
     amount = MofNCompleteColumn() if counted else TaskProgressColumn()
-    columns = (TextColumn(what), BarColumn(), amount, TimeRemainingColumn())
+    columns = (TextColumn(what), BarColumn(), amount, TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task(what, total=None, remark="")
+        yield lambda done, total, remark="": bar.update(task, completed=done, total=total, remark=remark)
 
 
 def fields(content: Mapping[str, str]) -> None:

@@ -95,12 +95,9 @@ class SimulatedSource:
 
     def load_all(self) -> list[Log]:
         """The log, simulated."""
-        from factorgraph_loc.simulation import preset, read_settings, simulate  # noqa: PLC0415
+        from factorgraph_loc.simulation import named_settings, simulate  # noqa: PLC0415
 
-        changes = json.loads(self.settings)
-        is_file = self.preset.endswith(".toml")
-        settings = read_settings(Path(self.preset), changes) if is_file else preset(self.preset, changes)
-        return [simulate(settings, self.seed)]
+        return [simulate(named_settings(self.preset, json.loads(self.settings)), self.seed)]
 
     def load(self) -> Log:
         """The log."""

@@ -38,22 +38,26 @@ class Store:
         self.folder = folder / "store"
 
     def create(self) -> None:
-        """Make the folders, and remove what processes that died have left half-written."""
+        """Make the folders, and remove what processes that died have left behind."""
         with self._writing():
             for name in ("claims", "tmp"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
-        for rest in (self.folder / "tmp").iterdir():
-            with self.claim(rest.name) as mine:
+        self.sweep()
+
+    def sweep(self) -> None:
+        """Remove what processes that died have left behind: claims, and results that are half-written."""
+        for key in {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}:
+            with self.claim(key) as mine:
                 if mine:
-                    shutil.rmtree(rest, ignore_errors=True)
+                    shutil.rmtree(self.folder / "tmp" / key, ignore_errors=True)
 
     def path(self, key: str) -> Path:
         """The folder of a run."""
         return self.folder / key[:2] / key
 
     def state(self, key: str, *, thorough: bool = False) -> State:
-        """Whether results are there, and whole. Files of the right size that are older than their manifest are taken as they are;
-        others, and all if ``thorough``, are read and compared with their checksums."""
+        """Whether results are there, and whole. Trajectories of the right size that are older than their manifest are taken as
+        they are; other files, and all if ``thorough``, are read and compared with their checksums."""
         folder = self.path(key)
         try:
             manifest = json.loads((folder / MANIFEST).read_bytes())
@@ -62,7 +66,8 @@ class Store:
                 stat = (folder / name).stat()
                 if stat.st_size != said["bytes"]:
                     return "damaged"
-                if (thorough or stat.st_mtime_ns > written) and _sha256((folder / name).read_bytes()) != said["sha256"]:
+                doubtful = thorough or name in (METRICS, FAILURE) or stat.st_mtime_ns > written
+                if doubtful and _sha256((folder / name).read_bytes()) != said["sha256"]:
                     return "damaged"
             if manifest["key"] != key:
                 return "damaged"

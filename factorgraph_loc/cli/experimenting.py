@@ -1,0 +1,185 @@
+"""``fgloc experiment``: many runs of a file, with results that are kept and one page to read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import DataRoot, Json, key_and_value
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.experiments.experiment import Prepared
+
+MANY = 2000  # runs that are not planned by mistake
+SHOWN = 10  # failures; all are in the table
+
+app = typer.Typer(no_args_is_help=True, help="Many runs of a file: make them, see how far they are, report on them.")
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="The experiment: a TOML file.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Another value of a key of FILE; LABEL.KEY of an estimator, simulation.KEY of simulated logs; may be repeated.",
+    ),
+]
+OutFolder = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; else what FILE says.")
+]
+
+
+@app.command()
+def run(
+    file: File,
+    set_: Changes = None,
+    out: OutFolder = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run again what failed.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and how long they may take.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help=f"Yes, these are to be more than {MANY:,} runs.")] = False,
+    data_root: DataRoot = None,
+    json: Json = False,
+) -> None:
+    """Make the runs of an experiment whose results are not there yet; can be stopped and started again at any time."""
+    from factorgraph_loc.experiments.experiment import run_experiment
+
+    prepared = _prepared(file, set_, out, data_root)
+    if dry_run:
+        _print_plan(prepared, jobs, retry_failed, json)
+        return
+    if len(prepared.runs) > MANY and not yes:
+        raise InputError(
+            f"{file}: plans {len(prepared.runs):,} runs, more than {MANY:,}: give --yes if that is meant, --dry-run to see them"
+        )
+    try:
+        with show.progress("runs", counted=True) as bar:
+            done = run_experiment(
+                prepared,
+                jobs=jobs,
+                again=retry_failed,
+                progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
+            )
+    except KeyboardInterrupt:
+        show.note(f"stopped; what is done is in {prepared.folder}, the same command goes on")
+        raise
+    for failure in done.failures[:SHOWN]:
+        show.note(f"failed: {failure}")
+    if len(done.failures) > SHOWN:
+        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
+    if json:
+        show.document({"folder": str(prepared.folder), "runs": done.rows.to_dicts(), "failures": done.failures})
+    else:
+        header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
+        show.table(header, lines)
+        typer.echo(f"\nresults are in {prepared.folder}: results.parquet, store/")
+    if done.failures:
+        raise typer.Exit(1)
+
+
+@app.command()
+def status(
+    file: File,
+    set_: Changes = None,
+    out: OutFolder = None,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")] = False,
+    data_root: DataRoot = None,
+    json: Json = False,
+) -> None:
+    """How many runs of an experiment are done, have failed, are missing, or are damaged."""
+    prepared = _prepared(file, set_, out, data_root, verify=verify)
+    labels = list(dict.fromkeys(run.label for run in prepared.runs))
+    states = ("ok", "failed", "missing", "damaged")
+    by_label = {
+        label: [sum(r.label == label and prepared.states[r.key] == state for r in prepared.runs) for state in states]
+        for label in labels
+    }
+    failed = [run for run in prepared.runs if prepared.states[run.key] == "failed"]
+    reasons = [
+        {"log": run.log, "label": run.label, "seed": run.seed, **dict(run.sweep), **prepared.store.row(run.key)}
+        for run in failed
+    ]
+    if json:
+        counts = {label: dict(zip(states, numbers, strict=True)) for label, numbers in by_label.items()}
+        show.document({"folder": str(prepared.folder), "labels": counts, "failures": reasons})
+        return
+    total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
+    rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
+    show.table(["label", *states], rows)
+    for one in reasons:
+        typer.echo(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
+
+
+def _prepared(
+    file: Path, changes: list[str] | None, out: Path | None, data_root: Path | None, *, verify: bool = False
+) -> Prepared:
+    from factorgraph_loc.experiments.experiment import prepare
+
+    pairs = [key_and_value(text, "--set") for text in changes or ()]
+    return prepare(file, pairs, data_root=None if data_root is None else str(data_root), out=out, verify=verify)
+
+
+def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:
+    import os
+
+    from factorgraph_loc.experiments.experiment import estimate_seconds
+
+    todo = prepared.todo(again=again)
+    processes = jobs or os.cpu_count() or 1
+    seconds = estimate_seconds(todo, prepared.folder) / max(1, min(processes, len(todo)))
+    if json:
+        keys = ("log", "label", "estimator", "sensors", "prior", "seed", "sweep", "key")
+        runs = [{k: getattr(run, k) for k in keys} | {"state": prepared.states[run.key]} for run in prepared.runs]
+        show.document({"folder": str(prepared.folder), "runs": runs, "todo": len(todo), "seconds": seconds})
+        return
+    header = ("log", "label", "sensors", "seed", "sweep", "state")
+    show.table(
+        header,
+        [
+            (
+                run.log,
+                run.label,
+                "-" if run.sensors is None else ",".join(run.sensors),
+                str(run.seed),
+                ", ".join(f"{k}={v}" for k, v in run.sweep.items()) or "-",
+                prepared.states[run.key],
+            )
+            for run in prepared.runs
+        ],
+    )
+    typer.echo(
+        f"\n{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes"
+    )
+
+
+def _span(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """A line for each label, set of sensors and point of the sweep: of each metric the median, the least and the greatest."""
+    from statistics import median
+
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        swept = [f"{k.removeprefix('sweep.')}={v}" for k, v in row.items() if k.startswith("sweep.") and v is not None]
+        groups.setdefault(" ".join([row["label"], *([row["sensors"]] if row["sensors"] else []), *swept]), []).append(
+            row
+        )
+    lines = []
+    for name, members in groups.items():
+        good = [row for row in members if row["status"] == "ok"]
+        cells = []
+        for metric in metrics:
+            values = [row[metric] for row in good if row.get(metric) is not None]
+            cells.append(f"{median(values):.3f} ({min(values):.3f} to {max(values):.3f})" if values else "-")
+        lines.append([name, f"{len(good)} of {len(members)}", *cells])
+    return ["median (least to greatest)", "runs", *metrics], lines

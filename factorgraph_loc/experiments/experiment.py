@@ -1,0 +1,153 @@
+"""An experiment from its file to the table of its results; what is stored already is not run again."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.execute import Outcome
+from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
+from factorgraph_loc.experiments.plan import PlannedRun, plan
+from factorgraph_loc.experiments.pool import execute
+from factorgraph_loc.experiments.store import State, Store
+
+if TYPE_CHECKING:
+    import polars as pl
+
+PACE = 20.0  # s of a log in a second, where nothing is known of an estimator
+Executor = Callable[[Sequence[PlannedRun]], Iterator[Outcome]]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An experiment whose ``runs`` are planned; its results go to ``folder``, and ``states`` says what is there by key."""
+
+    experiment: Experiment
+    folder: Path
+    runs: list[PlannedRun]
+    states: dict[str, State]
+
+    @property
+    def store(self) -> Store:
+        """Where the results are."""
+        return Store(self.folder)
+
+    def todo(self, *, again: bool = False) -> list[PlannedRun]:
+        """The runs that are to be made; with ``again`` those that failed too."""
+        done = ("ok",) if again else ("ok", "failed")
+        return [run for run in self.runs if self.states[run.key] not in done]
+
+    def counts(self) -> Counter[State]:
+        """How many runs are ok, failed, missing and damaged."""
+        return Counter(self.states[run.key] for run in self.runs)
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came out: a row a run, see :func:`~factorgraph_loc.experiments.index.load_results`; a line for each failure."""
+
+    rows: pl.DataFrame
+    failures: list[str]
+
+
+def prepare(
+    file: Path,
+    changes: Sequence[tuple[str, Any]] = (),
+    *,
+    data_root: str | None = None,
+    out: Path | None = None,
+    verify: bool = False,
+) -> Prepared:
+    """Plan the experiment of a ``file`` with ``changes``, and look at what is stored; ``verify``: by all checksums.
+
+    InputError for what is wrong in the file, StoreError if the folder for results cannot be written.
+    """
+    experiment = read_experiment(file, changes)
+    folder = out or experiment.folder()
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, expected a folder for the results")
+    store = Store(folder)
+    store.create()
+    runs = plan(experiment, file.parent, store.folder, data_root)
+    states = {key: store.state(key, thorough=verify) for key in dict.fromkeys(run.key for run in runs)}
+    return Prepared(experiment, folder, runs, states)
+
+
+def run_experiment(
+    prepared: Prepared,
+    *,
+    jobs: int | None = None,
+    again: bool = False,
+    executor: Executor | None = None,
+    progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
+) -> Done:
+    """Make the runs that are not stored, with ``again`` those that failed too, and write the table of all results.
+
+    ``jobs``: processes, by default one per core; ``executor``: what makes the runs instead, and yields their outcomes.
+    ``progress`` is given the number of runs done, of all, and of failures. The table is written however this ends.
+    StoreError if the store cannot be written.
+    """
+    todo = prepared.todo(again=again)
+    states = dict(prepared.states)
+    waiting = {run.key for run in todo}
+    failed = sum(states[run.key] == "failed" and run.key not in waiting for run in prepared.runs)
+    done = len(prepared.runs) - len(todo)
+    progress(done, len(prepared.runs), failed)
+    limits = prepared.experiment.limits
+    outcomes = (
+        executor(todo)
+        if executor
+        else execute(todo, prepared.folder, jobs=jobs or os.cpu_count() or 1, limits=limits, again=again)
+    )
+    try:
+        for outcome in outcomes if todo else ():
+            states[outcome.key] = outcome.status if outcome.status != "busy" else "missing"
+            done, failed = done + 1, failed + (outcome.status == "failed")
+            progress(done, len(prepared.runs), failed)
+    finally:
+        rows = _write_rows(prepared, states)
+    return Done(rows, [_failure(row) for row in rows.iter_rows(named=True) if row["status"] == "failed"])
+
+
+def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
+    """How long the runs take one after the other [s]: as those of the same estimator did, by duration of the log, else a guess."""
+    from factorgraph_loc.experiments.index import load_results  # noqa: PLC0415
+
+    columns = ["label", "estimator", "log", "timing.run_seconds", "duration"]
+    try:
+        rows = load_results(folder)
+    except InputError:
+        return sum(run.duration / PACE for run in runs)
+    rows = rows.select(c for c in columns if c in rows.columns).drop_nulls()
+    known: dict[tuple[str, str], list[float]] = {}
+    for label, estimator, log, seconds, duration in rows.iter_rows() if rows.width == len(columns) else ():
+        for like in ((label, log), (label, ""), (estimator, "")):
+            known.setdefault(like, []).append(seconds / max(duration, 1e-9))
+    total = 0.0
+    for run in runs:
+        paces = next(
+            (known[k] for k in ((run.label, run.log), (run.label, ""), (run.estimator, "")) if k in known), None
+        )
+        total += run.duration * (median(paces) if paces else 1.0 / PACE)
+    return total
+
+
+def _write_rows(prepared: Prepared, states: dict[str, State]) -> pl.DataFrame:
+    from factorgraph_loc.experiments.index import collect, write_index  # noqa: PLC0415
+
+    rows = collect((run for run in prepared.runs if states[run.key] in ("ok", "failed")), prepared.store)
+    write_index(rows, prepared.folder)
+    return rows
+
+
+def _failure(row: dict[str, Any]) -> str:
+    swept = "".join(
+        f", {k.removeprefix('sweep.')} {v}" for k, v in row.items() if k.startswith("sweep.") and v is not None
+    )
+    return f"{row['log']}, {row['label']}{swept}, seed {row['seed']}: {row['reason']}"

@@ -1,0 +1,69 @@
+"""All results of an experiment in one table, a row a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.experiments.store import Store, StoreError
+from factorgraph_loc.files import replacing
+
+INDEX = "results.parquet"
+SWEEP = "sweep."
+TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key"}
+
+
+def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
+    """The rows of those runs whose results are stored; see :func:`load_results`. InputError for a damaged one."""
+    rows = [_row(run, store.row(run.key)) for run in runs]
+    keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
+    table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
+    nothing = {
+        name: pl.String if name in TEXTS else pl.Float64 for name, kind in table.schema.items() if kind == pl.Null
+    }
+    return table.cast(nothing)  # type: ignore[arg-type]
+
+
+def write_index(table: pl.DataFrame, folder: Path) -> None:
+    """Write the table into ``folder``, at once or not at all; StoreError where it cannot be written."""
+    try:
+        with replacing(folder / INDEX) as temporary:
+            table.write_parquet(temporary)
+    except OSError as error:
+        raise StoreError(f"{folder / INDEX}: cannot be written: {error.strerror or error}") from error
+
+
+def load_results(path: str | Path) -> pl.DataFrame:
+    """The results of an experiment in the folder ``path``, a row a run.
+
+    Columns: ``label``, ``log``, ``estimator``, ``sensors`` (with commas; null for those of the rig), ``prior``, ``seed``,
+    ``sweep.KEY`` of each swept setting (null where it does not concern the run), ``status`` (ok, failed), ``kind`` (error, timeout,
+    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, and the scores of
+    :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). InputError if there are no results.
+    """
+    file = Path(path) / INDEX if Path(path).is_dir() else Path(path)
+    try:
+        return pl.read_parquet(file)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"{file}: cannot be read: {error}; `fgloc experiment run` writes it anew") from error
+
+
+def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "label": run.label,
+        "log": run.log,
+        "estimator": run.estimator,
+        "sensors": None if run.sensors is None else ",".join(run.sensors),
+        "prior": run.prior,
+        "seed": run.seed,
+        **{f"{SWEEP}{key}": value for key, value in run.sweep.items()},
+        **{name: found.pop(name) for name in ("status", "kind", "reason")},
+        "key": run.key,
+        "duration": run.duration,
+        **found,
+    }

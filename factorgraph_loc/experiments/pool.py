@@ -1,0 +1,217 @@
+"""Planned runs in processes of this machine: each worker makes many, so that a short run does not wait for imports.
+
+A run that takes too long or too much memory is ended with its process, and stored as failed; the others go on.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+
+from factorgraph_loc.experiments import worker
+from factorgraph_loc.experiments.execute import Kind, Outcome, store_failure
+from factorgraph_loc.experiments.experiment_file import Limits
+from factorgraph_loc.experiments.log_source import LogSource
+from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.experiments.processes import ProcessDiedError
+from factorgraph_loc.experiments.store import Store
+from factorgraph_loc.experiments.threads import use_one_thread
+
+LOOK = 0.1  # s between looks at memory and time
+AGAIN = 0.5  # s after which a run that another process had claimed is asked for again
+ATTEMPTS = 2  # a process can be killed for what others use; a run whose process dies twice is to blame itself
+SHARE = 0.9  # of the machine's memory, for all workers together
+
+
+@dataclass
+class _Worker:
+    process: multiprocessing.process.BaseProcess
+    connection: Connection
+    ready: bool = False
+    run: PlannedRun | None = None
+    source: LogSource | None = None  # of its last run: that log is loaded there
+    since: float = 0.0
+
+
+@dataclass
+class _Queue:
+    """What is to be run; a worker gets runs of the log that it has, else of one that no other has."""
+
+    runs: dict[LogSource, list[PlannedRun]] = field(default_factory=dict)
+    later: list[tuple[float, PlannedRun]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs.values())) + len(self.later)
+
+    def add(self, run: PlannedRun) -> None:
+        self.runs.setdefault(run.source, []).append(run)
+
+    def next(self, own: LogSource | None, taken: Sequence[LogSource]) -> PlannedRun | None:
+        """The next run for a worker whose log is ``own``, while others have those ``taken``."""
+        while self.later and self.later[0][0] <= time.monotonic():
+            self.add(self.later.pop(0)[1])
+        if not self.runs:
+            return None
+        free = [source for source in self.runs if source not in taken]
+        most = max(self.runs, key=lambda source: len(self.runs[source]))
+        chosen = own if own in self.runs else free[0] if free else most
+        assert chosen is not None
+        run = self.runs[chosen].pop(0)
+        if not self.runs[chosen]:
+            del self.runs[chosen]
+        return run
+
+
+def execute(
+    runs: Sequence[PlannedRun], folder: Path, *, jobs: int, limits: Limits, again: bool = False
+) -> Iterator[Outcome]:
+    """Make ``runs`` in ``jobs`` processes, store them below ``folder``, and yield outcomes as they come.
+
+    ``again``: stored failures are tried again. When the caller stops listening, the processes end at once, and what they had not
+    stored is not. The processes are spawned, so a script needs the usual ``if __name__ == "__main__"``. StoreError if the store
+    cannot be written, ProcessDiedError if no process can be started.
+    """
+    pool = _Pool(folder, limits, again, min(jobs, len(runs)))
+    for run in runs:
+        pool.queue.add(run)
+    try:
+        yield from pool.outcomes()
+    finally:
+        pool.close()
+
+
+class _Pool:
+    def __init__(self, folder: Path, limits: Limits, again: bool, jobs: int) -> None:
+        self.queue = _Queue()
+        self._folder, self._again = folder, again
+        self._time = limits.time
+        self._memory = limits.memory * 1e6 if limits.memory is not None else SHARE * _machine_memory() / max(jobs, 1)
+        self._deaths: Counter[str] = Counter()
+        self._stillborn = 0
+        self._workers = [self._start() for _ in range(jobs)]
+
+    def outcomes(self) -> Iterator[Outcome]:
+        while self.queue or any(w.run for w in self._workers):
+            for w in self._workers:
+                if w.ready and w.run is None:
+                    self._assign(w)
+            ready = wait([w.connection for w in self._workers], LOOK)
+            for i, w in enumerate(self._workers):
+                failure = None
+                if w.connection in ready:
+                    try:
+                        message = w.connection.recv()
+                    except (EOFError, OSError):
+                        failure = self._died(w)
+                    else:
+                        yield from self._heard(w, message)
+                        continue
+                elif not (failure := self._too_much(w)):
+                    continue
+                w.process.kill()
+                w.process.join()
+                w.connection.close()
+                self._workers[i] = self._start()
+                if w.run is not None and failure is not None:
+                    yield from self._settle(w.run, store_failure(w.run, self._folder, *failure))
+
+    def close(self) -> None:
+        for w in self._workers:
+            w.process.kill()
+        for w in self._workers:
+            w.process.join()
+        Store(self._folder).sweep()
+
+    def _start(self) -> _Worker:
+        use_one_thread()
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe()
+        process = context.Process(target=worker.serve, args=(there, self._folder, self._again), daemon=True)
+        with _without_interrupts():
+            process.start()
+        there.close()
+        return _Worker(process, here)
+
+    def _assign(self, w: _Worker) -> None:
+        others = [o.source for o in self._workers if o is not w and o.run is not None and o.source is not None]
+        run = self.queue.next(w.source, others)
+        if run is not None:
+            w.run, w.source, w.since = run, run.source, time.monotonic()
+            with suppress(OSError):  # it has died, which the next look tells
+                w.connection.send(run)
+
+    def _heard(self, w: _Worker, message: object) -> Iterator[Outcome]:
+        if message == worker.READY:
+            w.ready, self._stillborn = True, 0
+            return
+        if isinstance(message, Exception):
+            raise message
+        assert isinstance(message, Outcome)
+        assert w.run is not None
+        run, w.run = w.run, None
+        yield from self._settle(run, message)
+
+    def _settle(self, run: PlannedRun, outcome: Outcome) -> Iterator[Outcome]:
+        if outcome.status == "busy":
+            self.queue.later.append((time.monotonic() + AGAIN, run))
+        else:
+            yield outcome
+
+    def _died(self, w: _Worker) -> tuple[Kind, str] | None:
+        """What the death of a worker says about its run; None if it is tried once more."""
+        if not w.ready:
+            self._stillborn += 1
+            if self._stillborn >= ATTEMPTS:
+                raise ProcessDiedError(
+                    "a worker process ended before it began; a script needs `if __name__ == '__main__'`"
+                )
+        if w.run is None:
+            return None
+        self._deaths[w.run.key] += 1
+        if self._deaths[w.run.key] < ATTEMPTS:
+            self.queue.add(w.run)
+            return None
+        return "killed", f"its process died without a word, {ATTEMPTS} times (killed, or a crash in native code)"
+
+    def _too_much(self, w: _Worker) -> tuple[Kind, str] | None:
+        if w.run is None:
+            return None
+        if time.monotonic() - w.since > self._time:
+            return "timeout", f"it took more than {self._time:g} s"
+        if _resident(w.process.pid) > self._memory:
+            return "memory", f"its process held more than {self._memory / 1e6:.0f} MB"
+        return None
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes that start meanwhile ignore an interrupt from the keyboard from their first moment on."""
+    try:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:  # not the main thread: only that one may choose
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _machine_memory() -> float:
+    return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _resident(pid: int | None) -> float:
+    """Bytes that a process holds; 0 where the system does not tell."""
+    try:
+        return float(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError):
+        return 0.0
