@@ -40,7 +40,7 @@ class ActiveRun:
 
     ``localized``: it knew where it was, and truly, after ``metres`` [m] and ``seconds`` [s], with ``error_position`` [m] and
     ``error_heading`` [rad]; otherwise these are those at the end. ``claimed_wrong``: at some time it said that it knew, and was
-    wrong. ``truth``: where it went. ``steps``: its choices.
+    wrong by more than three times the limits. ``truth``: where it went. ``steps``: its choices.
     """
 
     seed: int

@@ -2,12 +2,40 @@
 
 from __future__ import annotations
 
-from factorgraph_loc.planning.active_run import ActiveRun
-from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.simulation.settings import SimulationSettings
+import math
+from collections.abc import Iterator
+from time import perf_counter
 
-POLICIES = ("information", "paper_literal", "random", "patrol", "nearest_tags")
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.estimators.base import Belief, Estimator
+from factorgraph_loc.estimators.cloud import systematic
+from factorgraph_loc.files import nearest
+from factorgraph_loc.measurements import Measurement, RfidScan
+from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
+from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
+from factorgraph_loc.planning.paths import Path, primitives
+from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
+from factorgraph_loc.planning.robot import SimulatedRobot
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation.free_space import CELL, FreeSpace, distance_to_walls, free_space
+from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
+from factorgraph_loc.simulation.simulate import generators
+from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.world import World
+from factors import se2
+from factors.rfid_likelihood import RfidLikelihood
+from factors.se2 import Array
+
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
+SHOWN = 300  # particles of a belief that are kept
+SPREAD = 2000  # poses that stand for a belief without particles
+WRONG = 3.0  # times the limits: an error that is no bad luck
+PAUSE = 1.0  # s that a robot waits that cannot go anywhere
+SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
 
 
 def run_active(
@@ -18,4 +46,165 @@ def run_active(
     Runs of one seed share world, start, and all draws of noise, whatever the policy and the estimator. InputError names a wrong
     policy, estimator or start.
     """
-    raise NotImplementedError
+    settings = settings or ActiveSettings()
+    if simulation.faults != FaultSettings():
+        raise InputError(f"{simulation.name}: has faults, expected none: they are not part of active runs")
+    chooser = make_policy(policy)
+    world = make_world(
+        simulation.world, generators(seed if simulation.world_seed is None else simulation.world_seed)[0]
+    )
+    space = free_space(world, settings.clearance)
+    of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
+    start = _start(world, space, settings, of_start)
+    robot = SimulatedRobot(
+        world, simulation.rig, simulation.rounds_per_second, start, settings, int(of_robot.integers(2**32))
+    )
+    setup = registry.Setup(simulation.rig, world, ("odometry", "rfid"), of_estimator)
+    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, of_policy)
+    localized = loop.run()
+    position, heading = loop.errors()
+    return ActiveRun(
+        seed=seed,
+        preset=simulation.name,
+        world=world,
+        policy=policy,
+        estimator=estimator,
+        localized=localized,
+        metres=robot.metres,
+        seconds=robot.t,
+        error_position=position,
+        error_heading=heading,
+        claimed_wrong=loop.claimed_wrong,
+        truth=robot.trajectory(),
+        steps=tuple(loop.steps),
+    )
+
+
+class _Loop:
+    """Propose, predict, choose, move, and update by what was really read."""
+
+    def __init__(
+        self,
+        robot: SimulatedRobot,
+        estimator: Estimator,
+        policy: Policy,
+        setup: registry.Setup,
+        space: FreeSpace,
+        settings: ActiveSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.steps: list[PlanningStep] = []
+        self.claimed_wrong = False
+        self._robot, self._estimator, self._policy = robot, estimator, policy
+        self._space, self._settings, self._rng = space, settings, rng
+        self._paths = primitives(settings.policy.horizon)
+        tags = tag_map(setup.world, setup.rig.survey).tags
+        assert setup.rig.rfid is not None, "the settings have been checked"
+        self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if len(tags.points) else None
+
+    def run(self) -> bool:
+        """Whether the robot found out where it is."""
+        robot, settings = self._robot, self._settings
+        done = self._take(robot.begin())
+        while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:
+            choice = self._choose()
+            before = robot.t
+            if choice.path is not None:
+                metres = min(choice.metres, settings.max_metres - robot.metres)
+                done = self._take(robot.drive(choice.path.poses, metres))
+            if robot.t == before:
+                done = self._take(robot.wait(PAUSE))
+        return done
+
+    def errors(self) -> tuple[float, float]:
+        """Of the estimate, in position [m] and heading [rad]; not a number where there is none."""
+        error = self._estimator.estimate().pose - self._robot.pose
+        return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
+
+    def _take(self, reports: Iterator[Measurement]) -> bool:
+        """Whether the place is known, and truly, on the way of these reports."""
+        for report in reports:
+            self._estimator.process(report)
+            if isinstance(report, RfidScan) and self._is_sure():
+                position, heading = self.errors()
+                if position < self._settings.position_limit and heading < self._settings.heading_limit:
+                    return True
+                beyond = max(position / self._settings.position_limit, heading / self._settings.heading_limit)
+                self.claimed_wrong |= beyond > WRONG
+        return False
+
+    def _is_sure(self) -> bool:
+        estimate = self._estimator.estimate()
+        if estimate.status != "localized":
+            return False
+        position = math.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1])
+        heading = math.sqrt(estimate.covariance[2, 2])
+        return position < self._settings.position_limit and heading < self._settings.heading_limit
+
+    def _choose(self) -> Choice:
+        particles, weights = _sampled(self._estimator.belief(), self._space, self._rng)
+        started = perf_counter()
+        paths, free = usable(self._paths, self._robot.free_ahead(self._space, self._paths))
+        situation = Situation(particles, weights, self._likelihood, self._space, paths, free, self._settings, self._rng)
+        choice = self._policy.choose(situation)
+        elapsed = 1e3 * (perf_counter() - started)
+        estimate = self._estimator.estimate()
+        self.steps.append(
+            PlanningStep(
+                t=self._robot.t,
+                metres=self._robot.metres,
+                truth=self._robot.pose.copy(),
+                pose=estimate.pose,
+                covariance=estimate.covariance,
+                particles=particles[systematic(weights, self._rng, min(SHOWN, len(weights)))],
+                candidates=tuple(self._in_world(path) for path in paths),
+                values=choice.values,
+                chosen=None if choice.path is None else self._in_world(choice.path),
+                planning_ms=elapsed,
+            )
+        )
+        return choice
+
+    def _in_world(self, path: Path) -> Array:
+        return np.asarray(se2.compose(self._robot.pose, path.poses))
+
+
+def _estimator(name: str, setup: registry.Setup, settings: ActiveSettings) -> Estimator:
+    if name == "active_mcl":
+        space = free_space(setup.world, max(settings.clearance - SLACK, 0.0))
+        return ActiveMcl(setup, ActiveMclSettings(particles=settings.particles), space)
+    if name not in ESTIMATORS:
+        raise InputError(f"no estimator of active runs is called {name!r}{nearest(name, list(ESTIMATORS))}")
+    return registry.create(name, setup, registry.settings_of(name, {}))
+
+
+def _start(world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
+    """The true pose (3,) at first."""
+    place = space.centres[rng.integers(len(space.centres))] + CELL * (rng.random(2) - 0.5)
+    drawn = np.array((*place, rng.uniform(-math.pi, math.pi)))
+    if settings.start is None:
+        return drawn
+    x, y, _ = settings.start
+    walls = np.array(world.walls).reshape(-1, 2)
+    gap = float(distance_to_walls(world, np.array(((x, y),)))[0])
+    if gap < settings.clearance or not np.all(((x, y) > walls.min(axis=0)) & ((x, y) < walls.max(axis=0))):
+        raise InputError(
+            f"{world.name}: start ({x:g}, {y:g}) is in a wall or {gap:.2f} m from one, expected a place between the walls, "
+            f"at least {settings.clearance:g} m from all"
+        )
+    return np.array(settings.start)
+
+
+def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A belief as particles (M, 3) with weights (M,): its own, or drawn from its modes; before it has any, from free space."""
+    if belief.particles is not None and belief.weights is not None and len(belief.particles):
+        return belief.particles, belief.weights
+    even = np.full(SPREAD, 1.0 / SPREAD)
+    modes = [m for m in belief.modes if np.all(np.isfinite(m.covariance))]
+    if not modes:
+        rows = rng.integers(len(space.centres), size=SPREAD)
+        return np.column_stack((space.centres[rows], rng.uniform(-math.pi, math.pi, SPREAD))), even
+    shares = np.array([m.weight for m in modes])
+    counts = rng.multinomial(SPREAD, shares / shares.sum())
+    drawn = [rng.multivariate_normal(m.pose, m.covariance, n) for m, n in zip(modes, counts, strict=True)]
+    return np.concatenate(drawn), even

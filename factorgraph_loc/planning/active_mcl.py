@@ -1,0 +1,140 @@
+"""ActiveMCL, the paper's Algorithm 2, with one particle filter.
+
+As it is printed, each action has particles of its own that are weighed by a scan that was not made, and the index m is both the map
+and the particle. Here one step is: propose ways; predict for each what would be read along it, drawn from the model of the
+antennas, and what would be left of the entropy; choose; move; and update the particles once, by what was really read. The first
+three are :mod:`~factorgraph_loc.planning.policies`, the loop is :mod:`~factorgraph_loc.planning.closed_loop`, and the particles are
+here.
+
+They begin evenly over free space. A scan is weighed a share at a time, with resampling from a kernel density in between
+(progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
+from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
+from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.estimators.tags import KnownTags
+from factorgraph_loc.measurements import BearingRange, RfidScan
+from factorgraph_loc.simulation.free_space import CELL, FreeSpace
+from factorgraph_loc.trajectory import Trajectory
+from factors import se2
+from factors.odometry import Increment
+from factors.se2 import Array
+
+RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
+OUTSIDE = -2.0  # log-weight per motion of a particle that is where no robot can be
+KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
+LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
+ONE_PLACE = 1.0  # m: largest standard deviation of a place
+
+
+class ActiveMclSettings(FilterSettings):
+    """``particles``: their number."""
+
+    particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
+
+
+class ActiveMcl(Filter):
+    """The particles of ActiveMCL; see the module. ``space``: where the robot may be."""
+
+    deterministic = False
+    supports_unknown_start = True
+    takes_scans = True
+    _state: Cloud
+
+    def __init__(self, setup: Setup, settings: ActiveMclSettings, space: FreeSpace) -> None:
+        super().__init__(setup, settings)
+        self._count, self._rng, self._space = settings.particles, setup.rng, space
+        self._tags = KnownTags(setup, self.diagnostics)
+
+    def belief(self) -> Belief:
+        """The particles with their weights, and their modes."""
+        if self._state is None:
+            return Belief(())
+        return Belief(self._state.modes(), self._state.poses, self._state.weights)
+
+    def trajectory(self) -> Trajectory:
+        """The same as the causal estimates."""
+        poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
+        covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
+        times = np.array([r.t for r in self._records])
+        return at_ticks(self._ticks, times, poses, se2.world_to_body(poses, covariances))
+
+    def _start(self, prior: PosePrior) -> Cloud:
+        return _cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._count))
+
+    def _seek(self, m: object) -> Cloud:
+        """Evenly over free space and all headings."""
+        cells = np.floor((np.arange(self._count) + self._rng.random()) * len(self._space.centres) / self._count)
+        places = self._space.centres[cells.astype(np.int64)] + CELL * (self._rng.random((self._count, 2)) - 0.5)
+        # a sequence of low discrepancy, so that neighbours look everywhere (golden ratio)
+        shares = (np.arange(self._count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
+        state = _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
+        return self._weighed(state, m) if isinstance(m, RfidScan) else state
+
+    def _predict(self, increment: Increment) -> None:
+        noise = self._rng.standard_normal(self._state.poses.shape) @ np.linalg.cholesky(increment.covariance).T
+        poses = se2.compose(se2.compose(self._state.poses, increment.delta), se2.exp(noise))
+        outside = np.where(self._space.cells(poses[:, :2]) >= 0, 0.0, OUTSIDE)
+        self._state = replace(self._state, poses=poses, log_weights=normalised(self._state.log_weights + outside))
+
+    def _update(self, m: BearingRange) -> None:
+        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+
+    def _scan(self, m: RfidScan) -> None:
+        self._state = self._weighed(self._state, m)
+
+    def _weighed(self, cloud: Cloud, m: RfidScan) -> Cloud:
+        looks, likelihood = self._tags.looks(m), self._tags.likelihood
+        if looks is None or likelihood is None:
+            return cloud
+        left = 1.0
+        while left > 0.0:
+            log_likelihood = likelihood.log_likelihood(cloud.poses, looks)
+            enough = ENOUGH * effective_size(cloud.log_weights)
+            share = largest_share(cloud.log_weights, log_likelihood, left, enough)
+            cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * log_likelihood))
+            left -= share
+            if effective_size(cloud.log_weights) < RESAMPLE_BELOW * self._count:
+                rows = systematic(cloud.weights, self._rng, self._count)
+                cloud = _cloud(_drawn(cloud.poses, rows, self._rng))
+        return cloud
+
+    def _estimate(self) -> PoseEstimate:
+        pose, covariance = self._state.moments
+        one = np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2
+        return PoseEstimate(self._t, pose, covariance, "localized" if one else "ambiguous")
+
+    def _record(self) -> PoseEstimate:
+        return self._estimate()
+
+
+def _drawn(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Particles (K, 3) drawn from kernels on the particles ``rows`` (K,) of ``poses`` (N, 3).
+
+    Each kernel is as wide as befits the distance to the particles that are next to it: of many few are left where a scan tells
+    much, and what lies between them would be lost.
+    """
+    different, which = np.unique(rows, return_inverse=True)
+    kept = poses[different]
+    places = np.column_stack((kept[:, :2], LEVER * np.cos(kept[:, 2]), LEVER * np.sin(kept[:, 2])))
+    gaps, _ = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))
+    width = np.minimum(KERNEL * gaps[:, -1], WIDEST)[which]
+    noise = rng.standard_normal((len(rows), 3)) * np.column_stack((width, width, width / LEVER))
+    return se2.compose(poses[rows], se2.exp(noise))
+
+
+def _cloud(poses: Array) -> Cloud:
+    return Cloud(poses, np.zeros((len(poses), 0)), np.full(len(poses), -math.log(len(poses))), localized=False)

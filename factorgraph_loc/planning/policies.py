@@ -1,0 +1,175 @@
+"""Policies: which way a robot that does not know its place should go.
+
+``information``: the way of which the largest fall of the belief's entropy is expected, the entropy before minus the expected one
+after, less what the way costs. ``paper_literal``: the same with the sign as it is printed, the entropy after minus that before,
+which picks what tells least. ``random``, ``patrol`` and ``nearest_tags`` are what to compare with.
+
+All are given the same ways, those of which the robot's proximity sensor finds the first metre free.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import nearest
+from factorgraph_loc.planning.information import expected_gain
+from factorgraph_loc.planning.paths import STEP, Path
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation.free_space import FreeSpace
+from factors import se2
+from factors.rfid_likelihood import RfidLikelihood
+from factors.se2 import Array
+
+NOTHING = 1e-3  # nats: an expected gain that is none
+AHEAD = 1.0  # m that must be free
+BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
+NEAR = 3  # tags that tell a place
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), the map's tags by ``likelihood`` (None without
+    any), where walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees."""
+
+    particles: Array
+    weights: Array
+    likelihood: RfidLikelihood | None
+    space: FreeSpace
+    candidates: tuple[Path, ...]
+    free: Array
+    settings: ActiveSettings
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, if they are compared."""
+
+    path: Path | None
+    metres: float
+    values: Array
+
+
+class Policy(Protocol):
+    """Chooses a way."""
+
+    def choose(self, situation: Situation) -> Choice: ...
+
+
+class Information:
+    """By expected information; ``sign`` -1: as the paper prints it."""
+
+    def __init__(self, sign: float = 1.0) -> None:
+        self._sign = sign
+        self._otherwise = Patrol()
+
+    def choose(self, situation: Situation) -> Choice:
+        s, settings = situation, situation.settings.policy
+        if s.likelihood is None or not s.candidates:
+            return self._otherwise.choose(s)
+        gains = expected_gain(
+            s.likelihood,
+            s.particles,
+            s.weights,
+            s.candidates,
+            s.rng,
+            dims=settings.dimensions,
+            samples=settings.samples,
+            space=s.space,
+        )
+        if np.max(np.abs(gains)) < NOTHING:
+            return self._otherwise.choose(s)
+        rates = s.settings.speed, s.settings.turn_rate
+        costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
+        values = self._sign * gains - np.array(costs)
+        return Choice(s.candidates[int(np.argmax(values))], settings.replan, values)
+
+
+class Random:
+    """Any of the ways, to its end."""
+
+    def choose(self, situation: Situation) -> Choice:
+        if not situation.candidates:
+            return Choice(None, 0.0, np.empty(0))
+        path = situation.candidates[int(situation.rng.integers(len(situation.candidates)))]
+        return Choice(path, path.length, np.empty(0))
+
+
+class Patrol:
+    """Straight on until a wall is near, then to where most is free; back only where nothing else is."""
+
+    def choose(self, situation: Situation) -> Choice:
+        straight = [(i, p) for i, p in enumerate(situation.candidates) if _is_straight(p)]
+        if not straight:
+            return Choice(None, 0.0, np.empty(0))
+        turns = np.array([abs(_direction(p)) for _, p in straight])
+        free = situation.free[[i for i, _ in straight]]
+        if turns.min() < 1e-6 and free[turns.argmin()] > AHEAD:
+            best = int(turns.argmin())
+        else:
+            # the freest, and of those that are as free the one that is turned to soonest
+            best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
+        direction = _direction(straight[best][1])
+        way = situation.settings.max_metres
+        along = np.arange(0.0, way + STEP, STEP)
+        poses = np.column_stack(
+            (along * math.cos(direction), along * math.sin(direction), np.full(len(along), direction))
+        )
+        if direction != 0.0:
+            poses = np.concatenate((np.zeros((1, 3)), poses))
+        return Choice(Path(poses, "patrol"), way, np.empty(0))
+
+
+class NearestTags:
+    """Towards where the nearest tags are nearest, in the mean of the belief."""
+
+    def choose(self, situation: Situation) -> Choice:
+        s = situation
+        if s.likelihood is None or not s.candidates:
+            return Patrol().choose(s)
+        rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
+        ends = np.array([p.poses[-1] for p in s.candidates])
+        places = se2.compose(s.particles[rows][:, None], ends[None])[..., :2]
+        gaps = np.linalg.norm(places[:, :, None] - s.likelihood.tags.points[:, :2], axis=3)
+        count = min(NEAR, gaps.shape[2])
+        values = -np.sort(gaps, axis=2)[..., :count].mean(axis=(0, 2))
+        return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
+
+
+POLICIES = ("information", "paper_literal", "random", "patrol", "nearest_tags")
+
+
+def make_policy(name: str) -> Policy:
+    """A policy by name; InputError names a wrong one."""
+    if name not in POLICIES:
+        raise InputError(f"no policy is called {name!r}{nearest(name, list(POLICIES))}")
+    made: dict[str, Policy] = {
+        "information": Information(),
+        "paper_literal": Information(sign=-1.0),
+        "random": Random(),
+        "patrol": Patrol(),
+        "nearest_tags": NearestTags(),
+    }
+    return made[name]
+
+
+def usable(paths: Sequence[Path], free: Array) -> tuple[tuple[Path, ...], Array]:
+    """The ways whose first metre is free, with how far they are."""
+    keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length) - 1e-9]
+    return tuple(paths[i] for i in keep), free[keep]
+
+
+def _direction(path: Path) -> float:
+    """Where a straight way leads [rad], from where the robot looks."""
+    return math.atan2(*path.poses[-1, 1::-1].tolist())
+
+
+def _is_straight(path: Path) -> bool:
+    x, y = path.poses[-1, :2]
+    return path.length > AHEAD - 1e-9 and math.hypot(x, y) > path.length - 1e-6

@@ -1,0 +1,133 @@
+"""A simulated robot that drives as it is told, by its own odometry, and hears tags on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from factorgraph_loc.measurements import IncrementOdometry, RfidScan
+from factorgraph_loc.planning.paths import Path, free_steps
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.readers import simulated_odometry as wheels
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.free_space import CELL, FreeSpace
+from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import se2
+from factors.rfid_likelihood import RfidLikelihood
+from factors.se2 import Array
+
+PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
+TOUCH = 1e-6  # m: a robot that is too near a wall may go as long as it comes no nearer
+
+
+class SimulatedRobot:
+    """The robot at its true place; see the module.
+
+    Its wheels err as :func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry` says: what it is told is what they report,
+    and what it does is what differs. Draws belong to the number of the odometry's row and of the inventory round, so that
+    robots of one seed have the same luck wherever they drive.
+    """
+
+    def __init__(
+        self, world: World, rig: Rig, rounds_per_second: float, start: Array, settings: ActiveSettings, seed: int
+    ) -> None:
+        assert rig.rfid is not None, "the settings have been checked"
+        self.pose = np.array(start, dtype=float)
+        self.t = 0.0
+        self.metres = 0.0
+        self.blocked = False
+        self._settings = settings
+        # free cells are those whose middle keeps the clearance
+        self._nearest = settings.clearance - CELL / math.sqrt(2.0)
+        self._walls = np.array(world.walls).reshape(-1, 4)
+        self._antennas = tuple(rig.rfid.all_antennas())
+        self._map = tag_map(world, rig.survey)
+        self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
+        self._round, self._rounds_per_second = 0, rounds_per_second
+        constants, self._noise, self._reads = np.random.default_rng(seed).spawn(3)
+        self._scale, self._drift, self._scale_of_turns = constants.normal(
+            0.0, (wheels.SCALE_SIGMA, wheels.DRIFT_SIGMA, wheels.SCALE_SIGMA)
+        )
+        self._truth = [(0.0, *self.pose.tolist())]
+
+    def trajectory(self) -> Trajectory:
+        """Where it really went."""
+        rows = np.array(self._truth)
+        return Trajectory(rows[:, 0], rows[:, 1:])
+
+    def begin(self) -> Iterator[IncrementOdometry | RfidScan]:
+        """What it reports before it has moved: a row of odometry without motion, and a first round."""
+        yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
+        yield self._scan()
+
+    def free_ahead(self, space: FreeSpace, paths: Sequence[Path]) -> Array:
+        """How far [m] (C,) each of C ways can be gone, as far as the proximity sensor sees."""
+        steps = free_steps(space, self.pose[None], paths)[:, 0]
+        way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
+        return np.asarray(np.minimum(way, self._settings.sight))
+
+    def drive(self, path: Array, metres: float) -> Iterator[IncrementOdometry | RfidScan]:
+        """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""
+        self.blocked = False
+        for told in self._told(path, metres):
+            n1, n2, n3 = self._noise.standard_normal(3)
+            root = math.sqrt(math.hypot(told[0], told[1]))
+            dx = (told[0] - wheels.ALONG * root * n1) / (1.0 + self._scale)
+            dy = (told[1] - wheels.LATERAL * root * n2) / (1.0 + self._scale)
+            drifted = self._drift * math.hypot(dx, dy) + wheels.HEADING * root * n3
+            moved = np.array((dx, dy, (told[2] - drifted) / (1.0 + self._scale_of_turns)))
+            there = se2.compose(self.pose, moved)
+            if root > 0.0 and self._distance(there) < min(self._nearest, self._distance(self.pose) - TOUCH):
+                self.blocked = True
+                return
+            self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
+            yield from self._passed(told)
+
+    def wait(self, seconds: float) -> Iterator[IncrementOdometry | RfidScan]:
+        """Stand still."""
+        for _ in range(max(1, round(seconds / PERIOD))):
+            yield from self._passed(np.zeros(3))
+
+    def _passed(self, told: Array) -> Iterator[IncrementOdometry | RfidScan]:
+        """The reports of one period."""
+        self.t = round(self.t + PERIOD, 6)
+        self._truth.append((self.t, *self.pose.tolist()))
+        yield IncrementOdometry(self.t, float(told[0]), float(told[1]), float(told[2]))
+        if self.t * self._rounds_per_second >= self._round - 1e-6:
+            yield self._scan()
+
+    def _told(self, path: Array, metres: float) -> Array:
+        """Motions (N, 3) of one period each along a way, each in the robot's frame before it."""
+        twists = se2.log(se2.between(path[:-1], path[1:]))
+        lengths = np.hypot(twists[:, 0], twists[:, 1])
+        seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)
+        keep = (seconds > 1e-9) & (np.cumsum(lengths) - lengths < metres - 1e-9)
+        if not keep.any():
+            return np.empty((0, 3))
+        poses = np.concatenate((path[:1], path[1:][keep]))
+        way = Trajectory(np.concatenate((np.zeros(1), np.cumsum(seconds[keep]))), poses)
+        times = np.append(np.arange(0.0, way.t[-1] - 1e-6, PERIOD), way.t[-1])
+        at = way.at(times)
+        return se2.between(at[:-1], at[1:])
+
+    def _scan(self) -> RfidScan:
+        """One round of all antennas."""
+        self._round += 1
+        chance = np.stack([self._likelihood.probabilities(self.pose[None], a)[0] for a in range(len(self._antennas))])
+        antenna, tag = np.nonzero(self._reads.random(chance.shape) < chance)
+        unknown = np.full(len(tag), np.nan)
+        names = tuple(self._map.names[i] for i in tag.tolist())
+        return RfidScan(
+            self.t, self._antennas, antenna.astype(np.int64), names, np.zeros(len(tag)), unknown, unknown, unknown
+        )
+
+    def _distance(self, pose: Array) -> float:
+        """To the nearest wall [m]."""
+        start, along = self._walls[:, :2], self._walls[:, 2:] - self._walls[:, :2]
+        offset = pose[:2] - start
+        share = np.clip((offset * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
+        return float(np.sqrt(((offset - share[:, None] * along) ** 2).sum(axis=1).min()))
