@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from factorgraph_loc import __version__
-from factorgraph_loc.cli import calibrating, features, images, inspecting, mapping, running, simulating
+from factorgraph_loc.cli import active, calibrating, features, images, inspecting, mapping, running, simulating
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
@@ -58,6 +58,7 @@ app.command()(calibrating.calibrate)
 app.command("map")(mapping.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
+app.command()(active.active)
 app.add_typer(features.app, name="features")
 
 

@@ -112,7 +112,7 @@ def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    longest = max((row["metres"] for row in rows if row["metres"] is not None), default=1.0)
+    longest = max((row["metres"] or 0.0 for row in rows), default=0.0) or 1.0
     for policy, style in zip(policies(rows), styles(), strict=False):
         driven = np.sort(metres(runs_of(rows, case, policy)))
         known = driven[np.isfinite(driven)]

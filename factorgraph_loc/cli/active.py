@@ -1,0 +1,96 @@
+"""``fgloc active``: simulated robots that choose where to drive until they know where they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list, parse_seeds
+from factorgraph_loc.cli.simulating import nested_changes, settings_of
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.planning.settings import ActiveSettings
+    from factorgraph_loc.simulation import SimulationSettings
+
+
+def active(
+    world: Annotated[
+        str, typer.Argument(metavar="WORLD", help="A preset of `fgloc simulate`, or a TOML file of its settings.")
+    ],
+    out: Out,
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B",
+            help="information, paper_literal, random, patrol, nearest_tags; the first is compared with the others.",
+        ),
+    ] = "information",
+    estimator: Annotated[
+        str, typer.Option("--estimator", "-e", metavar="A,B", help="active_mcl, particle_filter, smoother.")
+    ] = "active_mcl",
+    seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
+    max_metres: Annotated[
+        float | None, typer.Option(metavar="M", help="After which a robot gives up [m]; by default 100.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; may be repeated.",
+        ),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Let robots drive from an unknown start until they know where they are; compare policies on the same seeds."""
+    from factorgraph_loc.evaluation.active import difference_cells, differences, summaries, summary_cells
+    from factorgraph_loc.experiments.active import seek
+
+    chosen = parse_seeds(seeds)
+    simulation, settings = _settings(world, nested_changes({"max_metres": max_metres}, set_ or []))
+    with show.progress("runs", counted=True) as report:
+        results = seek(
+            simulation,
+            parse_list(policy),
+            parse_list(estimator),
+            chosen,
+            out,
+            settings,
+            jobs=jobs,
+            overwrite=overwrite,
+            progress=report,
+        )
+    for failure in results.failures:
+        show.note(f"failed: {failure}")
+    if json:
+        found = {"summaries": summaries(results.rows), "differences": differences(results.rows)}
+        show.document({"runs": results.rows, **found, "failures": results.failures})
+    else:
+        show.table(*summary_cells(results.rows))
+        header, lines = difference_cells(results.rows)
+        if lines:
+            typer.echo()
+            show.table(header, lines)
+        typer.echo(f"\nresults are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/")
+    if results.failures:
+        raise typer.Exit(1)
+
+
+def _settings(world: str, changes: dict[str, Any]) -> tuple[SimulationSettings, ActiveSettings]:
+    """The world and the run: no key is of both."""
+    from factorgraph_loc.files import nearest, parse_model
+    from factorgraph_loc.planning.settings import ActiveSettings
+    from factorgraph_loc.simulation import SimulationSettings
+
+    of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
+    for key in changes:
+        if key not in of_run and key not in of_world:
+            raise InputError(f"--set: unknown key {key}{nearest(key, [*of_run, *of_world])}")
+    simulation = settings_of(world, {key: value for key, value in changes.items() if key in of_world})
+    run = {key: value for key, value in changes.items() if key in of_run}
+    return simulation, parse_model(ActiveSettings, run, "the settings")

@@ -1,0 +1,300 @@
+"""Many robots that seek their place: worlds, policies and estimators on the same seeds, in processes, and what came out as files.
+
+What is done is kept while the rest is under way, so that an experiment which was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc import __version__
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.evaluation.active import DIFFERENCES, difference_cells, differences, summary_cells
+from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
+from factorgraph_loc.evaluation.figures import save
+from factorgraph_loc.evaluation.tables import markdown
+from factorgraph_loc.experiments.output import file_name
+from factorgraph_loc.experiments.processes import run_each
+from factorgraph_loc.files import nearest, replacing, write_text, write_toml
+from factorgraph_loc.planning.active_run import ActiveRun
+from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
+from factorgraph_loc.planning.policies import POLICIES
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation.settings import SimulationSettings
+
+CHUNK = 5  # runs of one process: to start one takes as long as a run
+FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")
+PARTS, PLOTS = "parts", "plots"
+ROW: dict[str, Any] = {
+    **dict.fromkeys(("world", "policy", "estimator"), pl.String),
+    "seed": pl.Int64,
+    **dict.fromkeys(("status", "reason"), pl.String),
+    "localized": pl.Boolean,
+    **dict.fromkeys(("metres", "seconds", "error_position", "error_heading"), pl.Float64),
+    "claimed_wrong": pl.Boolean,
+    "steps": pl.Int64,
+    **dict.fromkeys(("planning_ms", "planning_ms_max"), pl.Float64),
+}
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ActiveJob:
+    """Runs of one policy and estimator in one kind of world, for :func:`run_jobs`. The run of ``pictured``, if any, is drawn."""
+
+    simulation: SimulationSettings
+    policy: str
+    estimator: str
+    seeds: tuple[int, ...]
+    settings: ActiveSettings
+    folder: Path
+    pictured: int | None = None
+
+    @property
+    def name(self) -> str:
+        """World, estimator and policy."""
+        return file_name(f"{self.simulation.name}-{self.estimator}-{self.policy}")
+
+    @property
+    def part(self) -> Path:
+        """The file of the rows of this job: other settings, or another version, have another one."""
+        told: list[Any] = [__version__, self.policy, self.estimator, list(self.seeds), self.pictured]
+        told += [model.model_dump(mode="json") for model in (self.simulation, self.settings)]
+        key = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
+        return self.folder / PARTS / f"{self.name}-{self.seeds[0]}-{key}.parquet"
+
+
+@dataclass(frozen=True)
+class ActiveResults:
+    """``rows``: one a run, with the keys of :data:`ROW`; ``status`` is ok, refused (bad input) or failed, and without ok there is
+    a ``reason`` and nothing but what names the run. ``failures``: one line for each of those."""
+
+    rows: list[Row]
+    failures: list[str] = field(default_factory=list)
+
+
+def seek(
+    simulation: SimulationSettings,
+    policies: Sequence[str],
+    estimators: Sequence[str],
+    seeds: Sequence[int],
+    out: Path,
+    settings: ActiveSettings | None = None,
+    *,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> ActiveResults:
+    """Run every policy with every estimator on every seed, in ``jobs`` parallel processes (None: one per core).
+
+    Written into ``out``: ``results.parquet`` and ``results.csv`` (a row a run), ``differences.csv`` (see
+    :func:`~factorgraph_loc.evaluation.active.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png`` and for each
+    policy and estimator a picture of the run of the first seed. A run that fails is a row with its reason; the others go on.
+    If it is interrupted, the same call goes on. ``progress`` is given the number of runs done and of all.
+
+    Raises InputError, before anything runs, for an unknown policy or estimator, one that is given twice, or an ``out`` that
+    holds results while ``overwrite`` is off; and where all runs are refused for their input.
+    """
+    _check_names("policy", policies, POLICIES)
+    _check_names("estimator", estimators, ESTIMATORS)
+    settings = ActiveSettings() if settings is None else settings
+    check_free(out, overwrite=overwrite)
+    try:
+        (out / PLOTS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    if overwrite:
+        remove_results(out)
+    work = jobs_of(simulation, policies, estimators, seeds, out, settings, pictured=seeds[0])
+    results = run_jobs(work, jobs or os.cpu_count() or 1, progress)
+    if all(row["status"] == "refused" for row in results.rows):
+        raise InputError(str(results.rows[0]["reason"]))
+    config: dict[str, Any] = {
+        "version": __version__,
+        "policies": list(policies),
+        "estimators": list(estimators),
+        "seeds": list(seeds),
+    }
+    for name, model in (("settings", settings), ("simulation", simulation)):
+        config[name] = model.model_dump(mode="json", exclude_none=True)
+    write_toml(out / "config.toml", config)
+    write_tables(results.rows, out)
+    write_picture(comparison(results.rows), out / PLOTS / "comparison.png")
+    for job in work:
+        job.part.unlink(missing_ok=True)
+    with suppress(OSError):  # what else is there stays
+        (out / PARTS).rmdir()
+    return results
+
+
+def jobs_of(
+    simulation: SimulationSettings,
+    policies: Sequence[str],
+    estimators: Sequence[str],
+    seeds: Sequence[int],
+    folder: Path,
+    settings: ActiveSettings,
+    pictured: int | None = None,
+) -> list[ActiveJob]:
+    """The jobs of all these runs; all policies of some seeds come before the next seeds."""
+    chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
+    return [
+        ActiveJob(simulation, policy, estimator, chunk, settings, folder, pictured if pictured in chunk else None)
+        for chunk in chunks
+        for estimator in estimators
+        for policy in policies
+    ]
+
+
+def run_jobs(
+    jobs: Sequence[ActiveJob], workers: int, progress: Callable[[int, int], None] | None = None
+) -> ActiveResults:
+    """The rows of all jobs in their order. What an earlier call did is read from the jobs' parts, what this one does is kept."""
+    found: dict[int, list[Row]] = {i: _kept(job) for i, job in enumerate(jobs) if job.part.exists()}
+    left = [i for i in range(len(jobs)) if i not in found]
+    total = sum(len(job.seeds) for job in jobs)
+
+    def tell() -> None:
+        if progress is not None:
+            progress(sum(map(len, found.values())), total)
+
+    tell()
+    for at, outcome in run_each(run_job, [jobs[i] for i in left], workers):
+        job = jobs[left[at]]
+        if isinstance(outcome, Exception):
+            found[left[at]] = [_failed(job, seed, "failed", _message(outcome)) for seed in job.seeds]
+        else:
+            found[left[at]] = outcome
+        tell()
+    rows = [row for i in range(len(jobs)) for row in found[i]]
+    failures = [
+        f"{row['world']}, {row['policy']}, {row['estimator']}, seed {row['seed']}: {row['reason']}"
+        for row in rows
+        if row["status"] != "ok"
+    ]
+    return ActiveResults(rows, failures)
+
+
+def run_job(job: ActiveJob) -> list[Row]:
+    """The rows of a job, which are also kept as its part if all went well; jobs can be sent to other processes."""
+    rows = [_run(job, seed) for seed in job.seeds]
+    if all(row["status"] == "ok" for row in rows):
+        job.part.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(job.part) as temporary:
+            pl.DataFrame(rows, schema=ROW).write_parquet(temporary)
+    return rows
+
+
+def row_of(run: ActiveRun) -> Row:
+    """What is kept of a run in tables."""
+    times = run.planning_ms
+    return {
+        "world": run.preset,
+        "policy": run.policy,
+        "estimator": run.estimator,
+        "seed": run.seed,
+        "status": "ok",
+        "reason": None,
+        "localized": run.localized,
+        "metres": run.metres,
+        "seconds": run.seconds,
+        "error_position": run.error_position,
+        "error_heading": run.error_heading,
+        "claimed_wrong": run.claimed_wrong,
+        "steps": len(run.steps),
+        "planning_ms": float(np.median(times)) if len(times) else None,
+        "planning_ms_max": float(np.max(times)) if len(times) else None,
+    }
+
+
+def track_of(run: ActiveRun) -> SeekingTrack:
+    """What is drawn of a run."""
+    decisions = [Decision(s.metres, s.truth, s.particles, s.candidates, s.chosen) for s in run.steps]
+    ended = "localized" if run.localized else "not localized"
+    title = f"{run.preset}, seed {run.seed}: {run.policy} with {run.estimator}, {ended} after {run.metres:.1f} m"
+    return SeekingTrack(title, run.world, run.truth.poses, run.metres, decisions)
+
+
+def write_tables(rows: Sequence[Row], out: Path) -> None:
+    """``results.parquet``, ``results.csv``, ``differences.csv`` and ``table.md`` of runs into a folder."""
+    table = pl.DataFrame(rows, schema=ROW)
+    write_text(out / "results.csv", table.write_csv())
+    write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
+    write_text(out / "table.md", markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows)))
+    with replacing(out / "results.parquet") as temporary:
+        table.write_parquet(temporary)
+
+
+def write_picture(figure: Any, path: Path) -> None:
+    """A figure as PNG, at once or not at all."""
+    with replacing(path) as temporary:
+        save(figure, temporary)
+
+
+def check_free(out: Path, *, overwrite: bool) -> None:
+    """InputError if ``out`` is no folder, or holds results that may not be replaced. Parts of them may be there."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder for the results")
+    held = [name for name in FILES if (out / name).exists()]
+    if held and not overwrite:
+        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+
+
+def remove_results(out: Path) -> None:
+    """Remove the results of an earlier experiment, and what is there of an interrupted one; and nothing else."""
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
+    for pattern in (f"{PARTS}/*.parquet", f"{PARTS}/*.error.txt", f"{PLOTS}/*.png"):
+        for path in out.glob(pattern):
+            path.unlink()
+
+
+def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    if not names:
+        raise InputError(f"no {what} is given; known: {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown {what} {name!r}{nearest(name, list(known))}")
+        if list(names).count(name) > 1:
+            raise InputError(f"{what} {name} is given twice")
+
+
+def _run(job: ActiveJob, seed: int) -> Row:
+    try:
+        run = run_active(job.simulation, job.policy, job.estimator, seed, job.settings)
+    except InputError as error:
+        return _failed(job, seed, "refused", _message(error))
+    except Exception as error:
+        if not isinstance(error, FglocError):
+            text = "".join(traceback.format_exception(error))
+            job.part.parent.mkdir(parents=True, exist_ok=True)
+            write_text(job.part.parent / f"{job.name}-{seed}.error.txt", text)
+        return _failed(job, seed, "failed", _message(error))
+    if seed == job.pictured:
+        write_picture(run_picture(track_of(run)), job.folder / PLOTS / f"{job.name}-seed{seed}.png")
+    return row_of(run)
+
+
+def _failed(job: ActiveJob, seed: int, status: str, reason: str) -> Row:
+    known = (job.simulation.name, job.policy, job.estimator, seed, status, reason)
+    return {**dict.fromkeys(ROW), **dict(zip(ROW, known, strict=False))}
+
+
+def _message(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, FglocError) else f"{type(error).__name__}: {text}"
+
+
+def _kept(job: ActiveJob) -> list[Row]:
+    return pl.read_parquet(job.part).to_dicts()

@@ -1,0 +1,109 @@
+"""``fgloc active``: a table, files, JSON, and errors of one line."""
+
+import json
+import math
+
+import polars as pl
+import pytest
+
+from factorgraph_loc.experiments import active
+
+SMALL = ("--set", "world.width=8", "--set", "world.plan=hall", "--set", "world.depth=6", "--set", "world.tags=12")
+FEW = ("--set", "particles=300", "--set", "policy.samples=16")
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Runs in this process: to start others takes long."""
+
+    def run_each(function, jobs, _):
+        for i, job in enumerate(jobs):
+            yield i, function(job)
+
+    monkeypatch.setattr(active, "run_each", run_each)
+
+
+def test_runs_have_processes_of_their_own(fgloc, tmp_path):
+    out = tmp_path / "out"
+    done = fgloc("active", "office", "--policy", "random", "--seeds", "0:2", *SMALL, *FEW, "-o", out)
+    assert done.exit_code == 0, done.stderr
+    assert str(out) in done.stdout
+    rows = pl.read_parquet(out / "results.parquet")
+    assert rows.select("policy", "seed", "status").rows() == [("random", 0, "ok"), ("random", 1, "ok")]
+    again = fgloc("active", "office", "--seeds", "0:2", "-o", out)
+    assert again.exit_code == 2
+    assert "holds results already" in again.stderr
+
+
+@pytest.mark.usefixtures("here")
+def test_policies_are_compared(fgloc, tmp_path):
+    out = tmp_path / "out"
+    few = (*SMALL[:-1], "world.tags=4", "--max-metres", 8)
+    done = fgloc("active", "office", "--policy", "information,random", "--seeds", "0:2", *few, *FEW, "-o", out)
+    assert done.exit_code == 0, done.stderr
+    for text in ("median [m]", "information / random", "p (McNemar)"):
+        assert text in done.stdout
+    rows = pl.read_parquet(out / "results.parquet")
+    assert sorted(rows.select("policy", "seed").rows()) == [(p, s) for p in ("information", "random") for s in (0, 1)]
+    assert (rows["metres"] <= 8.2).all()
+    assert (out / "plots" / "comparison.png").exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_json_is_all_that_is_printed(fgloc, tmp_path):
+    done = fgloc("active", "office", *SMALL, *FEW, "--policy", "random,patrol", "--json", "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [(run["policy"], run["seed"]) for run in found["runs"]] == [("random", 0), ("patrol", 0)]
+    assert [one["policy"] for one in found["summaries"]] == ["random", "patrol"]
+    assert found["differences"][0]["pairs"] == 1
+    assert found["failures"] == []
+
+
+@pytest.mark.usefixtures("here")
+def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
+    out = tmp_path / "out"
+    bare = (*SMALL[:-1], "world.tags=0")
+    done = fgloc("active", "office", *bare, *FEW, "--policy", "patrol", "--max-metres", 3, "-o", out)
+    assert done.exit_code == 0, done.stderr  # that is a result
+    (row,) = pl.read_parquet(out / "results.parquet").to_dicts()
+    assert not row["localized"]
+    assert 2.0 < row["metres"] <= 3.2
+    assert "never" in done.stdout
+
+
+@pytest.mark.usefixtures("here")
+def test_the_world_may_come_from_a_file(fgloc, tmp_path):
+    path = tmp_path / "store.toml"
+    path.write_text('preset = "office"\n[world]\nplan = "hall"\nwidth = 8\ndepth = 6\ntags = 12\n')
+    done = fgloc("active", path, *FEW, "--policy", "random", "--set", "start=[4.0, 3.0, 0.5]", "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.stderr
+    (row,) = pl.read_parquet(tmp_path / "out" / "results.parquet").to_dicts()
+    assert (row["world"], row["status"]) == ("store", "ok")
+    assert row["error_heading"] < math.radians(10.0)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("ofice",), "did you mean office?"),
+        (("office", "--policy", "informations"), "did you mean information?"),
+        (("office", "--policy", ","), "no policy is given"),
+        (("office", "-e", "ekf"), "unknown estimator 'ekf'"),
+        (("office", "--seeds", "3:3"), "expected a number such as 3, or a range"),
+        (("office", "--set", "polcy.horizon=3"), "unknown key polcy: did you mean policy?"),
+        (("office", "--set", "policy.horizn=3"), "unknown key policy.horizn: did you mean horizon?"),
+        (("office", "--set", "policy.horizon=0"), "policy.horizon is 0"),
+        (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
+        (("office", "--max-metres", 0), "max_metres is 0"),
+        (("office", "--set", "start=[-5.0, 1.0, 0.0]"), "expected a place between the walls"),
+        (("missing.toml",), "missing.toml: cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line(fgloc, tmp_path, arguments, message):
+    done = fgloc("active", *arguments, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out" / "results.parquet").exists()

@@ -1,0 +1,191 @@
+"""Many active runs: rows of what went well and what did not, files, and going on after an interruption."""
+
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.experiments import active
+from factorgraph_loc.experiments.active import ROW, jobs_of, run_job, run_jobs, seek
+from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation.settings import SimulationSettings, preset
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+
+OFFICE = preset("office")
+WALLS = ((0.0, 0.0, 5.0, 0.0), (0.0, 0.0, 0.0, 5.0))
+
+
+def step(metres, ms):
+    pose, way = np.array((1.0, 1.0, 0.0)), np.array(((1.0, 1.0, 0.0), (2.0, 1.0, 0.0)))
+    return PlanningStep(0.0, metres, pose, pose, np.eye(3), np.zeros((5, 3)), (way,), np.ones(1), way, ms)
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Runs take no time, in this process: the metres are 10 and the seed, 5 more for `random`; the calls are returned."""
+    seen = []
+
+    def run(simulation, policy, estimator, seed, settings):
+        seen.append((policy, estimator, seed))
+        if settings.start is not None:
+            raise InputError("the start is inside a wall")
+        if seed == 7:
+            raise RunFailedError("the pose is not finite")
+        if seed == 8:
+            raise ZeroDivisionError("by zero")
+        metres = 10.0 + seed + 5.0 * (policy == "random")
+        truth = Trajectory(np.arange(3.0), np.ones((3, 3)))
+        steps = () if seed == 2 else (step(0.0, 30.0), step(2.0, 10.0), step(4.0, 12.0))
+        ends = (metres < 14.0, metres, 2.0 * metres, 0.1, 0.05, False)
+        return ActiveRun(seed, simulation.name, World(walls=WALLS), policy, estimator, *ends, truth, steps)
+
+    def here(function, jobs, _):
+        for i, job in enumerate(jobs):
+            yield i, function(job)
+
+    monkeypatch.setattr(active, "run_active", run)
+    monkeypatch.setattr(active, "run_each", here)
+    monkeypatch.setattr(active, "save", lambda figure, path: path.write_text(type(figure).__name__))
+    return seen
+
+
+def test_each_policy_runs_on_each_seed(calls, tmp_path):
+    told = []
+    report = lambda done, total: told.append((done, total))  # noqa: E731
+    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(7), tmp_path / "out", progress=report)
+    assert sorted(calls) == sorted((p, "active_mcl", s) for p in ("information", "random") for s in range(7))
+    assert not results.failures
+    assert told[0] == (0, 14)
+    assert told[-1] == (14, 14)
+    found = {(row["policy"], row["seed"]): row for row in results.rows}
+    one = found["random", 1]
+    assert (one["metres"], one["localized"], one["steps"], one["planning_ms"], one["planning_ms_max"]) == (
+        16.0,
+        False,
+        3,
+        12.0,
+        30.0,
+    )
+    assert found["information", 2]["planning_ms"] is None  # nothing had to be chosen
+
+
+@pytest.mark.usefixtures("calls")
+def test_files_of_an_experiment(tmp_path):
+    out = tmp_path / "out"
+    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(3), out)
+    assert sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()) == [
+        "config.toml",
+        "differences.csv",
+        "plots/comparison.png",
+        "plots/office-active_mcl-information-seed0.png",
+        "plots/office-active_mcl-random-seed0.png",
+        "results.csv",
+        "results.parquet",
+        "table.md",
+    ]
+    assert pl.read_parquet(out / "results.parquet").to_dicts() == results.rows
+    (difference,) = pl.read_csv(out / "differences.csv").to_dicts()
+    assert difference["pairs"] == 3
+    assert difference["difference"] == -math.inf  # the other never came there
+    assert "information / random" in (out / "table.md").read_text()
+    assert not (out / "parts").exists()
+    assert (out / "plots" / "comparison.png").read_text() == "Figure"
+
+
+@pytest.mark.usefixtures("calls")
+def test_a_run_that_fails_is_a_row(tmp_path):
+    results = seek(OFFICE, ("information",), ("active_mcl",), range(5, 10), tmp_path)
+    assert [row["status"] for row in results.rows] == ["ok", "ok", "failed", "failed", "ok"]
+    assert list(results.rows[2]) == list(ROW)
+    assert results.rows[2]["metres"] is None
+    assert results.failures == [
+        "office, information, active_mcl, seed 7: the pose is not finite",
+        "office, information, active_mcl, seed 8: ZeroDivisionError: by zero",
+    ]
+    assert "Traceback" in (tmp_path / "parts" / "office-active_mcl-information-8.error.txt").read_text()
+
+
+@pytest.mark.usefixtures("calls")
+def test_input_that_no_run_takes_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="inside a wall"):
+        seek(OFFICE, ("information",), ("active_mcl",), (0, 1), tmp_path, ActiveSettings(start=(0.0, 0.0, 0.0)))
+    assert not (tmp_path / "results.parquet").exists()
+
+
+def test_what_was_interrupted_goes_on(calls, tmp_path):
+    settings = ActiveSettings()
+    jobs = jobs_of(OFFICE, ("information",), ("active_mcl",), range(12), tmp_path, settings)
+    assert [job.seeds for job in jobs] == [tuple(range(5)), tuple(range(5, 10)), (10, 11)]
+    done = run_job(jobs[0])
+    calls.clear()
+    told = []
+    rows = run_jobs(jobs, 1, lambda *counts: told.append(counts)).rows
+    assert {seed for _, _, seed in calls} == set(range(5, 12))
+    assert rows[:5] == done
+    assert [row["seed"] for row in rows] == list(range(12))
+    assert told[0] == (5, 12)
+    calls.clear()
+    run_jobs(jobs, 1)
+    assert {seed for _, _, seed in calls} == {5, 6, 7, 8, 9}  # two of them failed: nothing was kept
+
+
+def test_other_settings_are_other_runs(tmp_path):
+    def part(simulation=OFFICE, **changes):
+        return jobs_of(simulation, ("random",), ("smoother",), (0,), tmp_path, ActiveSettings(**changes))[0].part
+
+    assert part() == part()
+    assert part() != part(max_metres=50.0)
+    assert part() != part(preset("office", {"world": {"tags": 3}}))
+
+
+@pytest.mark.usefixtures("calls")
+def test_a_process_that_dies_takes_its_runs_alone(monkeypatch, tmp_path):
+    def dying(function, jobs, _):
+        for i, job in enumerate(jobs):
+            yield i, RunFailedError("the process died") if i == 0 else function(job)
+
+    monkeypatch.setattr(active, "run_each", dying)
+    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(3), tmp_path)
+    assert [row["status"] for row in results.rows] == ["failed"] * 3 + ["ok"] * 3
+    assert len(results.failures) == 3
+
+
+@pytest.mark.usefixtures("calls")
+def test_results_are_not_replaced_unasked(tmp_path):
+    def go(**options):
+        seek(OFFICE, ("information",), ("active_mcl",), (0,), tmp_path, **options)
+
+    go()
+    (tmp_path / "plots" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds results already"):
+        go()
+    go(overwrite=True)
+    assert (tmp_path / "plots" / "mine.txt").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file"):
+        seek(OFFICE, ("information",), ("active_mcl",), (0,), tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("policies", "estimators", "message"),
+    [
+        (("informtion",), ("active_mcl",), "did you mean information"),
+        (("random",), ("ekf",), "unknown estimator 'ekf'"),
+        (("random", "random"), ("active_mcl",), "random is given twice"),
+        ((), ("active_mcl",), "no policy is given"),
+    ],
+)
+def test_names_are_checked_before_anything_runs(calls, tmp_path, policies, estimators, message):
+    with pytest.raises(InputError, match=message):
+        seek(OFFICE, policies, estimators, (0,), tmp_path / "out")
+    assert not calls
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_key_is_of_the_run_and_of_the_world():
+    """``fgloc active --set`` tells them apart by their names."""
+    assert not ActiveSettings.model_fields.keys() & SimulationSettings.model_fields.keys()
