@@ -24,7 +24,7 @@ from factors.se2 import Array
 Array32 = NDArray[np.float32]
 Places = NDArray[np.int64]
 
-CELL = 0.1  # m, of the tables
+CELL = 0.15  # m, of the tables
 FACINGS = 24  # directions in which a tag may face
 LEVEL = 0.25  # m: tags at the same height, to so much, share a table
 NOTHING = (
@@ -37,7 +37,7 @@ class ScanTables(NamedTuple):
     """What A antennas read of a tag in a cell of the robot's frame, layers F (by where the tag faces, the last where that is not
     known or does not matter) of N x N cells for each of L heights.
 
-    ``read`` (L F N N, A): probability. ``gain`` (L F N N, A): its logit, and ``missed`` (L F N N): sum over antennas of log(1 - q),
+    ``read`` (L F N N, A): probability. ``gain`` (A, L F N N): its logit, and ``missed`` (L F N N): sum over antennas of log(1 - q),
     both above those of the floor, and zero at the edge. ``silent`` (L F N N): the sum itself, but zero at the edge, where nothing
     is drawn. ``size``: N. ``points`` (T, 2) [m], ``facing`` (T,) [rad], NaN where not known, and ``first`` (T,): the first cell
     of each tag's tables; ``layers``: F.
@@ -77,7 +77,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     size = q.shape[2]
     return ScanTables(
         read=q.reshape(-1, q.shape[-1]),
-        gain=(np.log(q) - math.log(floor) - missed).astype(np.float32).reshape(-1, q.shape[-1]),
+        gain=np.ascontiguousarray((np.log(q) - math.log(floor) - missed).astype(np.float32).reshape(-1, q.shape[-1]).T),
         missed=missed.sum(axis=-1).astype(np.float32).ravel(),
         silent=np.where(inner, log_missed, 0.0).sum(axis=-1).ravel(),
         size=size,
@@ -199,6 +199,7 @@ def log_weights(
     """
     looks, count, _ = poses.shape
     tags = len(tables.points)
+    missed = tables.missed
     cells = np.empty((looks, tags, count), np.int32)
     # what it says that no antenna reads anything, in all looks up to each
     silence = np.zeros((looks + 1, count), np.float32)
@@ -209,7 +210,7 @@ def log_weights(
         for t in range(tags):
             _cells(tables, t, poses[k], turns, cells[k, t])
             for i in range(count):
-                silence[k + 1, i] += tables.missed[cells[k, t, i]]
+                silence[k + 1, i] += missed[np.uint32(cells[k, t, i])]
         for i in range(count):
             silence[k + 1, i] = silence[k, i] + np.float32(rounds[k]) * silence[k + 1, i]
     for n in range(scans):
@@ -227,6 +228,7 @@ def _add_reads(
     """Draw the reads of each scan, and add what they say."""
     looks, tags, count = cells.shape
     antennas = tables.read.shape[1]
+    gain = tables.gain
     row = np.empty((antennas, count), np.float32)
     filled = np.zeros(antennas, np.bool_)
     for k in range(looks):
@@ -247,7 +249,7 @@ def _add_reads(
                         continue
                     if not filled[a]:
                         for i in range(count):
-                            row[a, i] = tables.gain[cells[k, t, i], a]
+                            row[a, i] = gain[a, np.uint32(cells[k, t, i])]
                         filled[a] = True
                     for i in range(count):
                         out[n, i] += np.float32(hits) * row[a, i]

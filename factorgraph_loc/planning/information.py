@@ -35,7 +35,7 @@ DIMS = ("x", "y", "heading")
 POSITION = ("x", "y")
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a whole number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
-LOOK = 1.0  # m, between looks, each of which stands for the rounds of so much of the way
+LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way
 ROUNDS_PER_METRE = 4.0  # of a robot with 2 rounds a second at 0.5 m/s
 SAMPLES, SCANS = 256, 64  # particles that are weighed, and those that scans are drawn from
 SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
@@ -56,15 +56,11 @@ def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, c
 
     Comparable with :func:`gaussian_entropy` where the belief is wider than a cell and the particles are more than the cells.
     """
-    chosen = _columns(dims)
-    moved = np.zeros((1, len(poses), 3))
-    # the heading is brought into a circle as the third coordinate alone
-    if 2 in chosen and chosen[-1] != len(chosen) - 1:
-        raise InputError(f"dims are {', '.join(dims)}, expected x, x and y, or x, y and heading")
-    moved[0] = poses
+    chosen = _leading(dims)
     flat = np.atleast_2d(weights).reshape(-1, len(poses)).astype(np.float32)
     out = np.empty(len(flat))
-    expected_scans.cell_entropies(moved, np.zeros(len(flat), dtype=np.int64), flat, cell, len(chosen), out)
+    at = np.ascontiguousarray(poses, dtype=float)[None]
+    expected_scans.cell_entropies(at, np.zeros(len(flat), dtype=np.int64), flat, cell, chosen, out)
     return out.reshape(np.shape(weights)[:-1])
 
 
@@ -102,7 +98,7 @@ def expected_gain(
     if not paths:
         return np.empty(0)
     tables = _tables(likelihood)
-    chosen = _columns(dims)
+    chosen = _leading(dims)
     several = has_several_modes(particles, weights)
     rows = systematic(weights, rng, min(samples, len(particles)))
     poses = np.ascontiguousarray(particles[rng.permutation(rows)], dtype=float)
@@ -114,7 +110,7 @@ def expected_gain(
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
     after = np.empty((len(paths), scans))
     even: Array32 = np.full((1, count), 1.0 / count, dtype=np.float32)
-    before = _entropies(poses[None], np.zeros(1, dtype=np.int64), even, len(chosen), several)[0]
+    before = _entropies(poses[None], np.zeros(1, dtype=np.int64), even, chosen, several)[0]
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
@@ -129,7 +125,7 @@ def expected_gain(
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
-        after[c] = _entropies(at, index, np.exp(log_weights), len(chosen), several)
+        after[c] = _entropies(at, index, np.exp(log_weights), chosen, several)
     return np.asarray(before - after.mean(axis=1))
 
 
@@ -140,10 +136,20 @@ def _tables(likelihood: RfidLikelihood) -> ScanTables:
 
 def _columns(dims: Sequence[str]) -> list[int]:
     """Columns of a pose; InputError names a wrong dimension."""
+    if not dims:
+        raise InputError(f"dims: are none, expected some of {', '.join(DIMS)}")
     for name in dims:
         if name not in DIMS:
             raise InputError(f"dims: is {name!r}, expected some of {', '.join(DIMS)}")
     return sorted({DIMS.index(name) for name in dims})
+
+
+def _leading(dims: Sequence[str]) -> int:
+    """How many of a pose's coordinates ``dims`` are, from the first on; InputError if there is a gap."""
+    columns = _columns(dims)
+    if columns != list(range(len(columns))):
+        raise InputError(f"dims: are {', '.join(dims)}, expected x, y or x, y, heading")
+    return len(columns)
 
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several: bool) -> Array:

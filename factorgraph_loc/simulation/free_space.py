@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
@@ -40,9 +41,7 @@ class FreeSpace:
 
     def clear(self, a: Array, b: Array) -> bool:
         """Whether the straight line between two points runs over free cells alone."""
-        n = max(2, math.ceil(math.hypot(*(b - a)) / SPACING))
-        points = a + np.linspace(0.0, 1.0, n)[:, None] * (b - a)
-        return bool((self.cells(points) >= 0).all())
+        return bool(_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
 def free_space(world: World, clearance: float) -> FreeSpace:
@@ -128,3 +127,17 @@ def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
     count = int(index.max()) + 1
     entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.csr_matrix(entries, shape=(count, count))
+
+
+@numba.njit(cache=True)
+def _clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bool:
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    count = max(2, math.ceil(math.hypot(dx, dy) / SPACING))
+    step = 1.0 / (count - 1)
+    for k in range(count):
+        share = k * step if k < count - 1 else 1.0
+        i = math.floor((a[0] + share * dx - origin[0]) / CELL)
+        j = math.floor((a[1] + share * dy - origin[1]) / CELL)
+        if i < 0 or j < 0 or i >= index.shape[0] or j >= index.shape[1] or index[i, j] < 0:
+            return False
+    return True
