@@ -140,13 +140,15 @@ def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
     along = (x, x + ARROW * math.cos(heading)), (y, y + ARROW * math.sin(heading))
     axis.plot(*along, color=COLOURS[0], linewidth=2.0, zorder=5)
     axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label="robot (true)", zorder=5)
-    if index == len(track.decisions) - 1:
-        axis.plot(*track.truth[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
+    driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(track.truth[:, :2], axis=0).T))))
+    last = index == len(track.decisions) - 1
+    so_far = track.truth if last else track.truth[driven <= one.metres + 1e-6]
+    axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
     low, high = _outline(track).min(axis=0), _outline(track).max(axis=0)
     axis.set_xlim(low[0] - 0.5, high[0] + 0.5)
     axis.set_ylim(low[1] - 0.5, high[1] + 0.5)
     axis.set_aspect("equal", adjustable="box")
-    axis.set_title(f"after {one.metres:.1f} m")
+    axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {track.metres:.1f} m" if last else ""))
 
 
 def _outline(track: SeekingTrack) -> Array:

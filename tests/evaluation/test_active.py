@@ -125,10 +125,10 @@ def track(count):
         pose = np.array((1.0 + i, 1.5, 0.0))
         ways = tuple(pose + np.array(((0.0, 0.0, 0.0), (1.0, side, 0.0))) for side in (-0.5, 0.0, 0.5))
         particles = pose + 2.0**-i * rng.standard_normal((200, 3))
-        decisions.append(Decision(2.0 * i, pose, particles, ways, ways[1] if i else None))
+        decisions.append(Decision(float(i), pose, particles, ways, ways[1] if i else None))
     truth = np.column_stack((np.linspace(1.0, 1.0 + count, 50), np.full(50, 1.5), np.zeros(50)))
     world = World(tags={"T": Tag(x=2.0, y=0.0)}, walls=walls(12.0, 3.0))
-    return SeekingTrack("a run", world, truth, 2.0 * count, decisions)
+    return SeekingTrack("a run", world, truth, float(count), decisions)
 
 
 def labels(figure):
@@ -138,12 +138,14 @@ def labels(figure):
 def test_the_picture_of_a_run_shows_what_was_proposed_chosen_and_believed():
     figure = run_picture(track(9))
     maps = [axis for axis in figure.axes if axis.get_title().startswith("after")]
-    assert [axis.get_title() for axis in maps] == [f"after {2 * i}.0 m" for i in (0, 2, 3, 5, 6, 8)]
+    assert [axis.get_title() for axis in maps[:-1]] == [f"after {i}.0 m" for i in (0, 2, 3, 5, 6)]
+    assert maps[-1].get_title() == "after 8.0 m, way to the end at 9.0 m"
     drawn = {line.get_label(): line for line in maps[1].lines}
     assert {"walls", "tags", "belief", "candidates", "chosen", "robot (true)"} <= set(drawn)
     np.testing.assert_allclose(drawn["chosen"].get_xydata(), ((3.0, 1.5), (4.0, 1.5)))
     assert "chosen" not in {line.get_label() for line in maps[0].lines}  # nothing was taken
-    assert "way (true)" in {line.get_label() for line in maps[-1].lines}
+    ways = [next(line for line in axis.lines if line.get_label() == "way (true)") for axis in maps]
+    np.testing.assert_allclose([way.get_xdata()[-1] for way in ways], (1.0, 3.0, 4.0, 6.0, 7.0, 10.0), atol=0.2)
     assert {"chosen", "way (true)"} <= labels(figure)
     (belief,) = [axis for axis in figure.axes if axis.get_ylabel() == "spread of the belief [m]"]
     spread = belief.lines[0].get_ydata()
