@@ -60,6 +60,8 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
         if first["type"] == "missing":
             raise InputError(f"{source}: {key} is missing{more}") from error
+        if first["type"] == "value_error" and not key:  # of the whole: its content is no value that a line can show
+            raise InputError(f"{source}: {first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]
         raise InputError(f"{source}: {key} is {first['input']!r}: {expected}{more}") from error
 
@@ -68,6 +70,8 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
     """The keys that the model below ``path`` takes; empty where that is not a model."""
     parts = iter(path)
     for part in parts:
+        if isinstance(part, int):  # the place in a list of models
+            continue
         field = kind.model_fields.get(str(part))
         nested = field.annotation if field is not None else None
         if get_origin(nested) is dict:

@@ -1,0 +1,236 @@
+"""What becomes of a planned run: results under its key, or a failure with a reason."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import FglocError
+from factorgraph_loc.experiments import execute
+from factorgraph_loc.experiments.experiment import prepare, run_experiment
+from factorgraph_loc.experiments.experiment_file import Experiment
+from factorgraph_loc.experiments.index import load_results
+from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
+from factorgraph_loc.readers import load, write_native
+
+# a name that would leave the store as a path, and be code in a page
+NASTY = "../../a 'b' \"c\" <script>alert(1)</script>/.."
+
+
+@pytest.fixture(autouse=True)
+def _no_logs_kept():
+    execute._load.cache_clear()
+
+
+@pytest.fixture
+def out(tmp_path):
+    Store(tmp_path / "out").create()
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def planned(log, tmp_path, out):
+    """``planned(**content)``: the runs of an experiment on the log in the folder ``log``."""
+    write_native(dataclasses.replace(log, name=NASTY), tmp_path / "log")
+
+    def make(**content):
+        usual = {"name": "a", "logs": ["log"], "estimators": ["fake"]}
+        return plan(Experiment.model_validate(usual | content), tmp_path, out / "store")
+
+    return make
+
+
+def test_a_run_gives_what_fgloc_run_gives_but_for_times(planned, out, tmp_path):
+    (one,) = planned(estimators=["ekf"])
+    assert execute.run_planned(one, out).status == "ok"
+    store = Store(out)
+    (log,) = load(str(tmp_path / "log"))
+    result = run(log, RunConfig("ekf"))
+    track = store.track(one.key)
+    first = result.t[0]
+    np.testing.assert_allclose(track.final.t, result.final.t - first, atol=1e-9)
+    np.testing.assert_array_equal(track.final.poses, result.final.poses)
+    np.testing.assert_array_equal(track.causal.covariances, result.causal().covariances)
+    row = store.row(one.key)
+    assert row["causal.position_rmse"] is not None
+    assert row["timing.run_seconds"] >= row["timing.causal_seconds"] > 0.0
+
+
+def test_the_same_run_again_is_the_same_to_the_byte_but_for_times(planned, out, tmp_path):
+    (one,) = planned(estimators=["particle_filter"])
+    other = tmp_path / "other"
+    Store(other).create()
+    execute.run_planned(one, out)
+    execute.run_planned(one, other)
+    a, b = Store(out).path(one.key), Store(other).path(one.key)
+    names = sorted(file.name for file in a.iterdir())
+    assert names == sorted(file.name for file in b.iterdir())
+    assert {MANIFEST, TIMINGS} < set(names)
+    for name in set(names) - {TIMINGS}:
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+def test_what_is_stored_is_not_done_again(planned, out, fake):
+    (one,) = planned()
+    execute.run_planned(one, out)
+    del fake.made
+    assert execute.run_planned(one, out).status == "ok"
+    assert not hasattr(fake, "made")
+
+
+def test_a_claimed_run_is_left_to_its_owner(planned, out):
+    (one,) = planned()
+    with Store(out).claim(one.key):
+        assert execute.run_planned(one, out).status == "busy"
+        assert execute.store_failure(one, out, "timeout", "late").status == "busy"
+    assert Store(out).state(one.key) == "missing"
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "reason"),
+    [
+        (ZeroDivisionError("by\nnought"), "error", "ZeroDivisionError: by nought"),
+        (FglocError("cannot go on"), "error", "cannot go on"),
+        (MemoryError(), "memory", "there was no memory left"),
+    ],
+)
+def test_a_failure_is_stored_with_its_reason_and_tried_again_if_told(
+    planned, out, fake, monkeypatch, fault, kind, reason
+):
+    def fail(*_):
+        raise fault
+
+    (one,) = planned()
+    with monkeypatch.context() as patch:
+        patch.setattr(fake, "process", fail)
+        outcome = execute.run_planned(one, out)
+    assert (outcome.status, outcome.reason) == ("failed", reason)
+    row = Store(out).row(one.key)
+    assert (row["status"], row["kind"], row["reason"]) == ("failed", kind, reason)
+    assert execute.run_planned(one, out).status == "failed"
+    assert execute.run_planned(one, out, again=True).status == "ok"
+    assert not (Store(out).path(one.key) / FAILURE).exists()
+
+
+def test_a_failure_keeps_the_traceback_of_what_nobody_foresaw(planned, out, fake, monkeypatch):
+    def fail(*_):
+        raise KeyError("lost")
+
+    monkeypatch.setattr(fake, "process", fail)
+    (one,) = planned()
+    execute.run_planned(one, out)
+    assert b"in fail" in Store(out).read(one.key, FAILURE)
+
+
+@pytest.mark.parametrize("how", ["removed", "changed"])
+def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_path, how):
+    one, other = planned(estimators=["dead_reckoning", "ekf"])
+    execute.run_planned(one, out)
+    execute._load.cache_clear()
+    if how == "removed":
+        shutil.rmtree(tmp_path / "log")
+    else:
+        (tmp_path / "log" / "odometry.csv").write_text("t_ns,v,w\n")
+    outcome = execute.run_planned(other, out)
+    assert outcome.status == "failed"
+    assert "log" in outcome.reason
+    assert Store(out).row(other.key)["kind"] == "vanished"
+    assert Store(out).state(one.key) == "ok"
+
+
+def test_a_full_disk_is_no_failure_of_the_run(planned, out, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    (one,) = planned()
+    monkeypatch.setattr("factorgraph_loc.experiments.stored_run.write_files", full)
+    with pytest.raises(StoreError, match="No space left on device"):
+        execute.run_planned(one, out)
+    assert Store(out).state(one.key) == "missing"
+
+
+@pytest.fixture
+def experiment(log, tmp_path, out):
+    """``experiment(text)``: an experiment prepared from its file, with the log of a nasty name."""
+    write_native(dataclasses.replace(log, name=NASTY), tmp_path / "log")
+
+    def make(text="estimators = ['fake', 'ekf']", **options):
+        file = tmp_path / "a.toml"
+        file.write_text(f'name = "a"\nlogs = ["log"]\n{text}')
+        return prepare(file, out=out, **options)
+
+    return make
+
+
+def here(out, again=False):
+    """What makes runs in this process."""
+    return lambda runs: (execute.run_planned(one, out, again=again) for one in runs)
+
+
+def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out, tmp_path):
+    told = []
+    text = "estimators = ['ekf', {name = 'smoother', label = 'short'}]\nsensors = ['odometry']\n[sweep]\nshort.lag = [1, 2]"
+    done = run_experiment(experiment(text), executor=here(out), progress=lambda *numbers: told.append(numbers))
+    rows = load_results(out)
+    assert rows.equals(done.rows)
+    assert rows["log"].to_list() == [NASTY] * 3
+    assert rows["label"].to_list() == ["ekf", "short", "short"]
+    assert rows["sensors"].to_list() == ["odometry"] * 3
+    assert rows["sweep.short.lag"].to_list() == [None, 1, 2]
+    assert set(rows["status"]) == {"ok"}
+    assert rows["causal.position_rmse"].null_count() == 0
+    assert told == [(0, 3, 0), (1, 3, 0), (2, 3, 0), (3, 3, 0)]
+    # nothing was written beside the folder of the results
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.toml", "log", "out"]
+
+
+def test_failures_are_rows_and_are_tried_again_if_told(experiment, out, fake, monkeypatch):
+    def fail(*_):
+        raise FglocError("cannot go on")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fake, "process", fail)
+        done = run_experiment(experiment(), executor=here(out))
+    assert done.rows["status"].to_list() == ["failed", "ok"]
+    assert done.rows["reason"].to_list() == ["cannot go on", None]
+    assert done.failures == [f"{NASTY}, fake, seed 0: cannot go on"]
+    assert experiment().todo() == []
+    (again,) = experiment().todo(again=True)
+    assert again.label == "fake"
+    done = run_experiment(experiment(), again=True, executor=here(out, again=True))
+    assert done.rows["status"].to_list() == ["ok", "ok"]
+
+
+def test_a_damaged_result_is_found_and_done_again(experiment, out):
+    first = run_experiment(experiment(), executor=here(out)).rows
+    key = first["key"][1]
+    (Store(out).path(key) / "estimates.parquet").write_bytes(b"")
+    prepared = experiment()
+    assert prepared.counts() == {"ok": 1, "damaged": 1}
+    assert [one.key for one in prepared.todo()] == [key]
+    second = run_experiment(prepared, executor=here(out)).rows
+    times = [name for name in first.columns if name.startswith("timing.")]
+    assert second.drop(times).equals(first.drop(times))
+
+
+def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out):
+    def stopped(runs):
+        yield execute.run_planned(runs[0], out)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(experiment(), executor=stopped)
+    assert load_results(out)["label"].to_list() == ["fake"]
+    assert [one.label for one in experiment().todo()] == ["ekf"]
+
+
+def test_a_table_that_is_no_table_is_told(experiment, out):
+    run_experiment(experiment(), executor=here(out))
+    (out / "results.parquet").write_bytes(b"PAR1")
+    with pytest.raises(FglocError, match=r"results.parquet: cannot be read"):
+        load_results(out)
+    run_experiment(experiment(), executor=here(out))
+    assert len(load_results(out)) == 2

@@ -1,0 +1,106 @@
+"""What an experiment's file may say, and what is said of one that is wrong."""
+
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.experiment_file import Sweep, read_experiment
+
+GOOD = """
+name = "lags"
+logs = ["plaza2", {simulate = "office", seeds = "0:3"}]
+estimators = ["ekf", {name = "smoother", label = "short", settings = {lag = 2}}]
+seeds = "0:2"
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    """``read(text, *changes)``: the experiment of a file with this text."""
+
+    def read_text(text, *changes):
+        file = tmp_path / "a.toml"
+        file.write_text(text)
+        return read_experiment(file, changes)
+
+    return read_text
+
+
+def test_names_alone_are_entries(read):
+    experiment = read(GOOD)
+    assert [entry.log for entry in experiment.logs] == ["plaza2", None]
+    assert experiment.logs[1].seeds == (0, 1, 2)
+    assert [entry.shown for entry in experiment.estimators] == ["ekf", "short"]
+    assert experiment.seeds == (0, 1)
+    assert experiment.sensors == (None,)
+    assert str(experiment.folder()) == "out/lags"
+
+
+def test_one_list_of_sensors_is_one_set_and_a_list_of_lists_several(read):
+    assert read(GOOD + 'sensors = ["odometry", "rfid"]').sensors == (("odometry", "rfid"),)
+    assert read(GOOD + 'sensors = [["odometry"], ["odometry", "rfid"]]').sensors == (
+        ("odometry",),
+        ("odometry", "rfid"),
+    )
+
+
+@pytest.mark.parametrize("text", ['"short.lag" = [1, 2]', "short.lag = [1, 2]"])
+def test_a_sweep_is_the_same_with_quoted_and_with_nested_keys(read, text):
+    assert read(f"{GOOD}[sweep]\n{text}").sweep.points() == [{"short.lag": 1}, {"short.lag": 2}]
+
+
+def test_a_grid_takes_every_value_with_every_other_and_a_list_the_first_with_the_first():
+    over = {"a.x": [1, 2], "b.y": ["u", "v"]}
+    assert len(Sweep.model_validate(over).points()) == 4
+    in_step = Sweep.model_validate(over | {"mode": "list"}).points()
+    assert in_step == [{"a.x": 1, "b.y": "u"}, {"a.x": 2, "b.y": "v"}]
+
+
+def test_changes_reach_keys_estimators_and_simulated_logs(read):
+    experiment = read(
+        GOOD, ("seeds", 7), ("report.baseline", "ekf"), ("short.lag", 5), ("smoother.relinearize", True),
+        ("simulation.drive.duration", 20), ("sweep.short.lag", [1, 2]),
+    )  # fmt: skip
+    assert experiment.seeds == (7,)
+    assert experiment.report.baseline == "ekf"
+    assert experiment.estimators[0].settings == {}
+    assert experiment.estimators[1].settings == {"lag": 5, "relinearize": True}
+    assert experiment.logs[1].settings == {"drive": {"duration": 20}}
+    assert experiment.sweep.over == {"short.lag": (1, 2)}
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        ("sedes = 1", ["sedes", "did you mean seeds?"]),
+        ("estimators = [{nmae = 'ekf'}]", ["estimators", "nmae", "did you mean name?"]),
+        ("[limits]\nmemroy = 3", ["memroy", "did you mean memory?"]),
+        ("[limits]\ntime = 0", ["limits.time", "0"]),
+        ("[report]\nbaseline = 'efk'", ["efk", "did you mean ekf?"]),
+        ("[sweep]\n'smother.lag' = [1]", ["smother.lag", "did you mean smoother?"]),
+        ("[sweep]\n'short.lag' = []", ["short.lag", "no values"]),
+        ("[sweep]\nmode = 'list'\n'short.lag' = [1]\n'ekf.max_delay' = [1, 2]", ["as many values"]),
+        ("[sweep]\nmode = 'gird'\n'short.lag' = [1]", ["mode", "gird"]),
+        ("seeds = '5:2'", ["seeds", "5:2", "0:10"]),
+        ("sensors = []\nprior = ''", ["prior"]),
+        ("estimators = ['ekf', 'ekf']", ["ekf", "label"]),
+        ("estimators = []", ["estimators"]),
+        ("logs = [{simulate = 'office', rig = 'a.rig.toml'}]", ["rig", "simulate"]),
+        ("logs = [{log = 'plaza2', simulate = 'office'}]", ["either log or simulate"]),
+        ("name = '../out'", ["name", "../out"]),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_key_and_value(read, text, fragments):
+    key = text.partition(" = ")[0].strip("[]")
+    kept = "\n".join(line for line in GOOD.splitlines() if not line.startswith(f"{key} ="))
+    with pytest.raises(InputError) as caught:
+        read(f"{kept}\n{text}")
+    for fragment in ("a.toml", *fragments):
+        assert fragment in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "hint"), [(("sedes", 1), "seeds"), (("shrot.lag", 1), "short"), (("simulatoin.name", 1), "simulation")]
+)
+def test_a_misspelt_change_names_the_nearest(read, change, hint):
+    with pytest.raises(InputError, match=f"did you mean {hint}"):
+        read(GOOD, change)

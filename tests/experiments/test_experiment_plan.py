@@ -1,0 +1,164 @@
+"""Which runs an experiment has, and what their keys depend on."""
+
+import dataclasses
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments import facts, keys
+from factorgraph_loc.experiments.experiment_file import Experiment
+from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.readers import write_native
+
+
+@pytest.fixture
+def logs(tmp_path, log):
+    """A folder with two native logs, ``one`` and ``two``."""
+    for name in ("one", "two"):
+        write_native(dataclasses.replace(log, name=name), tmp_path / "logs" / name)
+    return tmp_path / "logs"
+
+
+@pytest.fixture
+def planned(logs, tmp_path):
+    """``planned(**content)``: the runs of an experiment with other keys than the usual ones."""
+
+    def make(**content):
+        usual = {"name": "a", "logs": ["one", "two"], "estimators": ["dead_reckoning"]}
+        return plan(Experiment.model_validate(usual | content), logs, tmp_path)
+
+    return make
+
+
+def test_a_glob_stands_for_all_logs_of_a_folder_and_for_known_names(planned):
+    assert [run.log for run in planned(logs=["[ot]*"])] == ["one", "two"]
+    assert {run.log for run in planned(logs=["plaza*"])} == {"plaza1", "plaza2"}
+    with pytest.raises(InputError, match=r"no log matches 'thre\*'"):
+        planned(logs=["thre*"])
+
+
+def test_seeds_are_for_estimators_that_are_random(planned):
+    runs = planned(logs=["one"], estimators=["ekf", "particle_filter"], seeds=[3, 4])
+    assert [(run.label, run.seed) for run in runs] == [("ekf", 3), ("particle_filter", 3), ("particle_filter", 4)]
+
+
+def test_a_sweep_concerns_the_estimators_that_it_names_and_simulated_logs(planned):
+    simulated = {"simulate": "office", "settings": {"drive": {"duration": 5}}}
+    sweep = {"short.lag": [1, 2], "simulation.world.tags": [10, 20]}
+    estimators = ["ekf", {"name": "smoother", "label": "short"}]
+    runs = planned(logs=["one", simulated], estimators=estimators, sweep=sweep)
+    by_log = {log: [(r.label, dict(r.sweep)) for r in runs if r.log == log] for log in ("one", "office-0")}
+    assert by_log["one"] == [("ekf", {}), ("short", {"short.lag": 1}), ("short", {"short.lag": 2})]
+    assert len(by_log["office-0"]) == 2 + 4
+    assert [r.settings for r in runs if r.label == "short"][:2] == [{"lag": 1}, {"lag": 2}]
+    assert len({r.key for r in runs}) == len(runs)
+
+
+def test_a_second_plan_has_the_same_keys_without_numerical_libraries(planned, logs, tmp_path):
+    before = planned(logs=["one"], estimators=["ekf", "particle_filter"], prior="reference")
+    script = (
+        "import sys, pathlib\n"
+        "from factorgraph_loc.experiments.experiment import plan, Experiment\n"
+        "e = Experiment(name='a', logs=['one'], estimators=['ekf', 'particle_filter'], prior='reference')\n"
+        f"print(*(r.key for r in plan(e, pathlib.Path({str(logs)!r}), pathlib.Path({str(tmp_path)!r}))))\n"
+        "print(*{'numpy', 'gtsam', 'polars', 'numba'} & set(sys.modules))\n"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == [" ".join(run.key for run in before), ""]
+
+
+def test_a_key_changes_with_everything_that_a_result_depends_on(planned, logs, monkeypatch):
+    def key(**content):
+        (run,) = planned(logs=["one"], **content)
+        return run.key
+
+    found = [
+        key(),
+        key(estimators=["ekf"]),
+        key(estimators=[{"name": "ekf", "settings": {"max_delay": 0.4}}]),
+        key(sensors=["odometry"]),
+        key(prior="0,0,0"),
+        key(seeds=[1]),
+    ]
+    with (logs / "one" / "odometry.csv").open("a") as file:
+        file.write("1700000099000000000,0,0\n")
+    found.append(key())
+    for name, value in (("code_version", "x"), ("library_versions", {"gtsam": "9"})):
+        monkeypatch.setattr(keys, name, lambda value=value: value)
+        monkeypatch.setattr(facts, name, lambda value=value: value)
+        found.append(key())
+    assert len(set(found)) == len(found)
+
+
+def test_a_key_does_not_change_with_what_a_result_does_not_depend_on(planned, logs):
+    (before,) = planned(logs=["one"])
+    for file in (logs / "one").iterdir():
+        file.touch()
+    moved = logs.rename(logs.parent / "elsewhere")
+    (after,) = planned(logs=[str(moved / "one")])
+    assert after.key == before.key
+    # said with other words: the default is the same setting
+    delay = planned(logs=[str(moved / "one")], estimators=["ekf"])[0].key
+    assert (
+        planned(logs=[str(moved / "one")], estimators=[{"name": "ekf", "settings": {"max_delay": 0.5}}])[0].key == delay
+    )
+
+
+def test_the_rig_and_the_map_that_are_given_are_part_of_the_log(planned, logs):
+    rig, world = (next((logs / "one").glob(f"*.{kind}.toml")) for kind in ("rig", "world"))
+    (own,) = planned(logs=["one"])
+    (given,) = planned(logs=[{"log": "one", "rig": str(rig), "world": str(world)}])
+    world.write_text(world.read_text() + "\n")
+    (changed,) = planned(logs=[{"log": "one", "rig": str(rig), "world": str(world)}])
+    assert len({own.key, given.key, changed.key}) == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "fragment"),
+    [
+        ({"logs": ["one", "one"]}, "two logs are called one"),
+        ({"logs": ["thre"]}, "thre"),
+        ({"estimators": ["efk"]}, "did you mean ekf?"),
+        ({"estimators": [{"name": "ekf", "settings": {"max_dely": 1}}]}, "did you mean max_delay?"),
+        ({"sweep": {"dead_reckoning.max_dely": [1]}}, "did you mean max_delay?"),
+        ({"sensors": ["odometri"]}, "did you mean odometry?"),
+        ({"prior": "1,2"}, "X,Y,HEADING"),
+        ({"logs": [{"simulate": "ofice"}]}, "did you mean office?"),
+        ({"logs": [{"simulate": "office", "settings": {"drvie": {}}}]}, "did you mean drive?"),
+    ],
+)
+def test_what_cannot_be_run_is_told_before_anything_runs(planned, content, fragment):
+    with pytest.raises(InputError) as caught:
+        planned(**content)
+    assert fragment in str(caught.value)
+
+
+def test_a_file_is_read_again_only_if_it_has_changed(tmp_path, monkeypatch):
+    file, cache = tmp_path / "a.csv", tmp_path / "digests.json"
+    file.write_text("1")
+    monkeypatch.setattr(keys, "_UNSETTLED", -1.0)
+    digests = keys.FileDigests(cache)
+    first = digests.of_file(file)
+    digests.save()
+    monkeypatch.setattr(keys, "hashlib", SimpleNamespace())
+    assert keys.FileDigests(cache).of_file(file) == first
+    monkeypatch.undo()
+    file.write_text("12")
+    assert keys.FileDigests(cache).of_file(file) != first
+    cache.write_text("{")
+    assert keys.FileDigests(cache).of_file(file) != first
+
+
+def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run():
+    script = (
+        "import sys, factorgraph_loc.experiments.stored_run, factorgraph_loc.readers, factorgraph_loc.simulation\n"
+        "from factorgraph_loc.estimators import registry\n"
+        "for name in registry.ESTIMATORS: registry._load(name, 1)\n"
+        "print(*sys.modules)"
+    )
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    outside = tuple(f"factorgraph_loc.{part.replace('/', '.')}" for part in keys.OUTSIDE)
+    assert [name for name in loaded if name.startswith(outside)] == []

@@ -1,0 +1,201 @@
+"""Results on disk are whole or not there, damage is found, and two processes do not meet at one run."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.store import FAILURE, MANIFEST, METRICS, TIMINGS, Store, StoreError
+
+KEY, OTHER = "ab" * 32, "cd" * 32
+FILES = {
+    METRICS: b'{"causal.position_rmse": 0.5}',
+    "estimates.parquet": bytes(1000),
+    TIMINGS: b'{"timing.run_seconds": 2.0}',
+}
+
+
+@pytest.fixture
+def store(tmp_path):
+    made = Store(tmp_path / "out")
+    made.create()
+    return made
+
+
+def age(folder, seconds=-10):
+    """Give the files of a run another time of change, the manifest excluded."""
+    for file in folder.iterdir():
+        if file.name != MANIFEST:
+            then = file.stat().st_mtime + seconds
+            os.utime(file, (then, then))
+
+
+def test_what_is_put_is_there_with_its_scores(store):
+    assert store.state(KEY) == "missing"
+    store.put(KEY, FILES)
+    assert store.state(KEY, thorough=True) == "ok"
+    assert store.has(KEY)
+    assert store.read(KEY, METRICS) == FILES[METRICS]
+    row = store.row(KEY)
+    assert row == {"status": "ok", "kind": None, "reason": None, "causal.position_rmse": 0.5, "timing.run_seconds": 2.0}
+
+
+def test_a_failure_is_a_result_with_a_reason_and_can_be_replaced(store):
+    store.put(KEY, {FAILURE: b'{"kind": "timeout", "reason": "it took more than 3 s"}'})
+    assert store.state(KEY) == "failed"
+    assert store.row(KEY) == {"status": "failed", "kind": "timeout", "reason": "it took more than 3 s"}
+    store.put(KEY, FILES)
+    assert store.state(KEY) == "ok"
+    assert not (store.path(KEY) / FAILURE).exists()
+
+
+@settings(max_examples=20)
+@given(st.sampled_from([METRICS, "estimates.parquet"]), st.integers(0, 10**6), st.integers(1, 255))
+def test_any_changed_byte_is_found(tmp_path_factory, name, place, change):
+    store = Store(tmp_path_factory.mktemp("flipped"))
+    store.create()
+    store.put(KEY, FILES)
+    file = store.path(KEY) / name
+    content = bytearray(file.read_bytes())
+    content[place % len(content)] ^= change
+    file.write_bytes(content)
+    assert store.state(KEY, thorough=True) == "damaged"
+    with pytest.raises(InputError, match="damaged"):
+        store.read(KEY, name)
+
+
+def test_a_quick_look_sees_what_was_written_later_and_a_thorough_one_what_was_not(store):
+    store.put(KEY, FILES)
+    file = store.path(KEY) / "estimates.parquet"
+    file.write_bytes(bytes(999) + b"x")
+    assert store.state(KEY) == "damaged"
+    age(store.path(KEY))
+    assert store.state(KEY) == "ok"
+    assert store.state(KEY, thorough=True) == "damaged"
+
+
+@pytest.mark.parametrize("what", ["truncated", "gone", "no manifest", "empty manifest", "manifest of another"])
+def test_a_quick_look_sees_gross_damage(store, what):
+    store.put(KEY, FILES)
+    folder = store.path(KEY)
+    match what:
+        case "truncated":
+            (folder / "estimates.parquet").write_bytes(b"")
+        case "gone":
+            (folder / "estimates.parquet").unlink()
+        case "no manifest":
+            (folder / MANIFEST).unlink()
+        case "empty manifest":
+            (folder / MANIFEST).write_bytes(b"")
+        case "manifest of another":
+            store.put(OTHER, FILES)
+            (folder / MANIFEST).write_bytes((store.path(OTHER) / MANIFEST).read_bytes())
+    assert store.state(KEY) == "damaged"
+    store.put(KEY, FILES)
+    assert store.state(KEY, thorough=True) == "ok"
+
+
+def test_times_may_be_lost_without_the_run(store):
+    store.put(KEY, FILES)
+    (store.path(KEY) / TIMINGS).write_bytes(b"{")
+    assert store.state(KEY, thorough=True) == "ok"
+    assert store.row(KEY)["causal.position_rmse"] == 0.5
+
+
+def hold(folder, connection):
+    """In another process: claim KEY and tell, until told to die."""
+    with Store(folder).claim(KEY) as mine:
+        connection.send(mine)
+        connection.recv()
+
+
+def test_a_claim_ends_with_its_owner_however_that_ends(store):
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe()
+    other = context.Process(target=hold, args=(store.folder.parent, there))
+    other.start()
+    assert here.recv() is True
+    with store.claim(KEY) as mine:
+        assert not mine
+    with store.claim(OTHER) as mine:
+        assert mine
+    other.kill()
+    other.join()
+    with store.claim(KEY) as mine:
+        assert mine
+    assert list((store.folder / "claims").iterdir()) == []
+
+
+def test_of_many_that_claim_at_once_one_gets_it(store):
+    # each process claims and lets go in turn; a claim by two at once would leave a mark that the other has not removed
+    script = (
+        "import sys; from pathlib import Path; from factorgraph_loc.experiments.store import Store\n"
+        "store, mark, got = Store(Path(sys.argv[1])), Path(sys.argv[1]) / 'mark', 0\n"
+        "while got < 300:\n"
+        "    with store.claim('ab') as mine:\n"
+        "        if mine: mark.touch(exist_ok=False); mark.unlink(); got += 1\n"
+    )
+    command = [sys.executable, "-c", script, str(store.folder.parent)]
+    others = [subprocess.Popen(command) for _ in range(3)]
+    assert [other.wait(60) for other in others] == [0, 0, 0]
+
+
+def test_what_a_dead_process_left_half_written_is_removed_and_what_a_living_one_writes_is_not(store):
+    for key in (KEY, OTHER):
+        (store.folder / "tmp" / key / "run").mkdir(parents=True)
+    with store.claim(OTHER) as mine:
+        assert mine
+        store.create()
+        assert [path.name for path in (store.folder / "tmp").iterdir()] == [OTHER]
+    assert store.state(KEY) == "missing"
+
+
+def test_a_write_that_fails_leaves_what_was_there(store, monkeypatch):
+    store.put(KEY, FILES)
+
+    def full(_handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StoreError, match="No space left on device"):
+        store.put(KEY, FILES | {METRICS: b"{}"})
+    monkeypatch.undo()
+    assert store.read(KEY, METRICS) == FILES[METRICS]
+    assert list((store.folder / "tmp").iterdir()) == []
+
+
+def test_a_full_disk_is_told_and_the_store_stays_whole(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"a small tmpfs cannot be mounted: {mounted.stderr.strip()}")
+    try:
+        store = Store(disk)
+        store.create()
+        store.put(KEY, FILES)
+        with pytest.raises(StoreError, match=r"cannot be written.*No space left"):
+            store.put(OTHER, FILES | {"estimates.parquet": bytes(10**6)})
+        assert store.state(KEY, thorough=True) == "ok"
+        assert store.state(OTHER) == "missing"
+        store.put(OTHER, FILES)
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize("folder", ["a file", "/proc"])  # neither of which root can write into
+def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path, folder):
+    path = Path("/proc/nowhere")
+    if folder == "a file":
+        (tmp_path / "file").write_text("")
+        path = tmp_path / "file" / "out"
+    with pytest.raises(StoreError, match="cannot be written"):
+        Store(path).create()
