@@ -48,9 +48,9 @@ def run_planned(run: PlannedRun, folder: Path, *, again: bool = False) -> Outcom
             return Outcome(run.key, "busy")
         state = store.state(run.key)
         if state == "ok" or (state == "failed" and not again):
-            return _outcome(run.key, store)
+            return stored_outcome(run.key, store)
         store.put(run.key, compute(run))
-        return _outcome(run.key, store)
+        return stored_outcome(run.key, store)
 
 
 def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Outcome:
@@ -61,7 +61,7 @@ def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Out
             return Outcome(run.key, "busy")
         if store.state(run.key) != "ok":
             store.put(run.key, {FAILURE: failure_file(kind, reason)})
-        return _outcome(run.key, store)
+        return stored_outcome(run.key, store)
 
 
 def compute(run: PlannedRun) -> dict[str, bytes]:
@@ -110,7 +110,8 @@ def _load(source: LogSource, digest: str) -> Log:
     return source.load()
 
 
-def _outcome(key: str, store: Store) -> Outcome:
+def stored_outcome(key: str, store: Store) -> Outcome:
+    """What became of a run whose results, or whose failure, are stored."""
     state = store.state(key)
     if state == "failed":
         return Outcome(key, "failed", str(store.row(key)["reason"]))

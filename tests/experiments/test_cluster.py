@@ -1,0 +1,139 @@
+"""An experiment on a real cluster of two worker processes: nothing is lost with a worker, nothing is stored twice."""
+
+import os
+import signal
+import sys
+from collections import Counter
+
+import pytest
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.experiments import cluster
+from factorgraph_loc.experiments.experiment_file import Limits, read_experiment
+from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.experiments.store import Store
+
+distributed = pytest.importorskip("distributed")
+EXPERIMENT = """
+name = "drives"
+logs = [{simulate = "office", seeds = "0:%d", settings = {drive = {duration = 10.0}, world = {tags = 0, landmarks = 12}}}]
+estimators = ["dead_reckoning", "ekf"]
+sensors = ["odometry", "bearing_range"]
+"""
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """A scheduler with two workers, each a process of its own."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=0
+    ) as made:
+        yield made
+
+
+@pytest.fixture
+def planned(tmp_path):
+    """``planned(n)``: the runs of n short drives, two a drive, and the folder for their results."""
+
+    def make(drives):
+        (tmp_path / "drives.toml").write_text(EXPERIMENT % drives)
+        folder = tmp_path / "out"
+        Store(folder).create()
+        experiment = read_experiment(tmp_path / "drives.toml")
+        return plan(experiment, tmp_path, Store(folder).folder, None), folder
+
+    return make
+
+
+@pytest.fixture
+def stored(monkeypatch):
+    """How often the results of each run were stored."""
+    count = Counter()
+    put = Store.put
+
+    def counted(self, key, files):
+        count[key] += 1
+        put(self, key, files)
+
+    monkeypatch.setattr(Store, "put", counted)
+    return count
+
+
+def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, planned, stored):
+    runs, folder = planned(6)
+    outcomes = []
+    for outcome in cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()):
+        outcomes.append(outcome)
+        if len(outcomes) == 3:  # both are at work, with more runs than they compute
+            os.kill(workers.workers[0].pid, signal.SIGKILL)
+    keys = {run.key for run in runs}
+    assert len(runs) == len(keys) == 12
+    assert [outcome.status for outcome in outcomes] == ["ok"] * 12
+    assert stored == dict.fromkeys(keys, 1)
+    store = Store(folder)
+    assert all(store.state(key, thorough=True) == "ok" for key in keys)
+    assert not list((store.folder / "claims").iterdir())
+
+
+def test_what_is_stored_is_not_run_again(workers, planned, stored):
+    runs, folder = planned(2)
+    first = list(cluster.execute(runs[:2], folder, scheduler=workers.scheduler_address, limits=Limits()))
+    again = list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
+    assert {o.key for o in first} == {r.key for r in runs[:2]}
+    assert {o.key for o in again} == {r.key for r in runs}
+    assert stored == {run.key: 1 for run in runs}
+
+
+def test_a_run_that_another_process_has_is_waited_for(workers, planned, stored):
+    runs, folder = planned(1)
+    claim = Store(folder).claim(runs[0].key)
+    assert claim.__enter__()
+    outcomes = cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits())
+    assert next(outcomes).key == runs[1].key
+    assert not stored[runs[0].key]
+    claim.__exit__(None, None, None)
+    assert [outcome.key for outcome in outcomes] == [runs[0].key]
+
+
+def test_a_run_that_takes_too_long_is_a_failure_and_its_worker_begins_anew(workers, planned):
+    runs, folder = planned(1)
+    before = {worker.pid for worker in workers.workers.values()}
+    outcomes = list(cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits(time=1e-3)))
+    assert [(o.status, o.reason) for o in outcomes] == [("failed", "it took more than 0.001 s")]
+    assert Store(folder).row(runs[0].key)["kind"] == "timeout"
+    assert {worker.pid for worker in workers.workers.values()} != before
+    kept = list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
+    assert sorted(o.status for o in kept) == ["failed", "ok"]
+    tried = list(cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits(), again=True))
+    assert [o.status for o in tried] == ["ok"]
+
+
+def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypatch):
+    runs, folder = planned(1)
+    monkeypatch.setattr(cluster, "version_here", lambda: "of another day")
+    with pytest.raises(InputError, match="another version of the code"):
+        list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
+    assert not stored
+    assert not list((Store(folder).folder / "claims").iterdir())
+
+
+def test_a_scheduler_that_goes_away_ends_the_experiment_not_the_results(planned, monkeypatch):
+    runs, folder = planned(3)
+    monkeypatch.setattr(cluster, "CONNECT", 2.0)
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as made:
+        outcomes = cluster.execute(runs, folder, scheduler=made.scheduler_address, limits=Limits())
+        first = next(outcomes)
+        made.close()
+        with pytest.raises(RunFailedError, match="the scheduler went away"):
+            list(outcomes)
+    assert Store(folder).state(first.key) == "ok"
+
+
+def test_no_scheduler_and_no_package_are_told_in_a_line(planned, monkeypatch):
+    runs, folder = planned(1)
+    monkeypatch.setattr(cluster, "CONNECT", 0.5)
+    with pytest.raises(InputError, match="no scheduler answers there"):
+        list(cluster.execute(runs, folder, scheduler="tcp://127.0.0.1:9", limits=Limits()))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[cluster\]'"):
+        list(cluster.execute(runs, folder, scheduler="tcp://127.0.0.1:9", limits=Limits()))
