@@ -1,0 +1,138 @@
+"""What a robot whose place is nearly known expects to learn on a path, by Fisher's information in closed form.
+
+A Gaussian belief is carried along the path by the odometry's noise; at each look the information that the sensors are expected to
+give at the mean is added (van Trees, "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4: the bound that
+an efficient estimator reaches). No measurement is drawn. It holds while the sensors' models are nearly linear over the belief.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.planning.information import POSITION, ROUNDS_PER_METRE, gaussian_entropy
+from factorgraph_loc.planning.paths import Path
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.settings import PixelSettings, SightingSettings
+from factorgraph_loc.simulation.sightings import crosses
+from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.world import World
+from factors import bearing_range, odometry, reprojection, se2
+from factors.bearing_range import BearingRangeModel
+from factors.odometry import ChainState, OdometryModel
+from factors.reprojection import CameraModel
+from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.se2 import Array
+
+SPEED = 0.5  # m/s, at which the odometry's noise that grows with time is taken
+_SIGHTINGS, _PIXELS = SightingSettings(), PixelSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion. The
+    other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna; ``looks_per_metre``: of
+    the others. Landmarks are seen up to ``max_range`` [m], at most ``max_points`` points up to ``max_depth`` [m], neither through
+    walls."""
+
+    world: World
+    odometry: OdometryModel
+    rfid: RfidLikelihood | None = None
+    bearing_range: BearingRangeModel | None = None
+    camera: CameraModel | None = None
+    rounds_per_metre: float = ROUNDS_PER_METRE
+    looks_per_metre: float = _SIGHTINGS.rate / SPEED
+    max_range: float = _SIGHTINGS.max_range
+    max_depth: float = _PIXELS.max_depth
+    max_points: int = _PIXELS.max_points
+
+    @staticmethod
+    def of(world: World, rig: Rig) -> Sensors:
+        """All sensors of a rig that find something in the world."""
+        return Sensors(
+            world,
+            rig.odometry_model(constants_as_noise=True),
+            RfidLikelihood(rig.rfid.model(), tag_map(world, rig.survey).tags) if rig.rfid and world.tags else None,
+            rig.bearing_range.model() if rig.bearing_range and world.landmarks else None,
+            rig.camera.model() if rig.camera and world.points is not None else None,
+        )
+
+
+def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:
+    """The covariance (3, 3) of x, y, heading in the world's frame that is expected at the end of a path, of a belief with ``mean``
+    (3,) and ``covariance`` (3, 3) in the world's frame at its start. The robot looks at each pose of the path but the first."""
+    body = se2.world_to_body(mean, covariance)
+    poses = se2.compose(mean, path.poses)
+    told = expected_information(poses[1:], np.diff(path.way), sensors)
+    turns = np.concatenate((np.zeros(1), np.cumsum(np.abs(se2.wrap(np.diff(path.poses[:, 2]))))))
+    states = [
+        ChainState(way / SPEED, x, y, heading, way, turn, 0.0)
+        for way, (x, y, heading), turn in zip(path.way.tolist(), path.poses.tolist(), turns.tolist(), strict=True)
+    ]
+    for (before, after), information in zip(pairwise(states), told, strict=True):
+        body = propagate(body, odometry.relative_motion(sensors.odometry, before, after))
+        # the same as inverting the sum of informations, also where the belief is certain of something
+        body = np.linalg.solve(np.eye(3) + body @ information, body)
+        body = (body + body.T) / 2.0
+    return se2.body_to_world(poses[-1], body)
+
+
+def fisher_gain(
+    mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors, *, dims: Sequence[str] = POSITION
+) -> Array:
+    """Expected reduction of entropy (C,) [nats] on each of C paths, in the dimensions ``dims``; see :func:`expected_covariance`."""
+    after = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors), dims) for path in paths]
+    return np.asarray(gaussian_entropy(covariance, dims) - np.array(after, dtype=float))
+
+
+def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:
+    """Fisher's information (N, 3, 3) on the body-frame perturbation of poses (N, 3), from all sensors, of ``ways`` (N,) metres that
+    are driven about each."""
+    out = np.zeros((len(poses), 3, 3))
+    if sensors.rfid is not None:
+        count = len(sensors.rfid.model.antennas)
+        hits = np.zeros((count, len(sensors.rfid.tags.points)), dtype=np.int64)
+        one_round = Looks(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
+        # in proportion to the rounds, whatever was read in them
+        found = sensors.rfid.score(poses, one_round).information
+        out += (sensors.rounds_per_metre * ways)[:, None, None] * found
+    looks = (sensors.looks_per_metre * ways)[:, None, None]
+    if sensors.bearing_range is not None:
+        out += looks * _of_landmarks(sensors.bearing_range, poses, sensors)
+    if sensors.camera is not None:
+        out += looks * np.array([_of_points(sensors.camera, pose, sensors) for pose in poses]).reshape(-1, 3, 3)
+    return out
+
+
+def _of_landmarks(model: BearingRangeModel, poses: Array, sensors: Sensors) -> Array:
+    """Information (N, 3, 3) of one look at the landmarks in sight from each pose (N, 3)."""
+    points = sensors.world.positions()
+    eyes = se2.compose(poses, np.array(model.mounting))
+    apart = np.hypot(*np.moveaxis(points[None] - eyes[:, None, :2], -1, 0))
+    n, k = np.nonzero(apart <= sensors.max_range)
+    seen = ~crosses(sensors.world, eyes[n, :2], points[k])
+    n, k = n[seen], k[seen]
+    by_pose, _, _ = bearing_range.jacobians(model, poses[n], points[k])
+    ranges, _ = bearing_range.predict(model, poses[n], points[k])
+    whitened = by_pose / bearing_range.sigmas(model, ranges)[:, :, None]
+    out = np.zeros((len(poses), 3, 3))
+    np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
+    return out
+
+
+def _of_points(model: CameraModel, pose: Array, sensors: Sensors) -> Array:
+    """Information (3, 3) of one image of the points in sight from a pose (3,)."""
+    assert sensors.world.points is not None, "a camera has points to look at"
+    points = sensors.world.points.positions
+    pixels, depth = reprojection.predict(model, pose, points)
+    near = np.flatnonzero((depth > 0.0) & (depth <= sensors.max_depth) & model.contains(pixels))
+    eye, _ = reprojection.camera_pose(model, pose)
+    seen = near[~crosses(sensors.world, np.broadcast_to(eye[:2], (len(near), 2)), points[near, :2])]
+    _, by_pose, _, _ = reprojection.linearize(model, pose, points[seen])
+    share = min(1.0, sensors.max_points / max(len(seen), 1))
+    weight = share * model.tempering / model.sigma**2
+    return np.asarray(weight * np.einsum("kia,kib->ab", by_pose, by_pose))

@@ -1,0 +1,118 @@
+"""Expected covariance along a path: against the motion model, numerical Jacobians, and the Monte-Carlo gain."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.planning.fisher import Sensors, expected_covariance, expected_information, fisher_gain
+from factorgraph_loc.planning.information import expected_gain, gaussian_entropy
+from factorgraph_loc.planning.paths import Path, primitives
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.settings import RACKHAM_RIG
+from factorgraph_loc.world import Landmark, Tag, World
+from factors import bearing_range, reprojection, se2
+from factors.odometry import ChainState, Growth, OdometryModel, relative_motion
+
+RIG = Rig.model_validate(RACKHAM_RIG)
+NOISE = OdometryModel(along=Growth(0.02), lateral=Growth(0.01), heading=Growth(0.03))
+MEAN = np.array((1.0, 2.0, 0.7))
+COVARIANCE = np.array(((0.04, 0.01, 0.002), (0.01, 0.03, -0.001), (0.002, -0.001, 0.01)))
+STRAIGHT = next(p for p in primitives(4.0) if p.length > 3.9 and not p.poses[:, 1:].any())
+STEP = Path(STRAIGHT.poses[:2], "arc")
+
+
+def numerical(function, pose):
+    """Derivative by the body-frame perturbation."""
+    h = 1e-6
+    moves = h * np.eye(3)
+    ends = [(function(se2.compose(pose, se2.exp(m))) - function(se2.compose(pose, se2.exp(-m)))) for m in moves]
+    return np.stack(ends, axis=-1) / (2.0 * h)
+
+
+def test_without_sensors_it_is_the_motion_model_alone():
+    found = expected_covariance(MEAN, COVARIANCE, STRAIGHT, Sensors(World(), NOISE))
+    start, end = (ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), ChainState(8.0, 4.0, 0.0, 0.0, 4.0, 0.0, 0.0))
+    increment = relative_motion(NOISE, start, end)
+    transition = se2.adjoint(se2.inverse(increment.delta))
+    body = transition @ se2.world_to_body(MEAN, COVARIANCE) @ transition.T + increment.covariance
+    expected = se2.body_to_world(se2.compose(MEAN, increment.delta), body)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_one_look_at_a_landmark_is_one_update_of_a_kalman_filter():
+    world = World(landmarks={"L": Landmark(x=4.0, y=3.0), "far": Landmark(x=40.0, y=3.0)})
+    model = RIG.bearing_range.model()
+    sensors = Sensors(world, OdometryModel(), bearing_range=model, looks_per_metre=1.0 / STEP.length)
+    end = se2.compose(MEAN, STEP.poses[-1])
+    point = world.positions()[:1]
+    jacobian = numerical(lambda p: np.concatenate(bearing_range.predict(model, p, point)), end)
+    noise = np.diag(bearing_range.sigmas(model, bearing_range.predict(model, end, point)[0])[0] ** 2)
+    transition = se2.adjoint(se2.inverse(STEP.poses[-1]))
+    body = transition @ se2.world_to_body(MEAN, COVARIANCE) @ transition.T
+    gain = body @ jacobian.T @ np.linalg.inv(jacobian @ body @ jacobian.T + noise)
+    expected = se2.body_to_world(end, (np.eye(3) - gain @ jacobian) @ body)
+    np.testing.assert_allclose(expected_covariance(MEAN, COVARIANCE, STEP, sensors), expected, rtol=1e-4, atol=1e-7)
+
+
+def test_points_in_view_of_a_camera_tell_what_their_pixels_do():
+    model = RIG.camera.model()
+    points = np.array(((4.0, 2.2, 1.0), (4.0, 1.5, 1.4), (-4.0, 2.0, 1.0)))  # the last is behind the robot
+    world = World(points=PointMap.of(["a", "b", "c"], points))
+    pose = np.array((0.0, 2.0, 0.0))
+    sensors = Sensors(world, OdometryModel(), camera=model, looks_per_metre=2.0)
+    jacobian = numerical(lambda p: reprojection.predict(model, p, points[:2])[0].ravel(), pose)
+    expected = 2.0 * model.tempering * jacobian.T @ jacobian / model.sigma**2
+    np.testing.assert_allclose(expected_information(pose[None], np.ones(1), sensors)[0], expected, rtol=1e-4)
+    hidden = world.model_copy(update={"walls": ((2.0, -5.0, 2.0, 9.0),)})
+    assert not expected_information(pose[None], np.ones(1), replace(sensors, world=hidden)).any()
+    one_of_two = replace(sensors, max_points=1)
+    np.testing.assert_allclose(expected_information(pose[None], np.ones(1), one_of_two)[0], expected / 2.0, rtol=1e-4)
+
+
+def test_no_landmark_is_seen_through_a_wall():
+    world = World(landmarks={"L": Landmark(x=4.0, y=2.0)}, walls=((2.5, -5.0, 2.5, 9.0),))
+    sensors = Sensors(world, NOISE, bearing_range=RIG.bearing_range.model())
+    assert not expected_information(np.array(((1.0, 2.0, 0.0),)), np.ones(1), sensors).any()
+    assert expected_information(np.array(((3.0, 2.0, 0.0),)), np.ones(1), sensors).any()
+
+
+def tagged(*places):
+    return World(tags={f"T{i}": Tag(x=float(x), y=float(y), z=1.2) for i, (x, y) in enumerate(places)})
+
+
+@pytest.mark.parametrize("dims", [("x", "y"), ("x", "y", "heading")])
+def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow(dims):
+    """As narrow as the sensors are linear, and tags at the end of their reach, so that the belief does not fall below what the
+    particles resolve. The order of the paths is the same too."""
+    world, paths = tagged((4.8, 3.0), (-1.5, 5.5)), [p for p in primitives(1.5) if p.length > 1.4][::5]
+    sensors = replace(Sensors.of(world, RIG), odometry=NOISE)
+    covariance = np.diag((0.3**2, 0.3**2, 0.15**2))
+    rng = np.random.default_rng(0)
+    particles = rng.multivariate_normal(MEAN, covariance, 2000)
+    weights = np.full(2000, 1.0 / 2000)
+    drawn = expected_gain(sensors.rfid, particles, weights, paths, rng, dims=dims, noise=NOISE, samples=2000, scans=200)
+    closed = fisher_gain(MEAN, covariance, paths, sensors, dims=dims)
+    assert abs(drawn - closed).max() < 0.3
+    assert np.corrcoef(drawn, closed)[0, 1] > 0.9
+    assert np.ptp(closed) > 0.3
+
+
+def test_the_gain_is_the_fall_of_entropy():
+    sensors = Sensors.of(tagged((4.8, 3.0), (-1.5, 5.5)), RIG)
+    (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], sensors)
+    after = expected_covariance(MEAN, COVARIANCE, STRAIGHT, sensors)
+    assert gain == pytest.approx(gaussian_entropy(COVARIANCE, ("x", "y")) - gaussian_entropy(after, ("x", "y")))
+    assert fisher_gain(MEAN, COVARIANCE, [], sensors).shape == (0,)
+
+
+def test_only_sensors_that_find_something_are_taken():
+    nothing = Sensors.of(World(), RIG)
+    assert nothing.rfid is None
+    assert nothing.bearing_range is None
+    assert nothing.camera is None
+    (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], nothing)
+    assert gain < 0.0
+    assert math.isfinite(gain)

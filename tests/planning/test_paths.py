@@ -1,0 +1,159 @@
+"""Candidate paths: their shapes, that they keep clear of walls, and how far they can be driven."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.planning.paths import STEP, Path, free_length, free_steps, primitives, waypoint_paths, waypoints
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation.free_space import CELL, distance_to_walls, free_space
+from factorgraph_loc.simulation.sightings import crosses
+from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.world import World
+from factors import se2
+
+CLEARANCE = 0.3
+ROOM = World(walls=((0.0, 0.0, 10.0, 0.0), (10.0, 0.0, 10.0, 6.0), (10.0, 6.0, 0.0, 6.0), (0.0, 6.0, 0.0, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def office():
+    world = make_world(preset("office").world, np.random.default_rng(4))
+    return world, free_space(world, CLEARANCE)
+
+
+def straight(length):
+    (found,) = [p for p in primitives(length) if p.length > 0.9 * length and not p.poses[:, 1:].any()]
+    return found
+
+
+@given(st.floats(0.3, 20.0))
+def test_primitives_have_their_length_and_start_at_the_robot(length):
+    paths = primitives(length)
+    assert 30 <= len(paths) <= 60
+    for path in paths:
+        np.testing.assert_array_equal(path.poses[0], 0.0)
+        assert np.diff(path.way).max() <= STEP + 1e-9
+        assert path.length == pytest.approx(length) or path.length == pytest.approx(length / 2.0)
+        # the robot drives forwards: along its heading, or on an arc
+        steps = se2.log(se2.between(path.poses[:-1], path.poses[1:]))
+        np.testing.assert_allclose(steps[:, 1], 0.0, atol=1e-9)
+        assert (steps[:, 0] > -1e-9).all()
+
+
+def test_primitives_differ():
+    ends = np.array([p.poses[-1] for p in primitives(4.0)])
+    apart = np.hypot(*(ends[:, None, :2] - ends[None, :, :2]).transpose(2, 0, 1))
+    assert apart[~np.eye(len(ends), dtype=bool)].min() > 0.1
+
+
+@pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf])
+def test_a_horizon_of_nothing_is_an_error(length):
+    with pytest.raises(InputError, match="horizon is .* m, expected a length above 0"):
+        primitives(length)
+
+
+def test_a_turn_takes_time_and_no_way():
+    straight_back = Path(np.array(((0.0, 0.0, 0.0), (0.0, 0.0, math.pi), (-1.0, 0.0, math.pi))), "arc")
+    assert straight_back.length == pytest.approx(1.0)
+    assert straight_back.duration(0.5, 1.0) == pytest.approx(1.0 / 0.5 + math.pi / 1.0)
+
+
+def test_a_path_is_cut_at_a_pose():
+    path = straight(4.0)
+    assert path.until(1.1).length == pytest.approx(1.0)
+    assert path.until(9.0).length == pytest.approx(4.0)
+
+
+def test_ways_to_places_go_through_no_wall(office):
+    world, space = office
+    rng = np.random.default_rng(0)
+    targets = waypoints(space, 40)
+    for _ in range(5):
+        pose = np.array((*space.centres[rng.integers(len(space.centres))], rng.uniform(-3.0, 3.0)))
+        paths = waypoint_paths(space, pose, targets)
+        assert len(paths) >= 39
+        for path in paths:
+            at = se2.compose(pose, path.poses)[:, :2]
+            assert not crosses(world, at[:-1], at[1:]).any()
+            assert distance_to_walls(world, at).min() > CLEARANCE - CELL
+            np.testing.assert_allclose(at[0], pose[:2])
+            assert np.hypot(*(targets - at[-1]).T).min() < 1e-9
+
+
+def test_a_way_to_a_place_in_sight_is_straight_and_others_are_the_shortest():
+    space = free_space(ROOM, CLEARANCE)
+    pose = np.array((2.0, 3.0, 1.0))
+    (path,) = waypoint_paths(space, pose, np.array(((8.05, 3.05),)))
+    cell = space.centres[space.cells(np.array(((8.05, 3.05),)))[0]]
+    assert path.length == pytest.approx(math.hypot(*(cell - pose[:2])), rel=1e-6)
+    # a wall up to 5 of 6 m: the way leads around its end
+    split = World(walls=(*ROOM.walls, (5.0, 0.0, 5.0, 5.0)))
+    (around,) = waypoint_paths(free_space(split, CLEARANCE), np.array((4.0, 2.0, 0.0)), np.array(((6.0, 2.0),)))
+    shortest = 2.0 * math.hypot(1.0, 3.0)
+    assert shortest < around.length < 1.15 * shortest + 2.0 * CLEARANCE
+
+
+def test_no_way_to_a_place_within_a_wall_or_where_the_robot_is():
+    space = free_space(ROOM, CLEARANCE)
+    here = np.array((2.0, 3.0, 0.0))
+    assert waypoint_paths(space, here, np.array(((0.1, 0.1), (-5.0, 3.0), (2.0, 3.0)))) == []
+
+
+def test_a_robot_too_close_to_a_wall_has_ways_too():
+    space = free_space(ROOM, CLEARANCE)
+    (path,) = waypoint_paths(space, np.array((0.1, 3.0, 0.0)), np.array(((5.0, 3.0),)))
+    np.testing.assert_array_equal(path.poses[0], 0.0)
+    assert path.length == pytest.approx(4.9, abs=CELL)
+
+
+def test_waypoints_are_spread(office):
+    _, space = office
+    found = waypoints(space, 30)
+    assert len(np.unique(found, axis=0)) == 30
+    # nowhere is farther from all of them than any two of them are apart
+    apart = np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1)) + 1e9 * np.eye(30)
+    nearest = np.hypot(*(space.centres[:, None] - found[None]).transpose(2, 0, 1)).min(axis=1)
+    assert nearest.max() <= apart.min() + 1e-9
+    assert len(waypoints(space, 10**6)) == len(space.centres)
+
+
+def test_free_length_is_that_to_the_wall():
+    space = free_space(ROOM, CLEARANCE)
+    path = straight(20.0)
+    poses = np.array(((2.0, 3.0, 0.0), (2.0, 3.0, math.pi), (5.0, 3.0, math.pi / 2.0), (5.0, 3.0, -math.pi / 2.0)))
+    expected = np.array((8.0, 2.0, 3.0, 3.0)) - CLEARANCE
+    found = free_length(space, poses, path)
+    assert (found <= expected + CELL / 2.0).all()
+    assert (found >= expected - CELL / 2.0 - STEP).all()
+    assert free_length(space, poses, straight(1.0)) == pytest.approx(1.0)
+
+
+def test_free_length_agrees_with_distances_to_walls(office):
+    world, space = office
+    rng = np.random.default_rng(1)
+    poses = np.column_stack((space.centres[rng.integers(len(space.centres), size=200)], rng.uniform(-3.1, 3.1, 200)))
+    paths = primitives(6.0)
+    steps = free_steps(space, poses, paths)
+    stopped = 0
+    for path, last in zip(paths, steps, strict=True):
+        np.testing.assert_array_equal(free_length(space, poses, path), path.way[last])
+        for pose, end in zip(poses[:20], last[:20].tolist(), strict=True):
+            at = se2.compose(pose, path.poses)[:, :2]
+            assert distance_to_walls(world, at[: end + 1]).min() > CLEARANCE - CELL * math.sqrt(0.5)
+            assert not crosses(world, at[:end], at[1 : end + 1]).any()
+            if end + 1 < len(at):
+                stopped += 1
+                assert distance_to_walls(world, at[end + 1 : end + 2])[0] < CLEARANCE + CELL * math.sqrt(0.5)
+    assert stopped > 100
+
+
+def test_a_robot_at_a_wall_may_leave_it_but_not_go_through():
+    space = free_space(ROOM, CLEARANCE)
+    path = straight(2.0)
+    off, into, outside = np.array(((0.15, 3.0, 0.0), (0.15, 3.0, math.pi), (-4.0, 3.0, 0.0)))
+    np.testing.assert_allclose(free_length(space, np.array((off, into, outside)), path), (2.0, 0.0, 0.0), atol=1e-9)
