@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         compare,
         convert,
         datasets,
+        experiment,
         features,
         images,
         info,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
         run,
         simulate,
     )
+    from factorgraph_loc.experiments.index import load_results
 
 __version__ = "0.1.0"
 __all__ = [
@@ -30,20 +32,25 @@ __all__ = [
     "compare",
     "convert",
     "datasets",
+    "experiment",
     "features",
     "images",
     "info",
     "load",
+    "load_results",
     "map",
     "run",
     "simulate",
 ]
 
+# by name: those that are not among the verbs; to read a table, nothing that estimates is needed
+_ELSEWHERE = {"load_results": "factorgraph_loc.experiments.index"}
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module("factorgraph_loc.api"), name)
+    return getattr(importlib.import_module(_ELSEWHERE.get(name, "factorgraph_loc.api")), name)
 
 
 def __dir__() -> list[str]:

@@ -25,6 +25,8 @@ from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.experiments import run as running
+from factorgraph_loc.experiments.cluster import on_cluster
+from factorgraph_loc.experiments.experiment import Done, prepare, run_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
@@ -43,6 +45,7 @@ __all__ = [
     "compare",
     "convert",
     "datasets",
+    "experiment",
     "features",
     "images",
     "info",
@@ -232,6 +235,31 @@ def map(
     made = maps.make_map(_one(log), options)
     made.write(Path(out), overwrite=overwrite)
     return made
+
+
+def experiment(
+    file: str | Path,
+    *,
+    changes: Settings | None = None,
+    out: str | Path | None = None,
+    data_root: str | Path | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    retry_failed: bool = False,
+    progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
+) -> Done:
+    """Make the runs of an experiment's file whose results are not there yet.
+
+    ``changes``: other values of its dotted keys, as of ``--set``. ``out``: folder of the results, else what the file says.
+    ``jobs``: processes, else one per core; ``scheduler``: address of a ``dask.distributed`` cluster in place of them.
+    ``progress`` is given the number of runs done, of all, and of failures. A run that fails is a row and a line of ``failures``.
+    """
+    root = None if data_root is None else str(data_root)
+    prepared = prepare(
+        Path(file), list((changes or {}).items()), data_root=root, out=None if out is None else Path(out)
+    )
+    executor = None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed)
+    return run_experiment(prepared, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
 
 
 def images(

@@ -95,6 +95,26 @@ def test_calibrate_writes_a_rig(tmp_path):
         fgloc.calibrate(log, tmp_path / "cart.rig.toml")
 
 
+def test_an_experiment_gives_its_table(tmp_path):
+    (tmp_path / "drives.toml").write_text(
+        'name = "drives"\nlogs = [{simulate = "office", seeds = "0:2", settings = {drive = {duration = 5.0}}}]\n'
+        'estimators = ["dead_reckoning"]\nsensors = ["odometry"]\n'
+    )
+    told = []
+    done = fgloc.experiment(
+        tmp_path / "drives.toml",
+        changes={"simulation.drive.duration": 6.0},
+        out=tmp_path / "out",
+        jobs=1,
+        progress=lambda *numbers: told.append(numbers),
+    )
+    assert not done.failures
+    table = fgloc.load_results(tmp_path / "out")
+    assert table["duration"].to_list() == [6.0, 6.0]
+    assert table.equals(done.rows)
+    assert told == [(0, 2, 0), (1, 2, 0), (2, 2, 0)]
+
+
 def test_map_writes_a_world(office, tmp_path):
     made = fgloc.map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
     assert set(read_world(tmp_path / "seen.world.toml").landmarks) == set(made.world.landmarks) != set()

@@ -40,6 +40,10 @@ def run(
     set_: Changes = None,
     out: OutFolder = None,
     jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that makes the runs instead."),
+    ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run again what failed.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and how long they may take.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help=f"Yes, these are to be more than {MANY:,} runs.")] = False,
@@ -47,8 +51,11 @@ def run(
     json: Json = False,
 ) -> None:
     """Make the runs of an experiment whose results are not there yet; can be stopped and started again at any time."""
+    from factorgraph_loc.experiments.cluster import on_cluster
     from factorgraph_loc.experiments.experiment import run_experiment
 
+    if scheduler is not None and jobs is not None:
+        raise InputError("--jobs is of this machine, but --scheduler names a cluster: expected one of them")
     prepared = _prepared(file, set_, out, data_root)
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
@@ -63,6 +70,7 @@ def run(
                 prepared,
                 jobs=jobs,
                 again=retry_failed,
+                executor=None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed),
                 progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
             )
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
@@ -30,6 +30,8 @@ from factorgraph_loc.experiments.store import FAILURE, Store
 
 if TYPE_CHECKING:
     from types import ModuleType
+
+    from factorgraph_loc.experiments.experiment import Executor, Prepared
 
 CONNECT = 10.0  # s to wait for the scheduler
 LOOK = 0.5  # s between looks at what is done, and at runs that another process had claimed
@@ -52,6 +54,12 @@ class _Sent:
 
     run: PlannedRun
     claim: ExitStack
+
+
+def on_cluster(scheduler: str, prepared: Prepared, *, again: bool = False) -> Executor:
+    """What makes the runs of an experiment on the cluster of ``scheduler``; see :func:`execute`."""
+    limits = prepared.experiment.limits
+    return partial(execute, folder=prepared.folder, scheduler=scheduler, limits=limits, again=again)
 
 
 def execute(
