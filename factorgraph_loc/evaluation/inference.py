@@ -37,7 +37,7 @@ Units = Literal["logs", "seeds"]
 @dataclass(frozen=True)
 class Pooled:
     """A figure over logs. ``low`` and ``high``: 95 % interval over ``units``, None where these are too few; ``least`` and ``most``:
-    the range over logs, or over seeds where there is one log."""
+    the range over its ``count`` units, the logs, or the seeds where there is one log."""
 
     value: float
     low: float | None
@@ -46,6 +46,7 @@ class Pooled:
     most: float
     units: Units
     count: int
+    logs: int
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,13 @@ def pooled(scores: ByLog, *, rms: bool) -> Pooled | None:
     low, high = bounds(draw_pooled(clusters, rms=rms)[:, 0]) if enough else (None, None)
     spread = clusters[0] if units == "seeds" else per_log
     value = float(_average(per_log[:, None], rms)[0])
-    return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread))
+    return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread), len(clusters))
 
 
-def contrast(a: ByLog, b: ByLog, *, rms: bool) -> Contrast | None:
+def contrast(a: ByLog, b: ByLog, *, rms: bool, interval: bool = True) -> Contrast | None:
     """Compare two sets of runs by the logs and seeds that both have; None if they have none in common.
 
-    One that ran with one seed is paired with each seed of the other.
+    One that ran with one seed is paired with each seed of the other. Without ``interval`` there is none, which saves its time.
     """
     found = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in found.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -99,9 +100,10 @@ def contrast(a: ByLog, b: ByLog, *, rms: bool) -> Contrast | None:
     units, enough = _units(list(clusters.values()))
     pairs = next(iter(clusters.values())) if units == "seeds" else np.array(list(by_log.values()))
     low, high, p, effect = None, None, None, None
-    if enough:
+    if enough and interval:
         drawn = draw_pooled(list(clusters.values()), rms=rms)
         low, high = bounds(drawn[:, 0] - drawn[:, 1])
+    if enough:
         p, effect = signed_rank(pairs[:, 0] - pairs[:, 1]), rank_biserial(pairs[:, 0] - pairs[:, 1])
     return Contrast(
         difference=float(total[0] - total[1]),

@@ -7,10 +7,12 @@ Runs are paired by log and seed; logs are clusters. The interval is a percentile
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.se2 import Array
 
@@ -106,15 +108,21 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     ``clusters``: for each log, the scores (K, C) of its K seeds. Pooled is the root mean square over logs of that over seeds, each
     log counted once, or without ``rms`` the mean of the means.
     """
-    rng = np.random.default_rng(_SEED)
     sizes = np.array([len(c) for c in clusters])
     scores = np.zeros((len(clusters), sizes.max(), clusters[0].shape[1]))
     for i, cluster in enumerate(clusters):
         scores[i, : len(cluster)] = np.square(cluster) if rms else cluster
-    logs = rng.integers(len(clusters), size=(DRAWS, len(clusters)))
+    logs, chance = _chances(len(clusters), int(sizes.max()))
     size = sizes[logs][..., None]
-    seeds = (rng.random((*logs.shape, sizes.max())) * size).astype(int)
+    seeds = (chance * size).astype(int)
     drawn = np.arange(sizes.max()) < size  # a log with fewer seeds draws fewer
     means = np.sum(scores[logs[..., None], seeds] * drawn[..., None], axis=2) / size
     pooled = np.mean(means, axis=1)
     return np.asarray(np.sqrt(pooled) if rms else pooled)
+
+
+@lru_cache(maxsize=2)
+def _chances(logs: int, seeds: int) -> tuple[NDArray[np.int64], Array]:
+    """Which logs are drawn (DRAWS, logs), and numbers from 0 to 1 (DRAWS, logs, seeds) that say which of their seeds."""
+    rng = np.random.default_rng(_SEED)
+    return rng.integers(logs, size=(DRAWS, logs)), rng.random((DRAWS, logs, seeds))

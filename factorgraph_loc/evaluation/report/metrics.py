@@ -1,0 +1,89 @@
+"""How scores are called, in which unit they are shown, and which is the better."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+DEFAULT = (
+    "causal.position_rmse",
+    "final.position_rmse",
+    "causal.heading_rmse",
+    "final.heading_rmse",
+    "timing.update_ms_median",
+)
+_DEGREES = 180.0 / math.pi
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A score by its ``key``; shown times ``factor`` in ``unit``. ``rms``: pooled as root mean square, else as the mean."""
+
+    key: str
+    title: str
+    unit: str = ""
+    factor: float = 1.0
+    rms: bool = False
+    better: Literal["low", "high"] | None = "low"
+
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def text(self, value: float, *, sign: bool = False) -> str:
+        """A value as people read it, without the unit."""
+        return number(self.factor * value, sign=sign)
+
+
+def metric_of(key: str) -> Metric:
+    """The metric of a key of the scores; of an unknown one nothing is called better."""
+    kind, _, what = key.partition(".")
+    if kind in ("causal", "final", "aligned"):
+        return _of_trajectory(key, kind, what)
+    if key in _OTHERS:
+        return _OTHERS[key]
+    return Metric(key, key.replace("_", " "), better=None)
+
+
+def _of_trajectory(key: str, kind: str, what: str) -> Metric:
+    sort, _, how = what.rpartition("_")
+    if sort in ("position", "space_position"):
+        return Metric(key, f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}", "m", rms=how == "rmse")
+    if sort in ("heading", "space_rotation"):
+        title = f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}"
+        return Metric(key, title, "°", _DEGREES, rms=how == "rmse")
+    if what == "rpe_position_per_m":
+        return Metric(key, f"{kind} drift", "m per m", rms=True)
+    if what == "rpe_heading_per_m":
+        return Metric(key, f"{kind} turn drift", "° per m", _DEGREES, rms=True)
+    if what == "coverage_95":
+        return Metric(key, f"{kind} truth in the 95 % ellipse", "%", 100.0, better=None)
+    return Metric(key, f"{kind} {'ANEES' if what == 'anees' else what.replace('_', ' ')}", better=None)
+
+
+_HOW = {"rmse": "RMSE", "p95": "error at 95 %", "max": "largest error", "median": "median error"}
+_OTHERS = {
+    m.key: m
+    for m in (
+        Metric("timing.update_ms_median", "update, median", "ms"),
+        Metric("timing.update_ms_p99", "update, 99 %", "ms"),
+        Metric("timing.update_ms_max", "update, slowest", "ms"),
+        Metric("timing.real_time_factor", "times real time", better="high"),
+        Metric("timing.final_seconds", "final trajectory", "s"),
+        Metric("timing.peak_memory_mb", "peak memory", "MB"),
+        Metric("time_to_localized", "localized after", "s"),
+    )
+}
+
+
+def number(value: float, *, sign: bool = False) -> str:
+    """Three digits that say something, no exponent; with ``sign`` also a plus. A minus is a true one."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:+,.{min(digits, 6)}f}" if sign else f"{value:,.{min(digits, 6)}f}"
+    return text.replace(",", "\u202f").replace("-", "\u2212")

@@ -1,0 +1,316 @@
+"""One self-contained HTML file of an experiment's results: words, tables, charts, and what it takes to repeat them.
+
+The page loads nothing: style, script and data are in it, and its policy forbids all else, so that not even a string that slipped
+through unescaped could run. The same results give the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import polars as pl
+import tomli_w
+
+from factorgraph_loc import __version__
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.report import charts, tables
+from factorgraph_loc.evaluation.report.markup import Html, data, figure, join, table, tag, text
+from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
+from factorgraph_loc.evaluation.report.reading import Reading, RunFiles, read_runs
+from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results, score
+from factorgraph_loc.evaluation.report.summary import summary
+from factorgraph_loc.evaluation.report.tracks import KINDS
+from factorgraph_loc.files import write_text
+
+SHOWN = 8  # variants that are visible at first
+_SWEPT = 3  # metrics that are drawn over a swept setting
+
+
+def write_report(
+    rows: pl.DataFrame,
+    runs: Callable[[str], RunFiles],
+    out: Path,
+    *,
+    metrics: Sequence[str] = DEFAULT,
+    baseline: str | None = None,
+    title: str = "Results",
+    experiment: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the page ``out``.
+
+    ``rows``: one a run, with key, log, estimator, seed, status (ok, failed), reason, the scores, and where there are such label,
+    sensors, kind (of a failure) and ``sweep.*``. ``runs``: the files of a run that went well, by its key. ``metrics``: scores to
+    show. ``baseline``: the label that the others are compared with, by default the first. ``experiment``: what was asked for, as
+    plain values.
+
+    Raises InputError for no rows, or a baseline that is no label.
+    """
+    if not len(rows):
+        raise InputError("there are no runs to report on")
+    results = Results(rows)
+    labels = {variant.label: name for name, variant in reversed(results.variants.items())}
+    if baseline is not None and baseline not in labels:
+        raise InputError(f"the baseline is {baseline!r}, expected one of {', '.join(sorted(labels))}")
+    page = _Page(
+        results, _known(results, metrics), labels[baseline] if baseline else next(iter(results.variants)), runs
+    )
+    write_text(out, page.html(title, experiment or {}))
+
+
+class _Page:
+    def __init__(
+        self, results: Results, metrics: Sequence[Metric], baseline: str, runs: Callable[[str], RunFiles]
+    ) -> None:
+        self._results = results
+        self._metrics = metrics
+        self._baseline = baseline
+        self._runs = runs
+        self._charts: list[charts.Chart] = []
+        self._sections: list[tuple[str, str]] = []
+
+    def html(self, title: str, experiment: Mapping[str, Any]) -> str:
+        results = self._results
+        drawn = read_runs(results, self._metrics[0].key, self._runs)
+        best = [results.compare(metric) for metric in self._metrics]
+        against = [results.compare(metric, self._baseline) for metric in self._metrics]
+        body = [
+            tag("section", summary(results, best, drawn.trust), class_="lead", id="summary"),
+            self._overview(best),
+            self._differences(against),
+            self._by_log(),
+            self._trajectories(drawn),
+            self._distributions(drawn),
+            self._sweeps(),
+            self._consistency(drawn),
+            self._times(),
+            self._failures(),
+            self._repeat(experiment, drawn),
+            self._method(),
+        ]
+        content = {
+            "variants": list(results.variants),
+            "logs": list(results.logs),
+            "drawn": drawn.logs,
+            "shown": SHOWN,
+            "errors": drawn.errors,
+            "charts": self._charts,
+        }
+        style = _asset("page.css")
+        script = "".join(_asset(name) for name in ("charts.js", "tracks.js", "page.js"))
+        return Template(_asset("page.html")).substitute(
+            title=text(title),
+            contents=join(tag("a", name, href=f"#{identity}") for identity, name in self._sections),
+            body=join(body, "\n"),
+            data=join([data("page", content), data("config-texts", drawn.configs), *drawn.tracks]),
+            style=style,
+            style_hash=_digest(style),
+            script=script,
+            script_hash=_digest(script),
+            version=__version__,
+        )
+
+    def _section(self, identity: str, name: str, *content: object) -> Html:
+        self._sections.append((identity, name))
+        return tag("section", tag("h2", name), *content, id=identity)
+
+    def _figure(self, chart: charts.Chart, title: str, caption: str = "") -> Html:
+        self._charts.append(chart)
+        return figure(title, caption, data_chart=len(self._charts) - 1)
+
+    def _overview(self, best: Sequence[Comparison]) -> Html:
+        results = self._results
+        several = len(results.logs) > 1
+        over = "each log counted once" if several else "over the seeds"
+        note = (
+            f"RMSEs are pooled as root mean square, the rest is averaged, {over}. Below each figure: its 95 % interval in "
+            "brackets, or the range, least … most, where logs or seeds are too few for one. ● best of the column; ○ not "
+            "significantly different from the best. Causal is what the robot knows at the time, final what the whole log tells; "
+            "compare neither with the other."
+        )
+        return self._section("results", "Results", tag("p", note, class_="note"), tables.overview(results, best))
+
+    def _differences(self, against: Sequence[Comparison]) -> Html | str:
+        if len(self._results.variants) < 2:
+            return ""
+        drawn = [(c, chart) for c in against if (chart := charts.ratios(self._results, c)) is not None]
+        figures = [self._figure(chart, c.metric.title) for c, chart in drawn]
+        note = (
+            f"Each estimator minus {self._baseline}, paired by log and seed: the difference of the pooled figures, its 95 % "
+            "interval (or the range over logs), the p value of the signed-rank test after Holm's correction for the number of "
+            "estimators in the column, and the effect: −1 if every log is below the baseline, +1 if every log is above. Grey: "
+            "not significant, or not tested."
+        )
+        below = (
+            f"Log by log, as a multiple of {self._baseline}: a dot is a log, the bar the median over logs; left of 1 is less. "
+            "Grey: not significant, or not tested."
+        )
+        return self._section(
+            "differences",
+            f"Differences from {self._baseline}",
+            tag("p", note, class_="note"),
+            tables.differences(self._results, against),
+            tag("p", below, class_="note"),
+            tag("div", *figures, class_="charts"),
+        )
+
+    def _by_log(self) -> Html:
+        parts = [
+            tag("div", tag("h3", m.heading), tables.by_log(self._results, m), data_metric=m.heading)
+            for m in self._metrics
+        ]
+        note = "The figure of each log, pooled over its seeds, and below it the range over them. ● best of the row."
+        controls = tag("div", class_="controls")
+        return self._section("by-log", "Log by log", tag("p", note, class_="note"), controls, *parts)
+
+    def _trajectories(self, drawn: Reading) -> Html | str:
+        if not drawn.tracks:
+            return ""
+        left = len(self._results.logs) - len(drawn.logs)
+        more = f" {left} of {len(self._results.logs)} logs are not drawn, to keep the page small." if left else ""
+        note = (
+            "Over walls (lines), tags (squares), landmarks (triangles), mapped points (dots) and the reference (broad grey). "
+            "Drag to move; click, then scroll to zoom, or pinch; double-click for all. Of several seeds the one with the median "
+            f"{self._metrics[0].title} is drawn.{more}"
+        )
+        below = (
+            "Below: position error (line) and twice the stated standard deviation in the direction in which it is largest "
+            "(area). A line that often leaves its area is that of an estimator that is too sure of itself. Drag to look at a "
+            "stretch of time; double-click for all. Of each short stretch the least and the largest error are drawn."
+        )
+        return self._section(
+            "trajectories",
+            "Trajectories and errors over time",
+            tag("p", note, class_="note"),
+            tag("div", class_="controls"),
+            tag("div", class_="legend"),
+            tag("div", class_="map"),
+            tag("p", below, class_="note"),
+            tag("div", class_="strips"),
+        )
+
+    def _distributions(self, drawn: Reading) -> Html | str:
+        if not any(errors for by_log in drawn.errors.values() for of in by_log for errors in of):
+            return ""
+        figures = [
+            tag("figure", tag("h3", f"{kind} position error"), tag("div", class_="chart", data_kind=kind))
+            for kind in KINDS
+        ]
+        note = (
+            "The share of times at which the position error is below a value: farther left is better. Logs count alike."
+        )
+        return self._section(
+            "distributions",
+            "Distribution of errors",
+            tag("p", note, class_="note"),
+            tag("div", class_="controls"),
+            tag("div", class_="legend"),
+            tag("div", *figures, class_="charts"),
+        )
+
+    def _sweeps(self) -> Html | str:
+        figures = []
+        for column in self._results.sweeps:
+            for metric in self._metrics[:_SWEPT]:
+                chart = charts.sweep(self._results, column, metric)
+                if chart is not None:
+                    figures.append(self._figure(chart, f"{metric.title} over {column.removeprefix(SWEEP)}"))
+        if not figures:
+            return ""
+        note = "Pooled over logs and seeds. Whiskers: the 95 % interval, or the range where logs or seeds are too few for one."
+        return self._section("sweeps", "Sweeps", tag("p", note, class_="note"), tag("div", *figures, class_="charts"))
+
+    def _consistency(self, drawn: Reading) -> Html | str:
+        chart = charts.consistency(self._results, drawn.trust, drawn.nees)
+        if chart is None:
+            return ""
+        note = (
+            "The average normalised estimation error squared says whether stated covariances are right: 1 per degree of freedom is "
+            "ideal, above it an estimator is too sure of itself, below it less sure than it could be."
+        )
+        caption = (
+            "A dot is a log, the bar the mean over logs. Shaded: where that mean lies with 95 % if the covariances are right, "
+            "for as many values as are independent, since errors of successive poses go together."
+        )
+        return self._section(
+            "consistency", "Consistency", tag("p", note, class_="note"), self._figure(chart, "Causal ANEES", caption)
+        )
+
+    def _times(self) -> Html | str:
+        found = _known(self._results, tables.TIMINGS, whole=False)
+        if not found:
+            return ""
+        note = (
+            "Median over runs, and least … most. Wall-clock times of the machine that ran them: take ratios. An update is one "
+            "stamp with a measurement of the surroundings; an estimator that waits for the end of the log has none."
+        )
+        drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self._results, m)) is not None]
+        figures = [self._figure(chart, m.title, "A dot is a log, the bar the median over logs.") for m, chart in drawn]
+        return self._section(
+            "times", "Times", tag("p", note, class_="note"), tables.timing(self._results, found), *figures
+        )
+
+    def _failures(self) -> Html | str:
+        count = sum(row["status"] != "ok" for row in self._results.rows)
+        if not count:
+            return ""
+        note = f"{count} of {len(self._results.rows)} runs failed, and are in none of the figures."
+        return self._section("failures", "Failures", tag("p", note, class_="note"), tables.failures(self._results))
+
+    def _repeat(self, experiment: Mapping[str, Any], drawn: Reading) -> Html:
+        parts: list[object] = []
+        if experiment:
+            asked = tag("pre", tomli_w.dumps(_toml(experiment)))
+            parts.append(tag("details", tag("summary", "What was asked for"), asked))
+        if drawn.configs:
+            chosen = tag("div", tag("div", class_="controls"), tag("pre"), id="configs")
+            parts.append(tag("details", tag("summary", "Effective configuration of a run"), chosen, open=""))
+        if drawn.versions:
+            versions = table(["", "version"], [[name, version] for name, version in drawn.versions.items()])
+            parts.append(tag("details", tag("summary", "Versions"), versions, open=""))
+        return self._section("repeat", "To repeat it", *parts)
+
+    def _method(self) -> Html:
+        return self._section(
+            "method",
+            "How it was counted",
+            tag(
+                "p",
+                "Runs are paired by log and seed, and logs are what a statement is made of. With six logs or more intervals are "
+                "a percentile bootstrap that draws logs and, within each, seeds; with one log they are over its seeds, if there "
+                "are six or more, and say something of this log only. Else figures stand side by side, and nothing is tested. "
+                "The test is Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected as of Holm "
+                "within each column; below 0.05 a difference is called significant. The effect is the matched-pairs "
+                "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored against the reference "
+                "without alignment.",
+                class_="note",
+            ),
+        )
+
+
+def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
+    """The metrics of which there is any score; with ``whole`` all of them if there is none."""
+    found = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
+    return found or ([metric_of(k) for k in keys] if whole else [])
+
+
+def _toml(content: Any) -> Any:
+    """TOML has no null: left out."""
+    if isinstance(content, Mapping):
+        return {str(key): _toml(value) for key, value in content.items() if value is not None}
+    if isinstance(content, list | tuple):
+        return [_toml(value) for value in content if value is not None]
+    return content if isinstance(content, str | int | float | bool) else str(content)
+
+
+def _asset(name: str) -> str:
+    return resources.files("factorgraph_loc.evaluation.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _digest(content: str) -> str:
+    return base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()

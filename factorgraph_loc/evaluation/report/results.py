@@ -1,0 +1,201 @@
+"""The rows of an experiment, by what was run (a variant: label, sensors, swept settings) and on which log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import polars as pl
+
+from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, pooled
+from factorgraph_loc.evaluation.report.metrics import Metric
+
+SWEEP = "sweep."
+SIMULATION = "simulation"  # first word of swept settings that change the log
+SCORED = 10  # poses that a log's reference must tell of at least: with fewer, its scores say nothing
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is compared: a ``label``, and what sets it apart from others of that label; ``swept``: its settings by dotted name."""
+
+    name: str
+    label: str
+    swept: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Of one metric. ``pooled``: of each variant, None where it has none; ``best``: the variant with the best of those that have
+    all logs; ``contrasts``: with ``reference``, a variant, of the others; ``p``: corrected for their number."""
+
+    metric: Metric
+    pooled: dict[str, Pooled]
+    best: str | None
+    reference: str
+    contrasts: dict[str, Contrast]
+    p: dict[str, float | None]
+
+    def is_significant(self, variant: str) -> bool:
+        """Whether a variant differs from the reference."""
+        p = self.p.get(variant)
+        return p is not None and p < SIGNIFICANT
+
+
+class Results:
+    """``variants`` and ``logs`` by name, in the order of the rows; ``rows``: all of them, as dictionaries.
+
+    A simulated log counts as another one for each value of a setting of the simulation that is swept.
+    """
+
+    def __init__(self, rows: pl.DataFrame) -> None:
+        self.rows: Sequence[Row] = rows.to_dicts()
+        self.sweeps = [c for c in rows.columns if c.startswith(SWEEP) and rows[c].drop_nulls().n_unique() > 1]
+        several = _labels_with_several_sensors(self.rows)
+        self.variants: dict[str, Variant] = {}
+        self.logs: dict[str, str] = {}
+        self._runs: dict[tuple[str, str], list[Row]] = {}
+        self._pooled: dict[tuple[str, str], Pooled | None] = {}
+        for row in self.rows:
+            variant, log = self._variant(row, several), self._log(row)
+            self.variants.setdefault(variant.name, variant)
+            self.logs.setdefault(log, str(row["log"]))
+            self._runs.setdefault((variant.name, log), []).append(row)
+
+    def runs(self, variant: str, log: str) -> list[Row]:
+        """The rows of a variant on a log."""
+        return self._runs.get((variant, log), [])
+
+    def of(self, variant: str) -> list[Row]:
+        """The rows of a variant."""
+        return [row for log in self.logs for row in self.runs(variant, log)]
+
+    def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
+        """The scores of a variant by log and seed, None where a run failed or has none."""
+        found = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
+        return {log: seeds for log, seeds in found.items() if seeds}
+
+    def representative(self, variant: str, log: str, metric: str) -> Row | None:
+        """The run that stands for all seeds: that with the median score, or the first that went well."""
+        well = [row for row in self.runs(variant, log) if row["status"] == "ok"]
+        ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
+        return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
+
+    def compare(self, metric: Metric, reference: str | None = None) -> Comparison:
+        """All variants with a reference, by default with the best, then without intervals of the differences."""
+        scores = {name: self.scores(metric.key, name) for name in self.variants}
+        found = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
+        best = _best(metric, scores, found)
+        against = reference or best or next(iter(self.variants))
+        contrasts = {
+            name: c
+            for name in scores
+            if name != against
+            and (c := contrast(scores[name], scores[against], rms=metric.rms, interval=reference is not None))
+            is not None
+        }
+        corrected = holm([c.p for c in contrasts.values()])
+        return Comparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
+
+    def unscored(self) -> list[str]:
+        """Logs of which too little is known to score them."""
+        kinds = [f"{kind}.scored" for kind in ("causal", "final")]
+        return [
+            log
+            for log in self.logs
+            if any(
+                0 < (row.get(kind) or 0) < SCORED
+                for name in self.variants
+                for row in self.runs(name, log)
+                for kind in kinds
+            )
+        ]
+
+    def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
+        key = (metric.key, variant)
+        if key not in self._pooled:
+            self._pooled[key] = pooled(scores, rms=metric.rms)
+        return self._pooled[key]
+
+    def _variant(self, row: Row, several: set[str]) -> Variant:
+        label = label_of(row)
+        parts = [label]
+        if label in several:
+            parts.append("with " + ", ".join(_sensors(row)) if _sensors(row) else "with the rig's sensors")
+        swept = {
+            column.removeprefix(SWEEP): row[column]
+            for column in self.sweeps
+            if row.get(column) is not None and not _of_log(column)
+        }
+        parts += [f"{_short(key)} {_value(value)}" for key, value in swept.items()]
+        return Variant(", ".join(parts), label, swept)
+
+    def _log(self, row: Row) -> str:
+        swept = [
+            f"{_short(c.removeprefix(SWEEP))} {_value(row[c])}"
+            for c in self.sweeps
+            if _of_log(c) and row.get(c) is not None
+        ]
+        return ", ".join([str(row["log"]), *swept])
+
+
+def score(row: Row, metric: str) -> float | None:
+    """The score of a run; None where it failed, has none, or was scored at too few poses to say anything.
+
+    Update times of an estimator that waits for the end of the log mean nothing.
+    """
+    kind = metric.partition(".")[0]
+    if metric.startswith("timing.update") and row.get("time_to_localized") is None:
+        return None
+    scored = row.get(f"{kind}.scored")
+    value = row.get(metric)
+    if row["status"] != "ok" or value is None or (scored is not None and scored < SCORED):
+        return None
+    return float(value)
+
+
+def label_of(row: Row) -> str:
+    """What the results call the estimator."""
+    return str(row.get("label") or row["estimator"])
+
+
+def _best(metric: Metric, scores: Mapping[str, ByLog], found: Mapping[str, Pooled]) -> str | None:
+    """Of the variants with a score of each log that any has."""
+    if metric.better is None or not found:
+        return None
+    complete = {
+        name: {log for log, seeds in scores[name].items() if any(v is not None for v in seeds.values())}
+        for name in found
+    }
+    every = set().union(*complete.values())
+    whole = [name for name in found if complete[name] == every]
+    pick = min if metric.better == "low" else max
+    return pick(whole, key=lambda name: found[name].value) if whole else None
+
+
+def _labels_with_several_sensors(rows: Sequence[Row]) -> set[str]:
+    met: dict[str, set[tuple[str, ...]]] = {}
+    for row in rows:
+        met.setdefault(label_of(row), set()).add(_sensors(row))
+    return {label for label, sensors in met.items() if len(sensors) > 1}
+
+
+def _sensors(row: Row) -> tuple[str, ...]:
+    sensors = row.get("sensors") or ()
+    return tuple(sensors.split(",") if isinstance(sensors, str) else sensors)
+
+
+def _of_log(column: str) -> bool:
+    return column.removeprefix(SWEEP).partition(".")[0] == SIMULATION
+
+
+def _short(key: str) -> str:
+    """The last word of a dotted name."""
+    return key.rpartition(".")[2].replace("_", " ")
+
+
+def _value(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,91 @@
+"""What a trajectory is drawn over: the map of a log and its reference, small enough to be kept beside results."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.files import write_text
+from factorgraph_loc.log import Log
+from factorgraph_loc.tag_map import tag_map
+from factors.se2 import Array
+
+_POSES = 1500  # of the reference, in all
+_POINTS = 1500  # of a map of points
+_PAUSE = 5.0  # s between poses of the reference that a line still joins
+
+
+@dataclass(frozen=True)
+class Scene:
+    """In the world's frame [m]: ``walls`` (W, 4) as x1, y1, x2, y2; ``landmarks``, ``tags`` and ``points`` (N, 2) of the map;
+    ``reference``: pieces (N, 2) without a long gap. ``t0_ns``: the log's start, absolute."""
+
+    walls: Array
+    landmarks: Array
+    tags: Array
+    points: Array
+    reference: tuple[Array, ...]
+    t0_ns: int = 0
+
+    @classmethod
+    def of(cls, log: Log) -> Scene:
+        """The scene of a log; tags are where estimators take them to be: moved by what the rig knows of their survey."""
+        world = log.world
+        points = np.empty((0, 2)) if world.points is None else world.points.positions[:, :2]
+        return cls(
+            walls=np.array(world.walls, dtype=float).reshape(-1, 4),
+            landmarks=world.positions(),
+            tags=tag_map(world, log.rig.survey).tags.points[:, :2],
+            points=points[:: len(points) // _POINTS + 1],
+            reference=_pieces(log),
+            t0_ns=log.t0_ns,
+        )
+
+    def content(self) -> dict[str, Any]:
+        """As plain values, in millimetres."""
+        return {
+            "walls": _millimetres(self.walls),
+            "landmarks": _millimetres(self.landmarks),
+            "tags": _millimetres(self.tags),
+            "points": _millimetres(self.points),
+            "reference": [_millimetres(piece) for piece in self.reference],
+        }
+
+    def write(self, path: Path) -> None:
+        """Write a JSON file at once or not at all."""
+        write_text(path, json.dumps(self.content() | {"t0_ns": self.t0_ns}, separators=(",", ":")) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> Scene:
+        """Read what :meth:`write` wrote."""
+        found = json.loads(path.read_text(encoding="utf-8"))
+        walls, landmarks, tags, points = (
+            _metres(found[name], columns)
+            for name, columns in (("walls", 4), ("landmarks", 2), ("tags", 2), ("points", 2))
+        )
+        return cls(walls, landmarks, tags, points, tuple(_metres(p, 2) for p in found["reference"]), found["t0_ns"])
+
+
+def _pieces(log: Log) -> tuple[Array, ...]:
+    if log.reference is None or not len(log.reference):
+        return ()
+    t, places = log.reference.t, log.reference.poses[:, :2]
+    step = len(t) // _POSES + 1
+    pause = max(_PAUSE, MAX_REFERENCE_GAP * step)
+    ends = np.flatnonzero(np.diff(t) > pause) + 1
+    return tuple(
+        piece[np.unique(np.append(np.arange(0, len(piece), step), len(piece) - 1))] for piece in np.split(places, ends)
+    )
+
+
+def _millimetres(values: Array) -> list[int]:
+    return [int(v) for v in np.rint(1e3 * values).ravel()]
+
+
+def _metres(values: list[int], columns: int) -> Array:
+    return np.array(values, dtype=float).reshape(-1, columns) / 1e3

@@ -1,0 +1,120 @@
+"""What came out, in words that the tables and charts of the page can be checked against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from factorgraph_loc.evaluation.inference import SIGNIFICANT, least_p
+from factorgraph_loc.evaluation.report.markup import Html, join, tag
+from factorgraph_loc.evaluation.report.results import SCORED, Comparison, Results, score
+from factorgraph_loc.evaluation.report.tables import p_value, uncertainty
+from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
+
+_SPOKEN = 2  # metrics of which the best is told
+
+
+def summary(
+    results: Results, against_best: Sequence[Comparison], trust: Mapping[str, tuple[float, float, float]]
+) -> Html:
+    """``against_best``: comparisons with the best of each metric. ``trust``: of each variant the mean NEES per degree of freedom of
+    its causal poses, and the band in which it lies where covariances are right."""
+    paragraphs = [_extent(results)]
+    paragraphs += [_best(c) for c in [c for c in against_best if c.best is not None][:_SPOKEN]]
+    paragraphs += _trust(trust)
+    paragraphs += _cautions(results, against_best)
+    return join(tag("p", paragraph) for paragraph in paragraphs)
+
+
+def _extent(results: Results) -> Html:
+    failed = sum(row["status"] != "ok" for row in results.rows)
+    seeds = {row["seed"] for row in results.rows}
+    outcome = "All went well." if not failed else tag("strong", f"{failed} of them failed.")
+    several = f" and up to {len(seeds)} seeds each" if len(seeds) > 1 else ""
+    return join(
+        (
+            f"{_count(len(results.variants), 'estimator')} on {_count(len(results.logs), 'log')}{several}: "
+            f"{_count(len(results.rows), 'run')}. ",
+            outcome,
+        )
+    )
+
+
+def _best(c: Comparison) -> Html:
+    assert c.best is not None
+    figure, unit = c.pooled[c.best], f" {c.metric.unit}" if c.metric.unit else ""
+    sure = uncertainty(c.metric, figure)
+    range_of = f" (from log to log {sure})" if sure and figure.units == "logs" else f" (from seed to seed {sure})"
+    about = f" (95 % interval {sure})" if figure.low is not None else range_of if sure else ""
+    parts: list[object] = [
+        f"The {'least' if c.metric.better == 'low' else 'largest'} {c.metric.title} is that of ",
+        tag("strong", c.best),
+        f": {c.metric.text(figure.value)}{unit}{about}. ",
+    ]
+    tied = [v for v in c.contrasts if c.p[v] is not None and not c.is_significant(v)]
+    worse = [v for v in c.contrasts if c.is_significant(v)]
+    if tied:
+        parts.append(f"It cannot be told apart from that of {_list(tied)}. ")
+    if worse:
+        told = [
+            f"{v} ({c.metric.text(c.contrasts[v].difference, sign=True)}{unit}, p {p_value(c.p[v])})" for v in worse
+        ]
+        parts.append(f"That of {_list(told)} is another.")
+    missing = [v for v in c.pooled if c.contrasts.get(v) is not None and c.contrasts[v].count < c.pooled[c.best].count]
+    if missing:
+        parts.append(f" {_list(missing)} lacks logs, and is compared on those that it has.")
+    return join(parts)
+
+
+def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
+    sure = [v for v, (mean, _, high) in trust.items() if mean > high]
+    timid = [v for v, (mean, low, _) in trust.items() if mean < low]
+    right = [v for v, (mean, low, high) in trust.items() if low <= mean <= high]
+    told = []
+    if sure:
+        told.append(f"{_list(sure)} {_is(sure)} surer than the causal errors allow")
+    if timid:
+        told.append(f"{_list(timid)} {_is(timid)} less sure than {'it' if len(timid) == 1 else 'they'} could be")
+    if right:
+        told.append(f"the stated covariances of {_list(right)} fit the errors")
+    return [join(["Trust: " + "; ".join(told) + "."])] if told else []
+
+
+def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]:
+    told: list[Html] = []
+    if poor := results.unscored():
+        told.append(join([f"Fewer than {SCORED} poses of {_list(poor)} have a reference: nothing is scored there."]))
+    found = [c for comparison in comparisons for c in comparison.contrasts.values()]
+    counts = {(c.units, c.count) for c in found}
+    if found and all(c.p is None for c in found):
+        units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"
+        told.append(join([f"With fewer than {units}, nothing is tested: read the figures log by log."]))
+    for comparison in comparisons:
+        tested = [c for c in comparison.contrasts.values() if c.p is not None]
+        if tested and least_p(max(c.count for c in tested)) * len(tested) >= SIGNIFICANT:
+            units, count = max(counts, key=lambda pair: pair[1])
+            told.append(
+                join(
+                    [
+                        f"{count} {units} are too few for {len(tested)} comparisons: whatever the difference, it cannot become "
+                        "significant."
+                    ]
+                )
+            )
+            break
+    if all(score(row, c.metric.key) is None for row in results.rows for c in comparisons):
+        told.append(join(["No run has any of the scores that were asked for."]))
+    return told
+
+
+def _count(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}".replace(",", "\u202f")
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _list(names: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``; of many the first, and how many more."""
+    shown = [*names[:5], f"{len(names) - 5} more"] if len(names) > 6 else list(names)
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

@@ -1,0 +1,268 @@
+"""The page as text: what stands in it, that it is whole and safe, and what it says of runs that fail or cannot be compared."""
+
+import hashlib
+import html
+import io
+import json
+import re
+from base64 import b64encode
+from html.parser import HTMLParser
+
+import numpy as np
+import polars as pl
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.report import RunFiles, Scene, tracks, write_report
+from factorgraph_loc.evaluation.report.metrics import metric_of, number
+from factorgraph_loc.evaluation.report.results import Results
+
+BAD = "<script>window.hacked = 1</script>\"'&</script><img src=x onerror=alert(1)> ../../etc"
+LOGS = [f"log{i}" for i in range(8)]
+
+
+def page_of(made, tmp_path, **more):
+    write_report(made.rows, made.runs, tmp_path / "report.html", **more)
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def words_of(page):
+    """The text that people read."""
+    body = re.sub(r"<(script|style)[^>]*>.*?</\1>", "", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+def data_of(page, identity="page"):
+    return json.loads(re.search(rf'id="{identity}">(.*?)</script>', page, flags=re.DOTALL)[1])
+
+
+class Elements(HTMLParser):
+    """Checks that elements are closed in order, and collects them."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self._open = [], []
+        self.feed(page)
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in ("meta", "link"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def eight(made):
+    return made({"ekf": 0.1, "smoother": 0.1, "dead": 0.5}, LOGS, 2, count=200)
+
+
+def test_names_the_best_and_what_cannot_be_told_apart(eight, tmp_path):
+    words = words_of(page_of(eight, tmp_path, baseline="dead", title="Eight logs"))
+    assert words.startswith("Eight logs")
+    assert "3 estimators on 8 logs and up to 2 seeds each: 48 runs. All went well." in words
+    assert re.search(r"least causal position RMSE is that of (ekf|smoother) : [\d.]+ m \(95 % interval \[", words)
+    assert re.search(
+        r"cannot be told apart from that of (ekf|smoother)\. That of dead \(\+0\.\d+ m, p 0\.0\d+\)", words
+    )
+    assert "○" in words
+    assert "Differences from dead" in words
+
+
+def test_is_whole_and_the_same_each_time(eight, tmp_path):
+    page = page_of(eight, tmp_path)
+    elements = Elements(page).found
+    assert not [a for _, a in elements if {"src", "onclick", "style"} & set(a)]
+    assert [a["href"] for t, a in elements if t == "link"] == ["data:,"]
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", page)
+    assert page == page_of(eight, tmp_path)
+
+
+def test_policy_allows_this_script_alone(eight, tmp_path):
+    page = page_of(eight, tmp_path)
+    script = re.search(r"<script>(.*?)</script>", page, flags=re.DOTALL)[1]
+    assert f"script-src 'sha256-{b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" in page
+    assert "default-src 'none'" in page
+
+
+def test_every_string_is_escaped(made, tmp_path):
+    bad = made({BAD: 0.1, "ekf": 0.2}, [BAD, "good"], count=40)
+    bad.rows = bad.rows.with_columns(
+        status=pl.when(pl.col("key") == "0003").then(pl.lit("failed")).otherwise("status"),
+        reason=pl.lit(BAD),
+        kind=pl.lit(BAD),
+    )
+    bad.config = f"log = {json.dumps(BAD)}\n[versions]\n{json.dumps(BAD)} = {json.dumps(BAD)}\n".encode()
+    page = page_of(bad, tmp_path, title=BAD, experiment={"name": BAD, BAD: [BAD, None]}, baseline=BAD)
+    elements = Elements(page).found
+    assert not [t for t, _ in elements if t == "img"]
+    assert len([t for t, a in elements if t == "script" and "type" not in a]) == 1
+    assert data_of(page)["logs"] == [BAD, "good"]
+    assert BAD in words_of(page)
+
+
+def test_few_logs_are_not_tested(made, tmp_path):
+    page = page_of(made({"a": 0.1, "b": 0.5}, LOGS[:3], count=40), tmp_path)
+    words = words_of(page)
+    assert "With fewer than 6 logs, or 6 seeds of one log, nothing is tested" in words
+    assert "95 % interval [" not in words
+    assert "from log to log" in words
+    assert 'class="grey"' in page
+
+
+def test_too_few_logs_for_so_many_comparisons(made, tmp_path):
+    words = words_of(page_of(made({f"e{i}": 0.1 + 0.1 * i for i in range(5)}, LOGS[:6], count=40), tmp_path))
+    assert "6 logs are too few for 4 comparisons" in words
+
+
+def test_failures_stand_with_their_reason(made, tmp_path):
+    some = made({"a": 0.1, "b": 0.2}, LOGS[:2], 2, count=40)
+    failed = pl.col("key").is_in(["0002", "0006"])
+    some.rows = some.rows.with_columns(
+        status=pl.when(failed).then(pl.lit("failed")).otherwise("status"),
+        kind=pl.when(failed).then(pl.lit("timeout")).otherwise(None),
+        reason=pl.when(failed).then(pl.lit("took longer than 60 s")).otherwise(None),
+        **{"causal.position_rmse": pl.when(failed).then(None).otherwise("causal.position_rmse")},
+    )
+    words = words_of(page_of(some, tmp_path))
+    assert "8 runs. 2 of them failed." in words
+    assert "b 2 timeout took longer than 60 s log0, seed 0; log1, seed 0" in words
+    assert "2 of 4 [15, 85] %" in words
+
+
+def test_all_failed_is_a_page_too(made, tmp_path):
+    some = made({"a": 0.1}, ["one"], count=40)
+    some.rows = some.rows.with_columns(pl.lit("failed").alias("status"), pl.lit("no memory").alias("reason"))
+    assert "1 of them failed" in words_of(page_of(some, tmp_path))
+
+
+def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
+    some = made({"a": 0.1, "b": 0.2}, LOGS[:2], count=40)
+    poor = pl.col("log") == "log1"
+    some.rows = some.rows.with_columns(
+        **{f"{k}.scored": pl.when(poor).then(1).otherwise(40) for k in ("causal", "final")},
+        **{"causal.position_rmse": pl.when(poor).then(0.0).otherwise("causal.position_rmse")},
+    )
+    words = words_of(page_of(some, tmp_path))
+    assert "Fewer than 10 poses of log1 have a reference: nothing is scored there." in words
+    assert Results(some.rows).scores("causal.position_rmse", "a")["log1"] == {0: None}
+
+
+def test_swept_settings_are_drawn_and_told_apart(made, tmp_path):
+    swept = made({"ekf": 0.1}, LOGS[:2], count=40, sweep=("sweep.ekf.lag", [1.0, 2.0, 4.0]))
+    page = page_of(swept, tmp_path)
+    assert data_of(page)["variants"] == ["ekf, lag 1", "ekf, lag 2", "ekf, lag 4"]
+    (chart,) = [c for c in data_of(page)["charts"] if "series" in c and c["y"]["title"] == "causal position RMSE [m]"]
+    (series,) = chart["series"]
+    values = [point[1] for point in series["points"]]
+    assert [point[0] for point in series["points"]] == [1.0, 2.0, 4.0]
+    assert values == sorted(values)
+    assert all(low <= value <= high for _, value, low, high in series["points"])
+
+
+def test_a_swept_simulation_makes_other_logs(made):
+    swept = made({"ekf": 0.1}, LOGS[:1], count=40, sweep=("sweep.simulation.tags", [10, 20]))
+    results = Results(swept.rows)
+    assert list(results.variants) == ["ekf"]
+    assert list(results.logs) == ["log0, tags 10", "log0, tags 20"]
+
+
+def test_sensors_tell_variants_apart(made):
+    some = made({"ekf": 0.1}, LOGS[:1], 2, count=40)
+    some.rows = some.rows.with_columns(sensors=pl.Series(["odometry,rfid", None]))
+    assert list(Results(some.rows).variants) == ["ekf, with odometry, rfid", "ekf, with the rig's sensors"]
+
+
+def test_the_median_seed_is_drawn(made, tmp_path):
+    some = made({"ekf": 0.1}, LOGS[:1], 3, count=40)
+    ranked = some.rows.sort("causal.position_rmse")["seed"].to_list()
+    (run,) = data_of(page_of(some, tmp_path), "track-0")["runs"]
+    assert run["seed"] == ranked[1]
+
+
+def test_wrong_asks_are_told(made, tmp_path):
+    some = made({"ekf": 0.1}, LOGS[:1], count=40)
+    with pytest.raises(InputError, match="the baseline is 'ekv', expected one of ekf"):
+        page_of(some, tmp_path, baseline="ekv")
+    with pytest.raises(InputError, match="no runs"):
+        write_report(some.rows[:0], some.runs, tmp_path / "none.html")
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_thinned_errors_keep_their_extremes(made):
+    some = made({"ekf": 0.1}, ["one"], count=5000)
+    series = tracks.read_series(some.tables["0000"], None)["causal"]
+    packed = tracks.pack(series, 100)
+    errors = np.array(packed["e"]["v"]) * packed["e"]["u"]
+    t = np.cumsum(packed["t"]["d"]) * packed["t"]["u"]
+    assert 50 <= len(errors) <= 102
+    assert errors.max() == pytest.approx(series.error.max(), rel=1e-3)
+    assert errors.min() == pytest.approx(series.error.min(), abs=1e-4)
+    assert (t[0], t[-1]) == pytest.approx((0.0, 499.9))
+    found = np.searchsorted(series.t, t - 1e-6)
+    assert np.cumsum(packed["x"]["d"]) * packed["x"]["u"] == pytest.approx(series.x[found], abs=1e-3)
+
+
+def test_series_begin_with_the_first_localized_pose(made):
+    some = made({"ekf": 0.1}, ["one"], count=30)
+    table = pl.read_parquet(some.tables["0000"])
+    early = (pl.col("t_ns") < 1_000_000_000) & (pl.col("kind") == "causal")
+    changed = table.with_columns(status=pl.when(early).then(pl.lit("unlocalized")).otherwise("status"))
+    series = tracks.read_series(_bytes(changed), None)
+    assert series["causal"].t[0] == pytest.approx(1.0)
+    assert series["final"].t[0] == 0.0
+    assert len(tracks.read_errors(_bytes(changed))["causal"]) == 20
+    never = table.with_columns(status=pl.lit("unlocalized"), error_heading=pl.lit(None, dtype=pl.Float64))
+    found = tracks.read_series(_bytes(never), None)
+    assert list(found) == ["final"]
+    assert found["final"].dof == 2
+
+
+def test_consistent_runs_are_told_to_be_so(made):
+    series = tracks.read_series(made({"ekf": 0.1}, ["one"], count=20000).tables["0000"], None)["causal"]
+    mean, independent, dof = tracks.consistency(series)
+    assert dof == 3
+    assert mean == pytest.approx(1.0, abs=0.15)  # sigma of the mean: sqrt(2 / 3 / independent), 0.03
+    assert 200 < independent < 5000
+
+
+def test_a_scene_survives_the_disk(made, tmp_path):
+    scene = made({"ekf": 0.1}, ["one"], count=20).scene
+    scene.write(tmp_path / "one.json")
+    again = Scene.read(tmp_path / "one.json")
+    assert again.content() == scene.content()
+    assert again.walls.shape == (2, 4)
+
+
+def test_a_run_without_a_scene_is_drawn(made, tmp_path):
+    some = made({"ekf": 0.1}, ["one"], count=20)
+    write_report(some.rows, lambda key: RunFiles(some.runs(key).read), tmp_path / "report.html")
+    assert data_of((tmp_path / "report.html").read_text(), "track-0")["scene"] is None
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.29381, "0.294"),
+        (31.49, "31.5"),
+        (1234567.0, "1\u202f234\u202f567"),
+        (-0.00012345, "\u22120.000123"),
+        (0.0, "0"),
+    ],
+)
+def test_numbers_have_three_digits(value, text):
+    assert number(value) == text
+
+
+def test_units_of_metrics():
+    assert metric_of("causal.heading_rmse").text(np.pi) == "180"
+    assert metric_of("final.position_p95").heading == "final position error at 95 % [m]"
+    assert metric_of("learnt.lever.value").better is None
+
+
+def _bytes(table):
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    return buffer.getvalue()
