@@ -10,7 +10,17 @@ import typer
 from typer.core import TyperGroup
 
 from factorgraph_loc import __version__
-from factorgraph_loc.cli import active, calibrating, features, images, inspecting, mapping, running, simulating
+from factorgraph_loc.cli import (
+    active,
+    calibrating,
+    experimenting,
+    features,
+    images,
+    inspecting,
+    mapping,
+    running,
+    simulating,
+)
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
@@ -59,6 +69,7 @@ app.command("map")(mapping.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
 app.command()(active.active)
+app.add_typer(experimenting.app, name="experiment")
 app.add_typer(features.app, name="features")
 
 
