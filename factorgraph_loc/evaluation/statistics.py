@@ -12,7 +12,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.se2 import Array
 
@@ -108,21 +107,22 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     ``clusters``: for each log, the scores (K, C) of its K seeds. Pooled is the root mean square over logs of that over seeds, each
     log counted once, or without ``rms`` the mean of the means.
     """
-    sizes = np.array([len(c) for c in clusters])
-    scores = np.zeros((len(clusters), sizes.max(), clusters[0].shape[1]))
-    for i, cluster in enumerate(clusters):
-        scores[i, : len(cluster)] = np.square(cluster) if rms else cluster
-    logs, chance = _chances(len(clusters), int(sizes.max()))
-    size = sizes[logs][..., None]
-    seeds = (chance * size).astype(int)
-    drawn = np.arange(sizes.max()) < size  # a log with fewer seeds draws fewer
-    means = np.sum(scores[logs[..., None], seeds] * drawn[..., None], axis=2) / size
-    pooled = np.mean(means, axis=1)
-    return np.asarray(np.sqrt(pooled) if rms else pooled)
+    scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
+    drawn = _weights(tuple(map(len, clusters))) @ scores
+    return np.asarray(np.sqrt(drawn) if rms else drawn)
 
 
 @lru_cache(maxsize=2)
-def _chances(logs: int, seeds: int) -> tuple[NDArray[np.int64], Array]:
-    """Which logs are drawn (DRAWS, logs), and numbers from 0 to 1 (DRAWS, logs, seeds) that say which of their seeds."""
+def _weights(seeds: tuple[int, ...]) -> Array:
+    """How much each of all N scores counts in each draw, (DRAWS, N), for logs with so many seeds."""
     rng = np.random.default_rng(_SEED)
-    return rng.integers(logs, size=(DRAWS, logs)), rng.random((DRAWS, logs, seeds))
+    sizes = np.array(seeds)
+    logs = rng.integers(len(sizes), size=(DRAWS, len(sizes)))
+    size = sizes[logs][..., None]
+    seed = (rng.random((*logs.shape, sizes.max())) * size).astype(int)
+    drawn = np.arange(sizes.max()) < size  # a log with fewer seeds draws fewer
+    first = np.cumsum(sizes) - sizes
+    place = np.arange(DRAWS)[:, None, None] * sizes.sum() + first[logs][..., None] + seed
+    weight = drawn / (size * len(sizes))
+    counted = np.bincount(place.ravel(), weights=weight.ravel(), minlength=DRAWS * int(sizes.sum()))
+    return np.asarray(counted.reshape(DRAWS, -1))
