@@ -123,6 +123,27 @@ def status(
         typer.echo(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
 
 
+@app.command()
+def report(
+    file: File,
+    set_: Changes = None,
+    out: OutFolder = None,
+    page: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The page to write; else report.html in OUT.")
+    ] = None,
+    data_root: DataRoot = None,
+    json: Json = False,
+) -> None:
+    """Write the results of an experiment as one HTML page, of those runs that are there."""
+    from factorgraph_loc.experiments.reporting import report_experiment
+
+    written = report_experiment(_prepared(file, set_, out, data_root), page)
+    if json:
+        show.document({"page": str(written)})
+    else:
+        typer.echo(f"the report is {written}")
+
+
 def _prepared(
     file: Path, changes: list[str] | None, out: Path | None, data_root: Path | None, *, verify: bool = False
 ) -> Prepared:

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-
-import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.experiments.experiment import Prepared
+from factorgraph_loc.experiments.index import collect
 from factorgraph_loc.experiments.plan import PlannedRun
 
 PAGE = "report.html"
 
 
-def report_experiment(prepared: Prepared, rows: pl.DataFrame, out: Path | None = None) -> Path:
-    """Write the page of an experiment with the results ``rows``, by default into its folder, and return its path.
+def report_experiment(prepared: Prepared, out: Path | None = None) -> Path:
+    """Write the page of all results of an experiment that are there, by default into its folder, and return its path.
 
-    What the logs look like is kept in the store, so that they are read once. InputError without any results, or for damaged ones.
+    What the logs look like is kept in the store, so that they are read once. InputError without any results, for damaged ones, or
+    if the page cannot be written.
     """
+    rows = collect((run for run in prepared.runs if prepared.states[run.key] in ("ok", "failed")), prepared.store)
     runs = {run.key: run for run in prepared.runs}
     scenes: dict[str, Scene | None] = {}
 
@@ -32,28 +34,30 @@ def report_experiment(prepared: Prepared, rows: pl.DataFrame, out: Path | None =
 
     path = out or prepared.folder / PAGE
     settings = prepared.experiment.report
-    write_report(
-        rows,
-        files,
-        path,
-        metrics=settings.metrics,
-        baseline=settings.baseline,
-        title=prepared.experiment.name,
-        experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
-    )
+    try:
+        write_report(
+            rows,
+            files,
+            path,
+            metrics=settings.metrics,
+            baseline=settings.baseline,
+            title=prepared.experiment.name,
+            experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
+        )
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     return path
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
     """Of a run's log; None if the log has vanished."""
-    try:
+    with suppress(OSError, ValueError, KeyError):
         return Scene.read(kept)
-    except (OSError, ValueError, KeyError):
-        pass
     try:
         scene = Scene.of(run.source.load())
     except InputError:
         return None
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    scene.write(kept)
+    with suppress(OSError):  # a page of results that may only be read
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        scene.write(kept)
     return scene

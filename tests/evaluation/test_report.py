@@ -115,6 +115,7 @@ def test_few_logs_are_not_tested(made, tmp_path):
 def test_too_few_logs_for_so_many_comparisons(made, tmp_path):
     words = words_of(page_of(made({f"e{i}": 0.1 + 0.1 * i for i in range(5)}, LOGS[:6], count=40), tmp_path))
     assert "6 logs are too few for 4 comparisons" in words
+    assert "cannot be told apart" not in words
 
 
 def test_failures_stand_with_their_reason(made, tmp_path):
@@ -153,7 +154,7 @@ def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
 def test_swept_settings_are_drawn_and_told_apart(made, tmp_path):
     swept = made({"ekf": 0.1}, LOGS[:2], count=40, sweep=("sweep.ekf.lag", [1.0, 2.0, 4.0]))
     page = page_of(swept, tmp_path)
-    assert data_of(page)["variants"] == ["ekf, lag 1", "ekf, lag 2", "ekf, lag 4"]
+    assert data_of(page)["variants"] == ["ekf (lag 1)", "ekf (lag 2)", "ekf (lag 4)"]
     (chart,) = [c for c in data_of(page)["charts"] if "series" in c and c["y"]["title"] == "causal position RMSE [m]"]
     (series,) = chart["series"]
     values = [point[1] for point in series["points"]]
@@ -166,13 +167,13 @@ def test_a_swept_simulation_makes_other_logs(made):
     swept = made({"ekf": 0.1}, LOGS[:1], count=40, sweep=("sweep.simulation.tags", [10, 20]))
     results = Results(swept.rows)
     assert list(results.variants) == ["ekf"]
-    assert list(results.logs) == ["log0, tags 10", "log0, tags 20"]
+    assert list(results.logs) == ["log0 (tags 10)", "log0 (tags 20)"]
 
 
 def test_sensors_tell_variants_apart(made):
     some = made({"ekf": 0.1}, LOGS[:1], 2, count=40)
     some.rows = some.rows.with_columns(sensors=pl.Series(["odometry,rfid", None]))
-    assert list(Results(some.rows).variants) == ["ekf, with odometry, rfid", "ekf, with the rig's sensors"]
+    assert list(Results(some.rows).variants) == ["ekf (odometry, rfid)", "ekf (the rig's sensors)"]
 
 
 def test_the_median_seed_is_drawn(made, tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, pooled
+from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, least_p, pooled
 from factorgraph_loc.evaluation.report.metrics import Metric
 
 SWEEP = "sweep."
@@ -38,6 +38,12 @@ class Comparison:
     reference: str
     contrasts: dict[str, Contrast]
     p: dict[str, float | None]
+
+    @property
+    def can_tell(self) -> bool:
+        """Whether any difference could become significant: with few logs and many comparisons none can."""
+        tested = [c.count for name, c in self.contrasts.items() if self.p[name] is not None]
+        return bool(tested) and least_p(max(tested)) * len(tested) < SIGNIFICANT
 
     def is_significant(self, variant: str) -> bool:
         """Whether a variant differs from the reference."""
@@ -122,16 +128,14 @@ class Results:
 
     def _variant(self, row: Row, several: set[str]) -> Variant:
         label = label_of(row)
-        parts = [label]
-        if label in several:
-            parts.append("with " + ", ".join(_sensors(row)) if _sensors(row) else "with the rig's sensors")
+        parts = [", ".join(_sensors(row)) or "the rig's sensors"] if label in several else []
         swept = {
             column.removeprefix(SWEEP): row[column]
             for column in self.sweeps
             if row.get(column) is not None and not _of_log(column)
         }
         parts += [f"{_short(key)} {_value(value)}" for key, value in swept.items()]
-        return Variant(", ".join(parts), label, swept)
+        return Variant(f"{label} ({'; '.join(parts)})" if parts else label, label, swept)
 
     def _log(self, row: Row) -> str:
         swept = [
@@ -139,7 +143,7 @@ class Results:
             for c in self.sweeps
             if _of_log(c) and row.get(c) is not None
         ]
-        return ", ".join([str(row["log"]), *swept])
+        return f"{row['log']} ({'; '.join(swept)})" if swept else str(row["log"])
 
 
 def score(row: Row, metric: str) -> float | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from factorgraph_loc.evaluation.inference import SIGNIFICANT, least_p
 from factorgraph_loc.evaluation.report.markup import Html, join, tag
 from factorgraph_loc.evaluation.report.results import SCORED, Comparison, Results, score
 from factorgraph_loc.evaluation.report.tables import p_value, uncertainty
@@ -50,7 +49,7 @@ def _best(c: Comparison) -> Html:
         tag("strong", c.best),
         f": {c.metric.text(figure.value)}{unit}{about}. ",
     ]
-    tied = [v for v in c.contrasts if c.p[v] is not None and not c.is_significant(v)]
+    tied = [v for v in c.contrasts if c.can_tell and c.p[v] is not None and not c.is_significant(v)]
     worse = [v for v in c.contrasts if c.is_significant(v)]
     if tied:
         parts.append(f"It cannot be told apart from that of {_list(tied)}. ")
@@ -84,23 +83,21 @@ def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]
     if poor := results.unscored():
         told.append(join([f"Fewer than {SCORED} poses of {_list(poor)} have a reference: nothing is scored there."]))
     found = [c for comparison in comparisons for c in comparison.contrasts.values()]
-    counts = {(c.units, c.count) for c in found}
     if found and all(c.p is None for c in found):
         units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"
         told.append(join([f"With fewer than {units}, nothing is tested: read the figures log by log."]))
-    for comparison in comparisons:
-        tested = [c for c in comparison.contrasts.values() if c.p is not None]
-        if tested and least_p(max(c.count for c in tested)) * len(tested) >= SIGNIFICANT:
-            units, count = max(counts, key=lambda pair: pair[1])
-            told.append(
-                join(
-                    [
-                        f"{count} {units} are too few for {len(tested)} comparisons: whatever the difference, it cannot become "
-                        "significant."
-                    ]
-                )
+    untold = [c for c in comparisons if not c.can_tell and any(p is not None for p in c.p.values())]
+    if untold:
+        tested = [c for c in untold[0].contrasts.values() if c.p is not None]
+        most = max(tested, key=lambda c: c.count)
+        told.append(
+            join(
+                [
+                    f"{most.count} {most.units} are too few for {len(tested)} comparisons: whatever the difference, it cannot "
+                    "become significant."
+                ]
             )
-            break
+        )
     if all(score(row, c.metric.key) is None for row in results.rows for c in comparisons):
         told.append(join(["No run has any of the scores that were asked for."]))
     return told

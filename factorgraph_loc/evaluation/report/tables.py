@@ -110,7 +110,7 @@ def _pooled_cell(c: Comparison, variant: str) -> Html:
     mark, kind = "", None
     if variant == c.best:
         mark, kind = "● ", "best"
-    elif c.best is not None and c.reference == c.best and _is_tied(c, variant):
+    elif c.reference == c.best and _is_tied(c, variant):
         mark, kind = "○ ", "tied"
     lines = [uncertainty(c.metric, figure)]
     if figure.logs < max(of.logs for of in c.pooled.values()) or figure.logs == 1:
@@ -119,7 +119,7 @@ def _pooled_cell(c: Comparison, variant: str) -> Html:
 
 
 def _is_tied(c: Comparison, variant: str) -> bool:
-    return c.p.get(variant) is not None and not c.is_significant(variant)
+    return c.can_tell and c.p.get(variant) is not None and not c.is_significant(variant)
 
 
 def _difference_cell(c: Comparison, variant: str) -> Html:
