@@ -30,6 +30,7 @@ LEVEL = 0.25  # m: tags at the same height, to so much, share a table
 NOTHING = (
     1e-3  # where no antenna reads a tag with so much more than the probability of a false read, it is out of reach
 )
+MOST_LOOKS = 1 << 16  # on a path: in the numbers of draws, so that paths of all lengths share them
 ALMOST_NEVER = 1e-12  # probability of a read, where there is no floor
 
 
@@ -239,7 +240,7 @@ def _add_reads(
                 silent = rounds[k] * tables.silent[cell]
                 if k >= stops[n] or silent == 0.0:
                     continue
-                left = _uniform(seed, (n * looks + k) * tags + t)
+                left = _uniform(seed, (n * MOST_LOOKS + k) * tags + t)
                 # exp(x) is at least 1 + x
                 if left < 1.0 + silent or left < math.exp(silent):
                     continue

@@ -34,10 +34,12 @@ _SIGHTINGS, _PIXELS = SightingSettings(), PixelSettings()
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion. The
-    other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna; ``looks_per_metre``: of
-    the others. Landmarks are seen up to ``max_range`` [m], at most ``max_points`` points up to ``max_depth`` [m], neither through
-    walls."""
+    """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion.
+
+    The other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna;
+    ``looks_per_metre``: of the other sensors. Landmarks are seen up to ``max_range`` [m], at most ``max_points`` points up to
+    ``max_depth`` [m], neither through walls.
+    """
 
     world: World
     odometry: OdometryModel

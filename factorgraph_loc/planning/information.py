@@ -65,13 +65,14 @@ def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, c
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """Whether particles (M, 3) with weights (M,) are not well described by a Gaussian: its entropy would be larger than theirs, by
-    :data:`SEVERAL`, in place or in heading, or the heading is not known."""
+    """Whether particles (M, 3) with weights (M,) are not well described by a Gaussian: in place its entropy would be larger than
+    theirs, by :data:`SEVERAL`, or the heading is not known."""
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True
-    position = gaussian_entropy(covariance, POSITION) - particle_entropy(poses, weights, POSITION)
-    return bool(position > SEVERAL)
+    # a histogram spreads each particle over a cell: the variance of that is added to the Gaussian's (Sheppard)
+    gaussian = gaussian_entropy(covariance + np.diag(CELL**2 / 12.0), POSITION)
+    return bool(gaussian - particle_entropy(poses, weights, POSITION) > SEVERAL)
 
 
 def expected_gain(

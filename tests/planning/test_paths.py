@@ -53,7 +53,7 @@ def test_primitives_differ():
 
 @pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf])
 def test_a_horizon_of_nothing_is_an_error(length):
-    with pytest.raises(InputError, match="horizon is .* m, expected a length above 0"):
+    with pytest.raises(InputError, match=r"horizon is .* m, expected a length above 0"):
         primitives(length)
 
 
