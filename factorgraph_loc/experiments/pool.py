@@ -96,32 +96,38 @@ class _Pool:
         self._memory = limits.memory * 1e6 if limits.memory is not None else SHARE * _machine_memory() / max(jobs, 1)
         self._deaths: Counter[str] = Counter()
         self._stillborn = 0
-        self._workers = [self._start() for _ in range(jobs)]
+        self._jobs = jobs
+        self._workers: list[_Worker] = []
 
     def outcomes(self) -> Iterator[Outcome]:
-        while self.queue or any(w.run for w in self._workers):
+        while left := len(self.queue) + sum(w.run is not None for w in self._workers):
+            while len(self._workers) < min(self._jobs, left):
+                self._workers.append(self._start())
             for w in self._workers:
                 if w.ready and w.run is None:
                     self._assign(w)
-            ready = wait([w.connection for w in self._workers], LOOK)
-            for i, w in enumerate(self._workers):
-                failure = None
-                if w.connection in ready:
+            heard = wait([w.connection for w in self._workers], LOOK)
+            for w in list(self._workers):
+                failure = self._too_much(w)
+                if w.connection in heard:
                     try:
                         message = w.connection.recv()
                     except (EOFError, OSError):
+                        self._end(w)
                         failure = self._died(w)
                     else:
                         yield from self._heard(w, message)
                         continue
-                elif not (failure := self._too_much(w)):
-                    continue
-                w.process.kill()
-                w.process.join()
-                w.connection.close()
-                self._workers[i] = self._start()
+                elif failure is not None:
+                    self._end(w)
                 if w.run is not None and failure is not None:
                     yield from self._settle(w.run, store_failure(w.run, self._folder, *failure))
+
+    def _end(self, w: _Worker) -> None:
+        w.process.kill()
+        w.process.join()
+        w.connection.close()
+        self._workers.remove(w)
 
     def close(self) -> None:
         for w in self._workers:

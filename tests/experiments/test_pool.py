@@ -1,0 +1,81 @@
+"""Worker processes: what becomes of a run that takes too much, of a worker that dies, and of an experiment that is stopped."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from factorgraph_loc.experiments import pool
+from factorgraph_loc.experiments.experiment_file import Experiment, Limits
+from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.experiments.pool import execute
+from factorgraph_loc.experiments.store import Store
+
+SHORT = {"simulate": "office", "settings": {"drive": {"duration": 4}}}
+LONG = {"simulate": "office", "settings": {"name": "long", "drive": {"duration": 60}}}
+HUGE = {"name": "particle_filter", "label": "huge", "settings": {"particles": 1_000_000}}
+ENDLESS = {"name": "particle_filter", "label": "endless", "settings": {"particles": 100_000}}
+
+
+@pytest.fixture
+def planned(tmp_path):
+    """``planned(logs, estimators)``: the runs; results go to the folder ``out``."""
+    Store(tmp_path / "out").create()
+
+    def make(logs, estimators):
+        experiment = Experiment.model_validate({"name": "a", "logs": logs, "estimators": estimators})
+        return plan(experiment, tmp_path, tmp_path / "out" / "store")
+
+    return make
+
+
+def test_a_run_that_takes_too_long_or_too_much_memory_fails_and_the_others_go_on(planned, tmp_path):
+    runs = planned([LONG], [HUGE]) + planned([SHORT], ["ekf"])
+    store = Store(tmp_path / "out")
+    outcomes = list(execute(runs, tmp_path / "out", jobs=1, limits=Limits(memory=450.0)))
+    assert [o.status for o in outcomes] == ["failed", "ok"]
+    assert outcomes[0].reason == "its process held more than 450 MB"
+    assert store.row(runs[0].key)["kind"] == "memory"
+    runs = planned([LONG], [ENDLESS])
+    (outcome,) = execute(runs, tmp_path / "out", jobs=1, limits=Limits(time=1.0))
+    assert outcome.reason == "it took more than 1 s"
+    assert store.row(runs[0].key)["kind"] == "timeout"
+    assert [list((store.folder / name).iterdir()) for name in ("tmp", "claims")] == [[], []]
+
+
+def kill_worker(when):
+    """In a thread: kill the worker of this process once ``when()`` says that it has a run."""
+
+    def kill():
+        while not when():
+            time.sleep(0.01)
+        (child,) = multiprocessing.active_children()
+        os.kill(child.pid, signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+
+
+@pytest.mark.parametrize("attempts", [2, 1])
+def test_a_run_whose_worker_is_killed_is_tried_once_more(planned, tmp_path, monkeypatch, attempts):
+    monkeypatch.setattr(pool, "ATTEMPTS", attempts)
+    (run,) = planned([LONG], [{"name": "particle_filter", "settings": {"particles": 500}}])
+    store = Store(tmp_path / "out")
+    kill_worker((store.folder / "claims" / run.key).exists)
+    (outcome,) = execute([run], tmp_path / "out", jobs=1, limits=Limits())
+    if attempts == 2:
+        assert outcome.status == "ok"
+    else:
+        assert outcome.status == "failed"
+        assert store.row(run.key)["kind"] == "killed"
+
+
+def test_workers_end_when_the_caller_stops_listening(planned, tmp_path):
+    runs = planned([SHORT], ["dead_reckoning"]) + planned([LONG], [ENDLESS])
+    outcomes = execute(runs, tmp_path / "out", jobs=1, limits=Limits())
+    assert next(outcomes).status == "ok"
+    outcomes.close()
+    assert multiprocessing.active_children() == []
+    assert Store(tmp_path / "out").state(runs[1].key) == "missing"
