@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from time import perf_counter
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators import registry
@@ -16,7 +17,7 @@ from factorgraph_loc.files import nearest
 from factorgraph_loc.measurements import Measurement, RfidScan
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
-from factorgraph_loc.planning.paths import Path, primitives
+from factorgraph_loc.planning.paths import Path, primitives, waypoint_paths
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -34,6 +35,7 @@ ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
 SHOWN = 300  # particles of a belief that are kept
 SPREAD = 2000  # poses that stand for a belief without particles
 WRONG = 3.0  # times the limits: an error that is no bad luck
+MODES, LIKELY, TAGS = 3, 0.1, 4  # places with at least so much weight from which ways lead to the nearest tags
 PAUSE = 1.0  # s that a robot waits that cannot go anywhere
 SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
 
@@ -56,9 +58,7 @@ def run_active(
     space = free_space(world, settings.clearance)
     of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
     start = _start(world, space, settings, of_start)
-    robot = SimulatedRobot(
-        world, simulation.rig, simulation.rounds_per_second, start, settings, int(of_robot.integers(2**32))
-    )
+    robot = SimulatedRobot(world, space, simulation.rig, simulation.rounds_per_second, start, settings, of_robot)
     setup = registry.Setup(simulation.rig, world, ("odometry", "rfid"), of_estimator)
     loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, of_policy)
     localized = loop.run()
@@ -100,6 +100,9 @@ class _Loop:
         self._paths = primitives(settings.policy.horizon)
         tags = tag_map(setup.world, setup.rig.survey).tags
         assert setup.rig.rfid is not None, "the settings have been checked"
+        # where a robot is nearest to each tag
+        nearest_cells = cKDTree(space.centres).query(tags.points[:, :2])[1]
+        self._places = space.centres[np.unique(nearest_cells)]
         self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if len(tags.points) else None
 
     def run(self) -> bool:
@@ -142,9 +145,11 @@ class _Loop:
         return position < self._settings.position_limit and heading < self._settings.heading_limit
 
     def _choose(self) -> Choice:
-        particles, weights = _sampled(self._estimator.belief(), self._space, self._rng)
+        belief = self._estimator.belief()
+        particles, weights = _sampled(belief, self._space, self._rng)
         started = perf_counter()
-        paths, free = usable(self._paths, self._robot.free_ahead(self._space, self._paths))
+        proposed = [*self._paths, *self._ways_to_tags(belief)]
+        paths, free = usable(proposed, self._robot.free_ahead(proposed), self._settings.sight)
         situation = Situation(particles, weights, self._likelihood, self._space, paths, free, self._settings, self._rng)
         choice = self._policy.choose(situation)
         elapsed = 1e3 * (perf_counter() - started)
@@ -164,6 +169,16 @@ class _Loop:
             )
         )
         return choice
+
+    def _ways_to_tags(self, belief: Belief) -> list[Path]:
+        """From each place where the robot may well be to the tags that are nearest: what tells the places apart may be far away."""
+        out: list[Path] = []
+        for mode in belief.modes[:MODES]:
+            if mode.weight >= LIKELY and np.all(np.isfinite(mode.pose)):
+                ways = waypoint_paths(self._space, mode.pose, self._places)
+                ways = [way for way in ways if way.length >= self._settings.policy.horizon / 2.0]
+                out += sorted(ways, key=lambda way: way.length)[:TAGS]
+        return out
 
     def _in_world(self, path: Path) -> Array:
         return np.asarray(se2.compose(self._robot.pose, path.poses))

@@ -26,7 +26,7 @@ from factors import se2
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
-NOTHING = 1e-3  # nats: an expected gain that is none
+NOTHING = 0.3  # nats: an expected gain that is as good as none, by the noise of the expectation
 AHEAD = 1.0  # m that must be free
 BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
 NEAR = 3  # tags that tell a place
@@ -83,7 +83,7 @@ class Information:
             samples=settings.samples,
             space=s.space,
         )
-        if np.max(np.abs(gains)) < NOTHING:
+        if np.max(gains) < NOTHING:
             return self._otherwise.choose(s)
         rates = s.settings.speed, s.settings.turn_rate
         costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
@@ -159,10 +159,10 @@ def make_policy(name: str) -> Policy:
     return made[name]
 
 
-def usable(paths: Sequence[Path], free: Array) -> tuple[tuple[Path, ...], Array]:
-    """The ways whose first metre is free, with how far they are."""
+def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
+    """The ways whose first metre is free, up to where the sensor sees the first wall on them, with how far they are free."""
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length) - 1e-9]
-    return tuple(paths[i] for i in keep), free[keep]
+    return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]
 
 
 def _direction(path: Path) -> float:

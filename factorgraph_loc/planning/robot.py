@@ -12,7 +12,7 @@ from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.readers import simulated_odometry as wheels
 from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.free_space import CELL, FreeSpace
+from factorgraph_loc.simulation.free_space import FreeSpace
 from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
@@ -21,7 +21,6 @@ from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
 PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
-TOUCH = 1e-6  # m: a robot that is too near a wall may go as long as it comes no nearer
 
 
 class SimulatedRobot:
@@ -33,7 +32,14 @@ class SimulatedRobot:
     """
 
     def __init__(
-        self, world: World, rig: Rig, rounds_per_second: float, start: Array, settings: ActiveSettings, seed: int
+        self,
+        world: World,
+        space: FreeSpace,
+        rig: Rig,
+        rounds_per_second: float,
+        start: Array,
+        settings: ActiveSettings,
+        rng: np.random.Generator,
     ) -> None:
         assert rig.rfid is not None, "the settings have been checked"
         self.pose = np.array(start, dtype=float)
@@ -41,14 +47,12 @@ class SimulatedRobot:
         self.metres = 0.0
         self.blocked = False
         self._settings = settings
-        # free cells are those whose middle keeps the clearance
-        self._nearest = settings.clearance - CELL / math.sqrt(2.0)
-        self._walls = np.array(world.walls).reshape(-1, 4)
+        self._space = space
         self._antennas = tuple(rig.rfid.all_antennas())
         self._map = tag_map(world, rig.survey)
         self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
         self._round, self._rounds_per_second = 0, rounds_per_second
-        constants, self._noise, self._reads = np.random.default_rng(seed).spawn(3)
+        constants, self._noise, self._reads = rng.spawn(3)
         self._scale, self._drift, self._scale_of_turns = constants.normal(
             0.0, (wheels.SCALE_SIGMA, wheels.DRIFT_SIGMA, wheels.SCALE_SIGMA)
         )
@@ -64,9 +68,9 @@ class SimulatedRobot:
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield self._scan()
 
-    def free_ahead(self, space: FreeSpace, paths: Sequence[Path]) -> Array:
+    def free_ahead(self, paths: Sequence[Path]) -> Array:
         """How far [m] (C,) each of C ways can be gone, as far as the proximity sensor sees."""
-        steps = free_steps(space, self.pose[None], paths)[:, 0]
+        steps = free_steps(self._space, self.pose[None], paths)[:, 0]
         way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
         return np.asarray(np.minimum(way, self._settings.sight))
 
@@ -81,7 +85,7 @@ class SimulatedRobot:
             drifted = self._drift * math.hypot(dx, dy) + wheels.HEADING * root * n3
             moved = np.array((dx, dy, (told[2] - drifted) / (1.0 + self._scale_of_turns)))
             there = se2.compose(self.pose, moved)
-            if root > 0.0 and self._distance(there) < min(self._nearest, self._distance(self.pose) - TOUCH):
+            if root > 0.0 and not self._is_free(there):
                 self.blocked = True
                 return
             self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
@@ -125,9 +129,7 @@ class SimulatedRobot:
             self.t, self._antennas, antenna.astype(np.int64), names, np.zeros(len(tag)), unknown, unknown, unknown
         )
 
-    def _distance(self, pose: Array) -> float:
-        """To the nearest wall [m]."""
-        start, along = self._walls[:, :2], self._walls[:, 2:] - self._walls[:, :2]
-        offset = pose[:2] - start
-        share = np.clip((offset * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
-        return float(np.sqrt(((offset - share[:, None] * along) ** 2).sum(axis=1).min()))
+    def _is_free(self, there: Array) -> bool:
+        """Whether the robot may go there: to a free cell, or, where it is in none, to a cell that is no nearer to a wall."""
+        ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, there))), "step")
+        return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

@@ -19,19 +19,22 @@ CORRIDOR_WIDTH = 2.0
 DOOR_WIDTH = 1.0
 SHELF_DEPTH = 1.0
 AISLE_WIDTH = 3.0
+HALL_WIDTH = 3.0  # of the corridors of an H
+FROM_END = 2.0  # m, of a tag from the end of a corridor
 LOWEST_BOX = 1.4  # m: no furniture and no shelf is lower
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Outline and inner walls, ``boxes`` (furniture or shelves) by their corners (x1, y1, x2, y2), and the gaps in walls that are
-    ``doors``, all in metres."""
+    """Outline and inner walls, ``boxes`` (furniture, shelves, closed rooms) by their corners (x1, y1, x2, y2), and the gaps in
+    walls that are ``doors``, all in metres; ``hanging``: places (x, y) of tags that hang, in place of any on surfaces."""
 
     width: float
     depth: float
     walls: tuple[Segment, ...]
     boxes: tuple[Segment, ...]
     doors: tuple[Segment, ...] = ()
+    hanging: tuple[tuple[float, float], ...] = ()
 
     def segments(self) -> Array:
         """Everything that nobody drives or sees through: (S, 4)."""
@@ -78,6 +81,8 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
         return Plan(width, depth, outline, ())
     if settings.plan == "warehouse":
         return Plan(width, depth, outline, _shelves(width, depth))
+    if settings.plan == "corridors":
+        return _corridors(width, depth, outline)
     return _office(width, depth, outline, rng)
 
 
@@ -126,6 +131,23 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
         spans = [(margin, (width - AISLE_WIDTH) / 2.0), ((width + AISLE_WIDTH) / 2.0, width - margin)]
     bottoms = [pitch + i * (SHELF_DEPTH + pitch) for i in range(rows)]
     return tuple((x1, y, x2, y + SHELF_DEPTH) for y in bottoms for x1, x2 in spans)
+
+
+def _corridors(width: float, depth: float, outline: tuple[Segment, ...]) -> Plan:
+    """An H that looks the same when it is turned by half: a corridor along x, and one across each of its ends. What is between them
+    is closed rooms. A tag hangs in the middle, one in an arm at one end, and one in the opposite arm at the other."""
+    if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
+        raise InputError(
+            f"world: {width:g} x {depth:g} m is too small for corridors, expected at least "
+            f"{4.0 * HALL_WIDTH:g} x {3.0 * HALL_WIDTH:g} m"
+        )
+    low, high = (depth - HALL_WIDTH) / 2.0, (depth + HALL_WIDTH) / 2.0
+    count = max(1, round((width - 2.0 * HALL_WIDTH) / ROOM_WIDTH))
+    edges = np.linspace(HALL_WIDTH, width - HALL_WIDTH, count + 1).tolist()
+    rooms = [(x1, y1, x2, y2) for y1, y2 in ((0.0, low), (high, depth)) for x1, x2 in pairwise(edges)]
+    middle = HALL_WIDTH / 2.0
+    hanging = ((width / 2.0, depth / 2.0), (middle, FROM_END), (width - middle, depth - FROM_END))
+    return Plan(width, depth, outline, tuple(rooms), hanging=hanging)
 
 
 def _sides(box: Segment) -> list[Segment]:

@@ -20,14 +20,15 @@ Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there; ``hall``: one room with nothing in it.
+    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there; ``hall``: one room with nothing in it; ``corridors``: an H
+    that looks the same when it is turned by half, with three tags that hang, which alone tell its ends apart.
 
     ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
     ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
     ``points``: named points on walls and furniture that a camera may see (:class:`PixelSettings`).
     """
 
-    plan: Literal["office", "hall", "warehouse"] = "office"
+    plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
     width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
     depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
     tags: Annotated[int, Field(ge=0, le=10_000)] | None = None
@@ -260,6 +261,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     ),
     "warehouse": {
         "world": {"plan": "warehouse", "width": 30.0, "depth": 20.0, "density": 0.04, "surfaces": ["shelf"]},
+        "rig": RACKHAM_RIG,
+    },
+    "symmetric": {
+        "world": {"plan": "corridors", "width": 30.0, "depth": 24.0, "tags": 3},
         "rig": RACKHAM_RIG,
     },
 }

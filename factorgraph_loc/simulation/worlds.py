@@ -21,8 +21,8 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     """A world with walls (those of furniture and shelves too), tags ``T000``..., landmarks ``L000``... and points
     ``P0000``....
 
-    Tags on surfaces face away from them; those on the floor lie at height 0 and face nowhere. InputError if the plan lacks the
-    surfaces.
+    Tags on surfaces face away from them; those that hang face nowhere, nor do those on the floor, at height 0. InputError if the
+    plan lacks the surfaces.
     """
     plan = make_plan(settings, rng)
     tags: dict[str, Tag] = {}
@@ -32,12 +32,17 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     faces = np.concatenate(upright) if upright else np.empty((0, 4))
     if settings.surfaces == ("shelf",) and not len(faces):
         raise InputError(f"world: plan {settings.plan} has no shelves of this size, expected other surfaces")
+    if plan.hanging and count > len(plan.hanging):
+        raise InputError(f"world: tags is {count}, expected at most {len(plan.hanging)} in plan {settings.plan}")
     on_floor = 0
-    if "floor" in settings.surfaces:
+    if "floor" in settings.surfaces and not plan.hanging:
         on_floor = round(count / len(settings.surfaces)) if len(faces) else count
-    places = _even(settings, count - on_floor) if settings.even else _spread(plan, faces, count - on_floor, rng)
+    on_faces = 0 if plan.hanging else count - on_floor
+    places = _even(settings, on_faces) if settings.even else _spread(plan, faces, on_faces, rng)
     for x, y, facing in places.tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height, facing=facing)
+    for x, y in plan.hanging[:count]:
+        tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height)
     for x, y in rng.uniform((0.2, 0.2), (plan.width - 0.2, plan.depth - 0.2), (on_floor, 2)).round(3).tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=0.0)
     landmarks = _spread(plan, walls, settings.landmarks, rng)[:, :2].tolist()

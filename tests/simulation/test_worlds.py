@@ -21,7 +21,7 @@ def places(made):
     return np.array([(t.x, t.y) for t in made.tags.values()])
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", [name for name in PRESETS if name != "symmetric"])
 @pytest.mark.parametrize("seed", range(3))
 def test_tags_hang_on_a_surface_and_face_free_space(name, seed):
     settings = preset(name).world
@@ -61,6 +61,15 @@ def test_a_hall_with_even_tags_looks_the_same_from_both_ends():
     assert gaps.min(axis=1).max() < 2e-3
 
 
+def test_corridors_look_the_same_when_they_are_turned_by_half():
+    made = world(plan="corridors", width=30.0, depth=24.0, tags=3)
+    assert len(made.tags) == 3
+    for points in (places(made), np.array(made.walls).reshape(-1, 2)):
+        turned = np.array((30.0, 24.0)) - points
+        gaps = np.hypot(*(turned[:, None] - points[None]).transpose(2, 0, 1))
+        assert gaps.min(axis=1).max() < 2e-3
+
+
 def test_tags_are_spread_wider_than_at_random():
     """Drawn without a choice, 40 tags in this office have their nearest neighbour at 0.5 m to 1.2 m, in the median."""
     gaps = []
@@ -87,6 +96,8 @@ def test_landmarks_are_in_the_map():
     [
         ({"plan": "office", "depth": 4.0}, "office of 20 x 4 m has no rooms"),
         ({"plan": "hall", "surfaces": ("shelf",)}, "has no shelves"),
+        ({"plan": "corridors", "tags": 4}, "tags is 4, expected at most 3"),
+        ({"plan": "corridors", "width": 10.0}, "too small for corridors"),
     ],
 )
 def test_a_world_that_cannot_be_is_an_error(settings, message):
