@@ -70,10 +70,9 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
     told = expected_information(poses[1:], np.diff(path.way), sensors)
-    turns = np.concatenate((np.zeros(1), np.cumsum(np.abs(se2.wrap(np.diff(path.poses[:, 2]))))))
     states = [
         ChainState(way / SPEED, x, y, heading, way, turn, 0.0)
-        for way, (x, y, heading), turn in zip(path.way.tolist(), path.poses.tolist(), turns.tolist(), strict=True)
+        for way, (x, y, heading), turn in zip(path.way.tolist(), path.poses.tolist(), path.turned.tolist(), strict=True)
     ]
     for (before, after), information in zip(pairwise(states), told, strict=True):
         body = propagate(body, odometry.relative_motion(sensors.odometry, before, after))

@@ -24,7 +24,6 @@ from factorgraph_loc.planning import expected_scans
 from factorgraph_loc.planning.expected_scans import Places, ScanTables
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.simulation.free_space import FreeSpace
-from factors import se2
 from factors.odometry import OdometryModel
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
@@ -37,7 +36,7 @@ CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
 LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way
 ROUNDS_PER_METRE = 4.0  # of a robot with 2 rounds a second at 0.5 m/s
-SAMPLES, SCANS = 256, 64  # particles that are weighed, and those that scans are drawn from
+SAMPLES, SCANS = 256, 48  # particles that are weighed, and those that scans are drawn from
 SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
 WIDEST_HEADING = 0.8  # rad: no Gaussian in heading is wider
 
@@ -179,11 +178,10 @@ def _rounds(path: Path, looks: int, rounds_per_metre: float) -> Places:
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
-    """Standard deviations (S, 3) of the motion from one station to the next."""
+    """Standard deviations (S, 3) of the motion from one station to the next, by way and turn."""
     distance = np.diff(path.way[steps])
-    turned = np.concatenate(([0.0], np.cumsum(np.abs(se2.wrap(np.diff(path.poses[:, 2]))))))
-    rotation = np.diff(turned[steps])
+    rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))
     for column, growth in enumerate((noise.along, noise.lateral, noise.heading)):
-        out[1:, column] = [math.sqrt(growth.variance(d, r, 0.0)) for d, r in zip(distance, rotation, strict=True)]
+        out[1:, column] = np.sqrt(growth.per_distance**2 * distance + growth.per_rotation**2 * rotation)
     return out

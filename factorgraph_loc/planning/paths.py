@@ -37,6 +37,11 @@ class Path:
         steps = se2.log(se2.between(self.poses[:-1], self.poses[1:]))
         return np.concatenate((np.zeros(1), np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
 
+    @cached_property
+    def turned(self) -> Array:
+        """Radians (S,) turned up to each pose, to either side."""
+        return np.concatenate((np.zeros(1), np.cumsum(np.abs(se2.wrap(np.diff(self.poses[:, 2]))))))
+
     @property
     def length(self) -> float:
         """Metres driven."""
@@ -44,8 +49,7 @@ class Path:
 
     def duration(self, speed: float, turn_rate: float) -> float:
         """Seconds at ``speed`` [m/s] where no more than ``turn_rate`` [rad/s] is turned."""
-        turns = np.abs(se2.wrap(np.diff(self.poses[:, 2])))
-        return float(np.maximum(np.diff(self.way) / speed, turns / turn_rate).sum())
+        return float(np.maximum(np.diff(self.way) / speed, np.diff(self.turned) / turn_rate).sum())
 
     def until(self, length: float) -> Path:
         """The path up to the last pose that is no farther than ``length`` [m] on the way."""
