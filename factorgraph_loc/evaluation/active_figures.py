@@ -54,7 +54,8 @@ class SeekingTrack:
 def comparison(rows: Sequence[Row]) -> Figure:
     """For each world and estimator, side by side: a box for each policy, and the share of runs that were localized by then."""
     found = cases(rows)
-    figure, axes = grid(len(found), 2, 4.2 * len(found) + 1.0, "metres driven until localized")
+    seeds = len({row["seed"] for row in rows})
+    figure, axes = grid(len(found), 2, 4.2 * len(found) + 1.0, f"metres driven until localized, {seeds} runs of each")
     for (world, estimator), (boxes, shares) in zip(found, axes, strict=True):
         for axis in (boxes, shares):
             axis.set_title(f"{world}, {estimator}")

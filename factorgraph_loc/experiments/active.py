@@ -33,7 +33,7 @@ from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import SimulationSettings
 
-CHUNK = 5  # runs of one process: to start one takes as long as a run
+CHUNK = 10  # runs of one process: to start one takes longer than a run
 FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")
 PARTS, PLOTS = "parts", "plots"
 ROW: dict[str, Any] = {

@@ -105,6 +105,7 @@ def test_runs_that_all_fail_have_a_table_and_a_picture():
 def test_the_picture_of_a_comparison_counts_what_came_and_what_did_not(rows):
     figure = comparison(rows)
     boxes, shares = figure.axes
+    assert figure.get_suptitle().endswith("10 runs of each")
     assert [label.get_text() for label in boxes.get_xticklabels()] == ["information", "random"]
     assert [text.get_text() for text in boxes.texts] == ["1 of 10\nnever", "2 of 10\nnever"]
     ends = [float(line.get_ydata()[-1]) for line in shares.lines]
