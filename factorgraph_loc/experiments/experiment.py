@@ -111,6 +111,9 @@ def run_experiment(
             done, failed = done + 1, failed + (outcome.status == "failed")
             progress(done, len(prepared.runs), failed)
     finally:
+        for run in todo:  # an interrupt may come between a run's end and the news of it
+            if states[run.key] not in ("ok", "failed"):
+                states[run.key] = prepared.store.state(run.key)
         rows = _write_rows(prepared, states)
     return Done(rows, [_failure(row) for row in rows.iter_rows(named=True) if row["status"] == "failed"])
 

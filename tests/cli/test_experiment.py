@@ -1,0 +1,119 @@
+"""``fgloc experiment`` from the file to the table; what is stopped goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import polars as pl
+import pytest
+
+TEXT = """
+name = "lags"
+logs = ["{log}"]
+estimators = ["dead_reckoning", "ekf"]
+"""
+
+
+@pytest.fixture
+def file(tmp_path, short_log, monkeypatch):
+    """An experiment of two runs, its results in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    made = tmp_path / "lags.toml"
+    made.write_text(TEXT.format(log=short_log))
+    return made
+
+
+def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
+    plan = fgloc("experiment", "run", file, "--dry-run")
+    assert plan.exit_code == 0, plan.output
+    assert "2 runs, 2 to be made" in plan.stdout
+    made = fgloc("experiment", "run", file, "--jobs", 1)
+    assert made.exit_code == 0, made.output
+    assert "1 of 1" in made.stdout
+    rows = pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")
+    assert rows["label"].to_list() == ["dead_reckoning", "ekf"]
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "out" / "lags" / "store").glob("??/*/*"))
+    again = fgloc("experiment", "run", file, "--json")
+    document = json.loads(again.stdout)
+    assert [run["causal.position_rmse"] for run in document["runs"]] == rows["causal.position_rmse"].to_list()
+    assert sorted(p.stat().st_mtime_ns for p in (tmp_path / "out" / "lags" / "store").glob("??/*/*")) == before
+    status = fgloc("experiment", "status", file, "--verify", "--json")
+    labels = json.loads(status.stdout)["labels"]
+    assert labels["ekf"] == {"ok": 1, "failed": 0, "missing": 0, "damaged": 0}
+    changed = fgloc("experiment", "run", file, "--set", "ekf.max_delay=0.4", "--dry-run", "--json")
+    states = [(run["label"], run["state"]) for run in json.loads(changed.stdout)["runs"]]
+    assert states == [("dead_reckoning", "ok"), ("ekf", "missing")]
+    page = fgloc("experiment", "report", file)
+    assert page.exit_code == 0, page.output
+    assert "<html" in (tmp_path / "out" / "lags" / "report.html").read_text().lower()
+
+
+def test_a_failure_is_named_and_the_exit_code_is_1(fgloc, file, tmp_path):
+    result = fgloc("experiment", "run", file, "--jobs", 1, "--set", "prior=log")
+    assert result.exit_code == 1, result.output
+    status = fgloc("experiment", "status", file, "--set", "prior=log")
+    failures = [line for line in status.stdout.splitlines() if line.startswith("failed: ")]
+    assert len(failures) == result.stderr.count("failed: ") == 2
+    rows = pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")
+    assert rows["kind"].to_list() == ["error", "error"]
+
+
+@pytest.mark.parametrize(
+    ("args", "fragments"),
+    [
+        (["--set", "sedes=1"], ["sedes", "did you mean seeds?"]),
+        (["--set", "efk.max_delay=1"], ["efk", "did you mean ekf?"]),
+        (["--set", "ekf.max_dely=1"], ["max_dely", "did you mean max_delay?"]),
+        (["--set", "seeds"], ["--set", "KEY=VALUE"]),
+        (["--set", 'logs=["nowhere"]'], ["nowhere"]),
+        (["--set", 'estimators=["particle_filter"]', "--set", "seeds=0:10000"], ["10,000 runs", "--yes", "--dry-run"]),
+        (["--set", f"out={os.devnull}"], [os.devnull, "folder"]),
+        (["--set", "out=/proc/nowhere"], ["/proc/nowhere", "cannot be written"]),
+    ],
+)
+def test_what_is_wrong_is_refused_in_one_line(fgloc, file, args, fragments):
+    result = fgloc("experiment", "run", file, *args)
+    # where the words are right and the system refuses, it is not the input that is bad
+    assert result.exit_code == (1 if "cannot be written" in fragments else 2), result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    for fragment in ("error: ", *fragments):
+        assert fragment in line
+
+
+def test_ten_thousand_runs_can_be_listed(fgloc, file):
+    args = ("--set", 'estimators=["particle_filter"]', "--set", "seeds=0:10000", "--dry-run", "--json")
+    document = json.loads(fgloc("experiment", "run", file, *args).stdout)
+    assert document["todo"] == len({run["key"] for run in document["runs"]}) == 10_000
+    assert document["seconds"] > 0.0
+
+
+def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path):
+    (tmp_path / "slow.toml").write_text(
+        file.read_text().replace('"ekf"]', '{name = "particle_filter", settings = {particles = 200000}}]')
+    )
+    command = [
+        sys.executable,
+        "-c",
+        "from factorgraph_loc.cli.main import main; main()",
+        "experiment",
+        "run",
+        "slow.toml",
+    ]
+    process = subprocess.Popen([*command, "--jobs", "1"], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.glob("out/lags/store/??/*")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
+    stderr = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "the same command goes on" in stderr
+    assert "Traceback" not in stderr
+    assert len(pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")) == 1
+    status = fgloc("experiment", "status", "slow.toml", "--verify")
+    (line,) = [line for line in status.stdout.splitlines() if line.startswith("(all)")]
+    assert line.split()[1:] == ["1", "0", "1", "0"]
+    assert list((tmp_path / "out" / "lags" / "store" / "tmp").iterdir()) == []
