@@ -10,15 +10,16 @@ result does not depend on how finely a path is cut into pieces.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from factors import se2
-from factors.odometry_kernels import linearize, recalibrate
+from factors.odometry_kernels import Noise, linearize, recalibrate, relative, whitener
 from factors.se2 import Array
 
-MINIMUM_POSITION_VARIANCE = 1e-8
+MINIMUM_POSITION_VARIANCE = 1e-8  # of a robot at rest, whose covariance must still be one that can be inverted
 MINIMUM_HEADING_VARIANCE = 1e-8
 
 
@@ -67,6 +68,14 @@ class OdometryModel:
     lateral: Growth = field(default_factory=Growth)
     heading: Growth = field(default_factory=Growth)
 
+    def noise(self) -> Noise:
+        """What compiled code knows of it: see :data:`factors.odometry_kernels.Noise`."""
+        growths = (self.along, self.lateral, self.heading)
+        sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
+        sigmas += [self.unknown_distance, self.unknown_rotation]
+        least = MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE
+        return (float(self.direction), *(float(s) ** 2 for s in sigmas), *least)
+
 
 @dataclass(frozen=True, slots=True)
 class Increment:
@@ -81,8 +90,7 @@ class Increment:
     duration: float
 
 
-@dataclass(frozen=True, slots=True)
-class ChainState:
+class ChainState(NamedTuple):
     """Where the odometry is at a time: pose in its own frame, path [m], turned angle [rad], time without odometry [s]."""
 
     t: float
@@ -100,37 +108,7 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     The heading error is a random walk along the way, so it also displaces the end: with the chord seen from the end and
     the walk spread evenly over it, by a third of its variance (and half of it as covariance).
     """
-    delta = se2.between(np.array((start.x, start.y, start.heading)), np.array((end.x, end.y, end.heading)))
-    distance, rotation = abs(end.path - start.path), abs(end.turn - start.turn)
-    duration = abs(end.t - start.t)
-    unknown = max(0.0, end.unknown - start.unknown)
-    along = model.along.variance(distance, rotation, duration) + model.unknown_distance**2 * unknown
-    lateral = model.lateral.variance(distance, rotation, duration) + model.unknown_distance**2 * unknown
-    heading = model.heading.variance(distance, rotation, duration) + model.unknown_rotation**2 * unknown
-    # the start as seen from the end, turned by 90 degrees: how the end moves when the heading changes at the start
-    c, s = math.cos(delta[2]), math.sin(delta[2])
-    chord_x, chord_y = c * delta[0] + s * delta[1], -s * delta[0] + c * delta[1]
-    nx, ny = -chord_y, chord_x
-    # on the way the robot looked, on average, half the turn back from where it looks at the end
-    travel = model.direction - delta[2] / 2.0
-    d_along, d_lateral = math.cos(travel), math.sin(travel)
-    covariance = np.array(
-        [
-            [
-                d_along**2 * along + d_lateral**2 * lateral + heading * nx * nx / 3.0,
-                d_along * d_lateral * (along - lateral) + heading * nx * ny / 3.0,
-                heading * nx / 2.0,
-            ],
-            [0.0, d_lateral**2 * along + d_along**2 * lateral + heading * ny * ny / 3.0, heading * ny / 2.0],
-            [0.0, 0.0, heading],
-        ]
-    )
-    covariance[1, 0], covariance[2, 0], covariance[2, 1] = covariance[0, 1], covariance[0, 2], covariance[1, 2]
-    # a robot at rest still needs a covariance that can be inverted
-    covariance[0, 0] += MINIMUM_POSITION_VARIANCE
-    covariance[1, 1] += MINIMUM_POSITION_VARIANCE
-    covariance[2, 2] += MINIMUM_HEADING_VARIANCE
-    return Increment(delta, covariance, duration)
+    return Increment(*relative(model.noise(), start, end))
 
 
 # the constants that recalibrated() changes
@@ -172,7 +150,7 @@ class OdometryFactor:
         self._increment = increment
         self._arc = se2.log(increment.delta)
         self._estimated = list(estimated)
-        self._whitener = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(increment.covariance)))
+        self._whitener = whitener(increment.covariance)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""

@@ -13,7 +13,8 @@ import numba
 import numpy as np
 
 from factors import se2
-from factors.odometry import ChainState, Increment, OdometryModel, relative_motion
+from factors.odometry import ChainState, Increment, OdometryModel
+from factors.odometry_kernels import relative
 from factors.se2 import Array
 
 # columns of a row: when it takes effect, its kind, and its values
@@ -53,6 +54,7 @@ class OdometryChain:
             (m.lag, m.max_hold),
             (m.gyro_bias, use_gyro),
         )
+        self._noise = m.noise()
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
@@ -89,7 +91,7 @@ class OdometryChain:
 
         ``start`` may be what was believed at its time: the difference then includes what later rows corrected.
         """
-        return relative_motion(self.model, start, end)
+        return Increment(*relative(self._noise, start, end))
 
     def _insert(self, *row: float) -> bool:
         t = row[0]

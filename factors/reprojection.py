@@ -103,7 +103,7 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 
 def project(model: CameraModel, points: Array) -> Array:
     """Pixels (K, 2) of ``points`` (K, 3) in the camera's frame."""
-    return np.asarray(reprojection_kernels.project(_lens(model), np.ascontiguousarray(points, dtype=float))[0])
+    return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
 
 
 def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
@@ -143,7 +143,7 @@ def undistorted(model: CameraModel, pixels: Array) -> Array:
     """Directions (K, 2), as (x, y) at depth 1 in the camera's frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
     Newton's method."""
     seen = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
-    return np.asarray(reprojection_kernels.undistorted(_lens(model), np.ascontiguousarray(seen))[0])
+    return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(seen))[0])
 
 
 def rays(model: CameraModel, pixels: Array) -> Array:
@@ -160,7 +160,7 @@ def folded(model: CameraModel) -> Array | None:
         return None
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in (model.width, model.height))
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    lens = _lens(model)
+    lens = lens_of(model)
     seen = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
     directions, errors = reprojection_kernels.undistorted(lens, seen)
     bad = ~(errors < NONE) | (lens[8] * np.sum(directions**2, axis=1) >= 1.0)
@@ -172,7 +172,7 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
     perturbation (K, 2, 3), by the points (K, 2, 3), and by small changes of :data:`PARAMETERS` (K, 2, 8), of which that by the
     time offset is zero here, as it needs the robot's velocity."""
     found: tuple[Array, Array, Array, Array] = reprojection_kernels.linearize(
-        _lens(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
+        lens_of(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
     )
     return found
 
@@ -183,13 +183,10 @@ def linearize_in_space(
     """Pixels (K, 2) of ``points`` (K, 3) seen from a camera anywhere in space, at ``position`` (3,) with ``rotation`` (3, 3) in the
     world; their Jacobians by the camera's perturbation (K, 2, 6), turn first, then shift, both in the camera's frame as
     ``gtsam.Pose3`` has them, and by the points (K, 2, 3)."""
-    local = (np.asarray(points, dtype=float) - position) @ rotation
-    pixels, by_local = reprojection_kernels.project(_lens(model), np.ascontiguousarray(local))
-    by_camera = np.empty((len(local), 2, 6))
-    # a turn w moves the point in the camera's frame by -w x p
-    by_camera[..., :3] = by_local @ _cross_matrices(local)
-    by_camera[..., 3:] = -by_local
-    return pixels, by_camera, by_local @ rotation.T
+    found: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
+        lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
+    )
+    return found
 
 
 def log_likelihood(
@@ -204,7 +201,7 @@ def log_likelihood(
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
     else:
         whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
-    arguments = (_lens(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
+    arguments = (lens_of(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
     return model.tempering * np.asarray(
         reprojection_kernels.log_likelihood(
             *arguments,
@@ -226,15 +223,7 @@ def huber_weight(squared: Array, scale: float) -> Array:
     return np.asarray(scale / np.maximum(np.sqrt(squared), scale))
 
 
-def _cross_matrices(v: Array) -> Array:
-    """The matrices (K, 3, 3) that take the cross product of ``v`` (K, 3) with a vector."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out
-
-
-def _lens(model: CameraModel) -> Lens:
+def lens_of(model: CameraModel) -> Lens:
     """What the kernels know of a camera: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which its
     polynomial is used: where the radial part grows no more, at most :data:`WIDEST`; 0 without distortion, for everywhere."""
     end = 0.0

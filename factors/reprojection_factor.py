@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factors import se2
+from factors import pixel_kernels, se2
 from factors.displaced import carried, delayed, displaced
 from factors.reprojection import (
     PARAMETERS,
@@ -17,6 +17,7 @@ from factors.reprojection import (
     huber_loss,
     huber_weight,
     in_camera,
+    lens_of,
     linearize,
     project,
     recalibrated,
@@ -24,6 +25,7 @@ from factors.reprojection import (
 from factors.reprojection_kernels import NEAREST
 from factors.se2 import Array
 
+NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 BEHIND = 100.0  # standard deviations that a sighting of a point behind the camera is off by
 
 
@@ -50,8 +52,33 @@ class ReprojectionFactor:
     free: bool = False
     twist: Array | None = None
 
+    @property
+    def of_pose_alone(self) -> bool:
+        """Whether its only value is the pose."""
+        return not self.estimated and not self.free
+
+    def packed(self) -> pixel_kernels.Seen:
+        """As compiled code takes it, where it is a factor :attr:`of_pose_alone`."""
+        model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
+        return pixel_kernels.Seen(
+            lens_of(model),
+            model.position,
+            model.rotation,
+            np.ascontiguousarray(self.points, dtype=float),
+            np.ascontiguousarray(self.pixels, dtype=float),
+            EXACT if spreads is None else np.ascontiguousarray(spreads),
+            NOT_MOVED if offset is None else offset,
+            NO_SPREAD if noise is None else noise,
+            float(model.sigma),
+            float(model.robust),
+            float(model.tempering),
+        )
+
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        if self.of_pose_alone:
+            residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
+            return residual, [jacobian]
         error, blocks = self.whitened(values)
         weight = np.sqrt(self.weight(np.einsum("ki,ki->k", error, error)))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
@@ -72,6 +99,9 @@ class ReprojectionFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        if self.of_pose_alone:
+            residual, jacobian = pixel_kernels.whitened(self.packed(), np.ascontiguousarray(values[0], dtype=float))
+            return residual, [jacobian]
         here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
         offset = here.offset
         at = values[0] if offset is None else se2.compose(values[0], offset)

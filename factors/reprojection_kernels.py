@@ -47,7 +47,7 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 
 
 @numba.njit(cache=True, inline="always")
-def _pixel(
+def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
     """The pixel of a point, and how its two coordinates depend on the point."""
@@ -61,7 +61,7 @@ def _pixel(
 
 
 @numba.njit(cache=True, inline="always")
-def _mounting(position: Array, rotation: Array) -> Place:
+def mounting(position: Array, rotation: Array) -> Place:
     """The camera's place in the robot's frame, as numbers: its position, and its axes."""
     p, r = position, rotation
     right, down, ahead = (r[0, 0], r[1, 0], r[2, 0]), (r[0, 1], r[1, 1], r[2, 1]), (r[0, 2], r[1, 2], r[2, 2])
@@ -69,7 +69,7 @@ def _mounting(position: Array, rotation: Array) -> Place:
 
 
 @numba.njit(cache=True, inline="always")
-def _in_camera(
+def in_camera(
     place: Place, c: float, s: float, dx: float, dy: float, z: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """A point that is (dx, dy, z) from a robot with the heading (c, s): as it lies from the camera along the robot's axes, and in
@@ -129,7 +129,7 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
     n = len(points)
     pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
     for i in range(n):
-        u, v, by_u, by_v = _pixel(k, points[i, 0], points[i, 1], points[i, 2])
+        u, v, by_u, by_v = pixel(k, points[i, 0], points[i, 1], points[i, 2])
         pixels[i, 0], pixels[i, 1] = u, v
         for j in range(3):
             jacobians[i, 0, j], jacobians[i, 1, j] = by_u[j], by_v[j]
@@ -137,20 +137,42 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
+    """As of :func:`factors.reprojection.linearize_in_space`."""
+    n = len(points)
+    pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
+    for i in range(n):
+        dx, dy, dz = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+        x = dx * rotation[0, 0] + dy * rotation[1, 0] + dz * rotation[2, 0]
+        y = dx * rotation[0, 1] + dy * rotation[1, 1] + dz * rotation[2, 1]
+        z = dx * rotation[0, 2] + dy * rotation[1, 2] + dz * rotation[2, 2]
+        u, v, by_u, by_v = pixel(k, x, y, z)
+        pixels[i, 0], pixels[i, 1] = u, v
+        for r in range(2):
+            a, b, c = by_u if r == 0 else by_v
+            # a turn w moves the point in the camera's frame by -w x p
+            by_camera[i, r, 0], by_camera[i, r, 1], by_camera[i, r, 2] = b * z - c * y, c * x - a * z, a * y - b * x
+            by_camera[i, r, 3], by_camera[i, r, 4], by_camera[i, r, 5] = -a, -b, -c
+            for j in range(3):
+                by_point[i, r, j] = a * rotation[j, 0] + b * rotation[j, 1] + c * rotation[j, 2]
+    return pixels, by_camera, by_point
+
+
+@numba.njit(cache=True, error_model="numpy")
 def linearize(
     k: Lens, position: Array, rotation: Array, pose: Array, points: Array
 ) -> tuple[Array, Array, Array, Array]:
     """As of :func:`factors.reprojection.linearize`."""
-    n, place = len(points), _mounting(position, rotation)
+    n, place = len(points), mounting(position, rotation)
     pixels, by_pose, by_point = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
     by_parameters = np.zeros((n, 2, 8))
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(n):
-        (ax, ay, az), (lx, ly, lz) = _in_camera(
+        (ax, ay, az), (lx, ly, lz) = in_camera(
             place, c, s, points[i, 0] - pose[0], points[i, 1] - pose[1], points[i, 2]
         )
         rx, ry = ax + position[0], ay + position[1]  # from the robot
-        u, v, by_u, by_v = _pixel(k, lx, ly, lz)
+        u, v, by_u, by_v = pixel(k, lx, ly, lz)
         pixels[i, 0], pixels[i, 1] = u, v
         for r in range(2):
             d = by_u if r == 0 else by_v
@@ -180,7 +202,7 @@ def log_likelihood(
     scale: float,
 ) -> Array:
     """As of :func:`factors.reprojection.log_likelihood`, untempered, with ``whiteners`` (K, 2, 2) of the residuals."""
-    place = _mounting(position, rotation)
+    place = mounting(position, rotation)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])
     out = np.zeros(len(poses))
     for start in range(0, len(poses), BLOCK):
@@ -191,8 +213,8 @@ def log_likelihood(
             uu, uv, vu, vv = whiteners[i, 0, 0], whiteners[i, 0, 1], whiteners[i, 1, 0], whiteners[i, 1, 1]
             # poses side by side, and no other array than theirs: several are computed by one instruction
             for n in range(len(total)):
-                _, (lx, ly, lz) = _in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
-                u, v, _, _ = _pixel(k, lx, ly, lz)
+                _, (lx, ly, lz) = in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
+                u, v, _, _ = pixel(k, lx, ly, lz)
                 a, b = uu * (u - seen_u) + uv * (v - seen_v), vu * (u - seen_u) + vv * (v - seen_v)
                 total[n] -= _huber(a * a + b * b, scale)
     return out

@@ -10,8 +10,20 @@ from numpy.typing import NDArray
 
 from factors.rfid import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array
+from factors.se2_kernels import wrapped
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # what an optimiser may do, without taking infinities for impossible
+
+
+@numba.njit(cache=True)
+def moved(offset: Array, offsets: Array) -> Array:
+    """The poses (K, 3) that lie ``offset`` (3,) behind ``offsets`` (K, 3)."""
+    c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
+    for k in range(len(offsets)):
+        out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
+        out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
+        out[k, 2] = wrapped(offset[2] + offsets[k, 2])
+    return out
 
 
 @numba.njit(cache=True, inline="always")
@@ -111,8 +123,13 @@ def score(
             # of the antenna's boresight in the frame of the pose, and the antenna's place there
             cb, sb = co * ca - so * sa, so * ca + co * sa
             px, py = offsets[k, 0] + co * lx - so * ly, offsets[k, 1] + so * lx + co * ly
+            far_e, _, _, far_mean, far_spread = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])
+            far = 0
             for t in range(len(points)):
                 z, by_p, by_q, by_heading = of_tag(packed, a, x, y, c, s, points[t], normals[t])
+                if z == NEGLIGIBLE_LOGIT and hits[k, t] == 0:  # out of reach and not read, as most are
+                    far += 1
+                    continue
                 e, g, f, mean, spread = terms(packed, z, hits[k, t], rounds[k])
                 e_sum += e
                 mean_sum += mean
@@ -129,6 +146,9 @@ def score(
                 yy += f * by_y * by_y
                 ya += f * by_y * by_a
                 aa += f * by_a * by_a
+            e_sum += far * far_e
+            mean_sum += far * far_mean
+            spread_sum += far * far_spread
         nll[n], expected[n], variance[n] = tempering * e_sum, tempering * mean_sum, tempering * spread_sum
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = tempering * g_x, tempering * g_y, tempering * g_a
         information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = (

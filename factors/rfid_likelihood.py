@@ -50,11 +50,13 @@ class Looks:
 
     def moved(self, offset: Array) -> Looks:
         """The same looks, of the pose that lies ``offset`` (3,) before theirs."""
-        return Looks(se2.compose(offset, self.offsets), self.antennas, self.rounds, self.hits)
+        return Looks(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits)
 
 
 def together(parts: list[Looks]) -> Looks:
     """Several looks as one, all of the same pose."""
+    if len(parts) == 1:
+        return parts[0]
     return Looks(
         np.concatenate([p.offsets for p in parts]),
         np.concatenate([p.antennas for p in parts]),

@@ -42,7 +42,8 @@ from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
-from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
+from factors.odometry import PARAMETERS, Increment, OdometryFactor
+from factors.odometry_kernels import recalibrated
 from factors.reprojection_factor import ReprojectionFactor
 from factors.rfid_factor import RfidFactor
 from factors.se2 import Array
@@ -182,7 +183,9 @@ class KeyframeGraph(ABC):
         if ODOMETRY_KEY not in self._constants:
             return increment
         changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
-        return Increment(recalibrated(increment, changes)[0], increment.covariance, increment.duration)
+        return Increment(
+            recalibrated(increment.delta, increment.duration, changes), increment.covariance, increment.duration
+        )
 
     def _constant_priors(self) -> tuple[Values, Values]:
         """Means and covariances of the sensors' constants before any measurement."""

@@ -10,6 +10,7 @@ from factorgraph_loc.rig import Rig
 from factors import se2
 from factors.odometry import ChainState, Increment
 from factors.odometry_chain import OdometryChain
+from factors.odometry_kernels import carried
 from factors.se2 import Array
 
 HORIZON = 5.0  # s of odometry that are kept
@@ -92,5 +93,4 @@ class Motion:
 
 def propagate(covariance: Array, increment: Increment) -> Array:
     """A body-frame covariance (3, 3) carried along an increment."""
-    transition = se2.adjoint(se2.inverse(increment.delta))
-    return np.asarray(transition @ covariance @ transition.T + increment.covariance)
+    return np.asarray(carried(covariance, increment.delta, increment.covariance))

@@ -1,7 +1,8 @@
 """The Kalman update of all estimators by what is seen of landmarks and points: robust and iterated, in information form.
 
 A factor of sightings tells of K of them two coordinates each; one that is wrong must neither pull far nor be dropped by a
-prediction that is wrong itself.
+prediction that is wrong itself. Of pixels of known points, which come often and in numbers, the same is done by compiled code
+(:mod:`factors.pixel_kernels`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from factors import se2
+from factors import pixel_kernels, se2
+from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # of an iterated update, m and rad
@@ -52,6 +54,17 @@ def robust_update(
 
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
     """
+    if isinstance(factor, ReprojectionFactor) and factor.of_pose_alone:
+        arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+        found = pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE)
+        return Update(*found, factor.dof())
+    return linearized_update(factor, pose, covariance, iterations, converged)
+
+
+def linearized_update(
+    factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+) -> Update:
+    """:func:`robust_update` by a factor of any kind."""
 
     def linearize(delta: Array) -> tuple[Array, Array]:
         residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])

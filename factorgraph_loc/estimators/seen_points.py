@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factorgraph_loc.vision.spread import spread_out
-from factors import reprojection, se2
+from factors import pixel_kernels, reprojection, se2
 from factors.odometry import Increment
 from factors.reprojection import FOCAL, TIME_OFFSET, CameraModel
 from factors.reprojection_factor import ReprojectionFactor
@@ -103,12 +104,14 @@ class KnownPoints:
         if self.model is None:
             self._diagnostics.ignore("camera", len(m.pixels))
             return None
-        rows = [i for i, name in enumerate(m.points) if name in self.map.index]
-        if len(rows) < len(m.points) and not self._others_matter:
-            self._diagnostics.ignore("point not in the map", len(m.points) - len(rows))
-        if not rows:
-            return None
-        return self._factor(self.model, [self.map.index[m.points[i]] for i in rows], m.pixels[rows])
+        places = [self.map.index.get(name, -1) for name in m.points]
+        pixels = m.pixels
+        if -1 in places:
+            rows = [i for i, place in enumerate(places) if place >= 0]
+            if not self._others_matter:
+                self._diagnostics.ignore("point not in the map", len(places) - len(rows))
+            places, pixels = [places[i] for i in rows], pixels[rows]
+        return self._factor(self.model, places, pixels) if places else None
 
     def factor(
         self, m: Pixels, predicted: Predicted, offset: Increment | None = None, twist: Array | None = None
@@ -123,7 +126,8 @@ class KnownPoints:
             return None
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
-        factor = replace(factor, estimated=self._estimated.indices, twist=twist)
+        if self._estimated.indices:
+            factor = replace(factor, estimated=self._estimated.indices, twist=twist)
         here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
         camera = self._camera(here, predicted)
         focal = 0.0
@@ -133,10 +137,12 @@ class KnownPoints:
         if isinstance(m, CameraFrame):
             return self._found(m, factor, here.model, camera, focal)
         right = _agreeing(here, camera, focal)
-        self.missed = bool(np.count_nonzero(right) < FEW_SHARE * len(right))
-        if not right.all():
-            self._diagnostics.reject(DISAGREES, int(np.count_nonzero(~right)))
-        return _rows(factor, right) if right.any() else None
+        agreed = int(np.count_nonzero(right))
+        self.missed = agreed < FEW_SHARE * len(right)
+        if agreed == len(right):
+            return factor
+        self._diagnostics.reject(DISAGREES, len(right) - agreed)
+        return _rows(factor, right) if agreed else None
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose that an image tells without a prediction, None where it tells none, and how many points it seemed to show."""
@@ -159,11 +165,11 @@ class KnownPoints:
     def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
         """Record the innovation of an update at time ``t``."""
         self._diagnostics.innovation("camera", t, update.nis, update.dof)
-        errors = -update.residual * factor.model.sigma
-        for i, name in enumerate("uv"):
-            self._diagnostics.residuals.setdefault(f"camera.{name}", []).extend(errors[:, i].tolist())
+        u, v = (-factor.model.sigma * update.residual.T).tolist()
+        self._diagnostics.residuals.setdefault("camera.u", []).extend(u)
+        self._diagnostics.residuals.setdefault("camera.v", []).extend(v)
         if self._clock is not None:
-            self._clock.add(t, float(np.median(errors[:, 0])) / factor.model.fx)
+            self._clock.add(t, median(u) / factor.model.fx)
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
         spreads = self.map.covariances[points] if self._map_matters else None
@@ -245,8 +251,8 @@ def pixel_update(
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
     """The camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
-    lift = _lift(model)
-    return CameraPose(*reprojection.camera_pose(model, pose), lift @ covariance @ lift.T)
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
+    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, *arrays))
 
 
 def _lift(model: CameraModel) -> Array:
@@ -265,10 +271,12 @@ def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Tru
     model, count = here.model, len(here.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    spreads = np.broadcast_to(model.sigma**2 * np.eye(2), (count, 2, 2))
-    if here.point_covariances is not None:
+    if here.point_covariances is None:
+        spreads = np.zeros((count, 2, 2))
+        spreads[:, (0, 1), (0, 1)] = model.sigma**2
+    else:
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
-        spreads = spreads + by_point @ here.point_covariances @ by_point.transpose(0, 2, 1)
+        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
     if focal > 0.0:
         away = focal * (here.pixels - (model.cx, model.cy))
         spreads = spreads + away[:, :, None] * away[:, None, :]

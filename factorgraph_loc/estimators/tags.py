@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,10 +14,15 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.tag_map import TagMap, tag_map
-from factors import se2
+from factors import rfid_kernels, se2, se2_kernels
+from factors.rfid import Packed
 from factors.rfid_factor import RfidFactor, TagScore
 from factors.rfid_likelihood import Looks, RfidLikelihood, Score
 from factors.se2 import Array
+
+_Tags = tuple[Array, Array]  # points and normals
+_Integers = NDArray[np.int64]
+_Seen = tuple[Array, _Integers, _Integers, _Integers]  # offsets, antennas, rounds and hits
 
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
@@ -32,6 +38,7 @@ class KnownTags:
         settings = setup.rig.rfid if "rfid" in setup.sensors else None
         self._diagnostics = diagnostics
         self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
+        self._rounds: dict[tuple[str, ...], tuple[list[int], _Integers, _Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
         self.likelihood = None if settings is None else RfidLikelihood(settings.model(), self.map.tags)
 
@@ -44,14 +51,11 @@ class KnownTags:
         if self.likelihood is None:
             diagnostics.ignore("rfid", len(m.antennas))
             return None
-        antennas = [self._antennas.get(name, -1) for name in m.antennas]
-        used = sorted(set(antennas) - {-1})
-        if antennas.count(-1):
-            diagnostics.ignore("antenna that the rig lacks", antennas.count(-1))
-        if not used or not self.map.names:
+        rows, used, rounds = self._listening(m.antennas)
+        if -1 in rows:
+            diagnostics.ignore("antenna that the rig lacks", rows.count(-1))
+        if not len(used) or not self.map.names:
             return None
-        rows = {antenna: k for k, antenna in enumerate(used)}
-        rounds = np.bincount([rows[a] for a in antennas if a >= 0], minlength=len(used)).astype(np.int64)
         hits = np.zeros((len(used), len(self.map.names)), dtype=np.int64)
         unknown = 0
         # a tag counts once a round, as often as it may answer in it
@@ -59,11 +63,22 @@ class KnownTags:
             place = self.map.index.get(name)
             if place is None:
                 unknown += 1
-            elif antennas[number] >= 0:
-                hits[rows[antennas[number]], place] += 1
+            elif rows[number] >= 0:
+                hits[rows[number], place] += 1
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        return Looks(np.zeros((len(used), 3)), np.array(used, dtype=np.int64), rounds, hits)
+        return Looks(np.zeros((len(used), 3)), used, rounds, hits)
+
+    def _listening(self, names: tuple[str, ...]) -> tuple[list[int], _Integers, _Integers]:
+        """Of antennas that listened: the rows of their looks, -1 of those that the rig lacks; of each row its antenna's place in
+        the rig, and how many rounds there were. It is kept, as scan after scan is of the same antennas."""
+        if names not in self._rounds:
+            antennas = [self._antennas.get(name, -1) for name in names]
+            used = sorted(set(antennas) - {-1})
+            rows = [used.index(antenna) if antenna >= 0 else -1 for antenna in antennas]
+            counts = [antennas.count(antenna) for antenna in used]
+            self._rounds = {names: (rows, np.array(used, dtype=np.int64), np.array(counts, dtype=np.int64))}
+        return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Of each read of a scan the places of its antenna in the rig and of its tag in the map, -1 where these lack it."""
@@ -102,7 +117,17 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
 
     A step that does not lower the cost is halved. What is told of the innovation is that of the first factor.
     """
-    covariance = np.ascontiguousarray(covariance)
+    pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+    likelihood, looks = factors[0].likelihood, factors[0].seen
+    if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, Looks):
+        return scored_update(factors, pose, covariance, iterations)
+    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits)
+    arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
+    return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
+
+
+def scored_update(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int) -> TagUpdate:
+    """:func:`updated` by factors of any kind and number."""
     prior_information: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     sigmas = np.sqrt(np.diag(covariance))
     scores = [factor.score(pose) for factor in factors]
@@ -145,7 +170,71 @@ def _total(scores: Sequence[TagScore]) -> tuple[float, Array, Array]:
     return nll, gradient, information
 
 
-# The parts of an update that are linear algebra of three rows: compiled, as NumPy takes ten times as long for so few.
+# The parts of an update that are linear algebra of three rows: compiled, as NumPy takes ten times as long for so few. So is the
+# whole update by what was read and not read, which comes often.
+
+
+@numba.njit(cache=True)
+def _updated(
+    packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array, covariance: Array, iterations: int
+) -> tuple[Array, Array, float, int, float, float, float]:
+    """What :func:`scored_update` does, by one factor of looks."""
+    here = _score(packed, tags, seen, tempering, pose)
+    prior_information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    nis, dof = _innovation(here.gradient[0], here.information[0], covariance, tempering)
+    surprise, variance, cost = here.nll[0] - here.expected[0], here.variance[0], here.nll[0]
+    best, moved = pose.copy(), np.zeros(3)
+    for _ in range(iterations):
+        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved)
+        small = True
+        for i in range(3):
+            small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
+        if small:
+            best = _stepped(best, step)
+            break
+        lower = False
+        for _ in range(4):
+            tried = _stepped(best, step)
+            there, error = _score(packed, tags, seen, tempering, tried), _apart(pose, tried)
+            tried_cost = there.nll[0] + 0.5 * np.dot(error, np.dot(prior_information, error))
+            lower = tried_cost <= cost
+            if lower:
+                best, cost, moved, here = tried, tried_cost, error, there
+                break
+            step = step / 2.0
+        if not lower:
+            break
+    posterior, log_ratio = _posterior(prior_information, here.information[0])
+    return best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost
+
+
+@numba.njit(cache=True)
+def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
+    """Of one pose (3,), as of :meth:`~factors.rfid_likelihood.RfidLikelihood.score`."""
+    points, normals = tags
+    offsets, antennas, rounds, hits = seen
+    nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
+    told = np.empty(1), np.empty(1)
+    at = pose.copy().reshape(1, 3)
+    rfid_kernels.score(
+        packed, at, points, normals, offsets, antennas, rounds, hits, tempering, nll, gradient, information, *told
+    )
+    return Score(nll, gradient, information, *told)
+
+
+@numba.njit(cache=True)
+def _stepped(pose: Array, step: Array) -> Array:
+    x, y, turned = se2_kernels.exp(step[0], step[1], step[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)))
+
+
+@numba.njit(cache=True)
+def _apart(pose: Array, other: Array) -> Array:
+    """The twist that leads from one pose to another."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    dx, dy = other[0] - pose[0], other[1] - pose[1]
+    return np.array(se2_kernels.log(c * dx + s * dy, c * dy - s * dx, other[2] - pose[2]))
 
 
 @numba.njit(cache=True)

@@ -10,6 +10,7 @@ covariance of rank 3, and so has what is corrected.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numba
 import numpy as np
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from factors import reprojection
+from factors import reprojection, reprojection_kernels
 from factors.reprojection import CameraModel
+from factors.reprojection_kernels import Lens
 from factors.se2 import Array
 
 Truths = NDArray[np.bool_]
@@ -47,9 +49,9 @@ class CameraPose:
 def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> bool:
     """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], lie
     together as near to what is predicted as they should."""
-    predicted, jacobian, _ = reprojection.linearize_in_space(model, camera.position, camera.rotation, points)
-    joint = _joint(predicted - pixels, jacobian, spreads, camera.covariance)
-    return bool(joint < chdtri(2 * len(points), 1.0 - JOINT))
+    seen = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, spreads))
+    joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *seen)
+    return bool(joint < _largest(2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
@@ -112,14 +114,23 @@ def _best_of_samples(
     return best[1:]
 
 
+@cache
+def _largest(dof: int) -> float:
+    return float(chdtri(dof, 1.0 - JOINT))
+
+
 @numba.njit(cache=True)
-def _joint(residual: Array, jacobian: Array, spreads: Array, covariance: Array) -> float:
-    """The normalised square of innovations (K, 2) with Jacobians (K, 2, 6) and noise (K, 2, 2), under a covariance (6, 6)."""
+def _joint(
+    lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, spreads: Array
+) -> float:
+    """The normalised square of what is seen of points (K, 3) at pixels (K, 2) with noise (K, 2, 2), by a camera whose
+    perturbation has a covariance (6, 6)."""
+    predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros(6), 0.0
-    for i in range(len(residual)):
+    for i in range(len(points)):
         a, b, c = spreads[i, 0, 0], spreads[i, 0, 1], spreads[i, 1, 1]
         determinant = a * c - b * b
-        u, v = residual[i]
+        u, v = predicted[i, 0] - pixels[i, 0], predicted[i, 1] - pixels[i, 1]
         wu, wv = (c * u - b * v) / determinant, (a * v - b * u) / determinant
         total += u * wu + v * wv
         for j in range(6):

@@ -1,0 +1,101 @@
+"""Compiled updates of a pose against those that NumPy makes of the same measurements."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators import tags
+from factorgraph_loc.estimators.robust_update import linearized_update, robust_update
+from factors import rfid_kernels, se2
+from factors.reprojection import CameraModel, camera_pose, predict
+from factors.reprojection_factor import ReprojectionFactor
+from factors.rfid import Antenna, BeamModel, RfidModel
+from factors.rfid_factor import RfidFactor
+from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+
+CLOSE = 1e-8  # standard deviations
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A factor of pixels that is not compiled."""
+
+    factor: ReprojectionFactor
+
+    def whitened(self, values):
+        residual, blocks = replace(self.factor, estimated=(2,)).whitened([*values, np.zeros(1)])
+        return residual, blocks[:1]
+
+    def weight(self, squared):
+        return self.factor.weight(squared)
+
+    def dof(self):
+        return self.factor.dof()
+
+
+def spread(rng, size, scale):
+    root = scale * rng.standard_normal((size, size))
+    return root @ root.T + 1e-6 * np.eye(size)
+
+
+def close(found, expected, sigmas):
+    assert np.abs((found - expected) / sigmas).max() < CLOSE
+
+
+@pytest.mark.parametrize("tempering", [1.0, 0.5])
+@pytest.mark.parametrize("size", [3, 5])
+@pytest.mark.parametrize("iterations", [1, 8])
+def test_by_pixels(rng, iterations, size, tempering):
+    model = CameraModel(500.0, 500.0, 320.0, 240.0, 640, 480, position=np.array((0.1, 0.0, 0.5)), tempering=tempering)
+    for _ in range(10):
+        pose = rng.standard_normal(3)
+        position, rotation = camera_pose(model, pose)
+        depth = rng.uniform(0.5, 8.0, 15)
+        local = depth[:, None] * np.column_stack((rng.uniform(-0.6, 0.6, (15, 2)), np.ones(15)))
+        points = position + local @ rotation.T
+        pixels = predict(model, pose, points)[0] + rng.standard_normal((15, 2))
+        pixels[0] += 50.0
+        factor = ReprojectionFactor(model, points, pixels)
+        start, covariance = se2.compose(pose, se2.exp(0.05 * rng.standard_normal(3))), spread(rng, size, 0.05)
+        found = robust_update(factor, start, covariance, iterations, 1e-3)
+        expected = linearized_update(Plain(factor), start, covariance, iterations, 1e-3)
+        sigmas = np.sqrt(np.diag(expected.covariance))
+        close(found.delta, expected.delta, sigmas)
+        close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))
+        np.testing.assert_allclose(found.residual, expected.residual, atol=1e-9)
+        assert (found.nis, found.dof) == (pytest.approx(expected.nis), expected.dof)
+
+
+@pytest.mark.parametrize("iterations", [1, 4])
+def test_by_what_antennas_read_and_did_not_read(rng, iterations):
+    antennas = tuple(Antenna(x=0.2, z=1.0, yaw=yaw) for yaw in (-1.5, 0.0, 1.5))
+    model = RfidModel(antennas, (BeamModel(),), tempering=0.7)
+    for scale in (0.02, 0.5) * 5:
+        where = np.column_stack((rng.uniform(-8.0, 8.0, (15, 2)), rng.uniform(0.0, 2.0, 15)))
+        likelihood = RfidLikelihood(model, TagArray(where, np.full(15, np.nan)))
+        pose, offset = rng.standard_normal(3), 0.1 * rng.standard_normal(3)
+        at = se2.compose(pose, offset)[None]
+        shares = np.array([likelihood.probabilities(at, k)[0] for k in range(3)])
+        hits = rng.binomial(2, shares).astype(np.int64)
+        looks = Looks(np.tile(offset, (3, 1)), np.arange(3), np.full(3, 2), hits)
+        start, covariance = se2.compose(pose, se2.exp(scale * rng.standard_normal(3))), spread(rng, 3, scale)
+        factors = [RfidFactor(likelihood, looks)]
+        found = tags.updated(factors, start, covariance, iterations)
+        expected = tags.scored_update(factors, start, covariance, iterations)
+        sigmas = np.sqrt(np.diag(expected.covariance))
+        close(found.pose, expected.pose, sigmas)
+        close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))
+        assert found.dof == expected.dof
+        for name in ("nis", "surprise", "variance", "evidence"):
+            assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9, abs=1e-9)
+
+
+def test_offsets_of_looks_are_moved_as_poses_are(rng):
+    offset, offsets = rng.standard_normal(3), rng.standard_normal((4, 3))
+    np.testing.assert_allclose(rfid_kernels.moved(offset, offsets), se2.compose(offset, offsets), atol=1e-12)

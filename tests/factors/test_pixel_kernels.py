@@ -1,0 +1,94 @@
+"""Compiled factors of known points against what NumPy makes of the same."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factors import pixel_kernels, reprojection, se2
+from factors.reprojection import CameraModel, camera_pose, mounting, predict
+from factors.reprojection_factor import ReprojectionFactor
+
+MODEL = CameraModel(
+    500.0,
+    510.0,
+    320.0,
+    240.0,
+    640,
+    480,
+    (0.05, -0.01, 0.001, 0.002),
+    np.array((0.1, 0.02, 0.5)),
+    mounting(0.05, 0.1, -0.2),
+    sigma=1.3,
+    tempering=0.6,
+)
+OFFSET, NOISE = np.array((0.2, -0.05, 0.3)), np.diag((1e-4, 2e-4, 1e-5))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def seen(rng, *, inexact=False, offset=None, noise=None):
+    """A factor of some points with wrong ones among them, and a pose near that they are seen from."""
+    pose = rng.standard_normal(3)
+    position, rotation = camera_pose(MODEL, pose)
+    depth = rng.uniform(0.5, 8.0, 12)
+    local = depth[:, None] * np.column_stack((rng.uniform(-0.6, 0.6, 12), rng.uniform(-0.5, 0.5, 12), np.ones(12)))
+    points = position + local @ rotation.T
+    pixels = predict(MODEL, pose, points)[0] + rng.standard_normal((12, 2))
+    pixels[:3] += 40.0
+    roots = 0.03 * rng.standard_normal((12, 3, 3))
+    spreads = roots @ roots.transpose(0, 2, 1) if inexact else None
+    start = pose if offset is None else se2.compose(pose, se2.inverse(offset))
+    factor = ReprojectionFactor(MODEL, points, pixels, offset, noise, spreads)
+    return factor, se2.compose(start, se2.exp(0.03 * rng.standard_normal(3)))
+
+
+@pytest.mark.parametrize("noise", [None, NOISE])
+@pytest.mark.parametrize("offset", [None, OFFSET])
+@pytest.mark.parametrize("inexact", [False, True])
+def test_a_factor_is_that_of_a_camera_whose_constants_stay(rng, inexact, offset, noise):
+    factor, pose = seen(rng, inexact=inexact, offset=offset, noise=noise)
+    twin = replace(factor, estimated=(2,))  # is not compiled
+    for compiled, plain in (
+        (factor.whitened([pose]), twin.whitened([pose, np.zeros(1)])),
+        (factor.linearize([pose]), twin.linearize([pose, np.zeros(1)])),
+    ):
+        np.testing.assert_allclose(compiled[0], plain[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(compiled[1][0], plain[1][0], rtol=1e-9, atol=1e-7)
+
+
+def test_the_camera_of_a_robot_moves_as_the_robot_does(rng):
+    pose, step = rng.standard_normal(3), 1e-6
+    root = rng.standard_normal((3, 3))
+    position, rotation, covariance = pixel_kernels.placed(MODEL.position, MODEL.rotation, pose, root @ root.T)
+    np.testing.assert_allclose(position, camera_pose(MODEL, pose)[0])
+    np.testing.assert_allclose(rotation, camera_pose(MODEL, pose)[1])
+    lift = np.empty((6, 3))
+    for i, moved in enumerate(step * np.eye(3)):
+        there, turned = camera_pose(MODEL, se2.compose(pose, se2.exp(moved)))
+        turn = (rotation.T @ turned - np.eye(3)) / step
+        lift[:3, i] = turn[2, 1], turn[0, 2], turn[1, 0]
+        lift[3:, i] = rotation.T @ (there - position) / step
+    np.testing.assert_allclose(covariance, lift @ root @ root.T @ lift.T, atol=1e-4)
+
+
+def test_pixels_of_uncertain_points_scatter_with_both(rng):
+    factor, pose = seen(rng, inexact=True)
+    _, _, by_point = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
+    expected = MODEL.sigma**2 * np.eye(2) + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+    np.testing.assert_allclose(pixel_kernels.spread(by_point, factor.point_covariances, MODEL.sigma), expected)
+
+
+def test_a_point_depends_on_a_camera_in_space_as_on_the_robot_that_carries_it(rng):
+    factor, pose = seen(rng)
+    pixels, by_pose, by_point, _ = reprojection.linearize(MODEL, pose, factor.points)
+    in_space = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
+    lift = np.zeros((6, 3))
+    lift[:3, 2], lift[3:, 0], lift[3:, 1] = MODEL.rotation[2], MODEL.rotation[0], MODEL.rotation[1]
+    lift[3:, 2] = MODEL.position[0] * MODEL.rotation[1] - MODEL.position[1] * MODEL.rotation[0]
+    np.testing.assert_allclose(in_space[0], pixels)
+    np.testing.assert_allclose(in_space[1] @ lift, by_pose, atol=1e-9)
+    np.testing.assert_allclose(in_space[2], by_point, atol=1e-9)
