@@ -137,7 +137,7 @@ def compare(
         show.rich_table(comparison_table(comparison.rows))
         for line in verdict(comparison.rows):
             typer.echo(line)
-        typer.echo(f"\nresults are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/, runs/")
+        typer.echo(f"\nresults are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/")
     if comparison.failures:
         raise typer.Exit(1)
 

@@ -16,8 +16,9 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
+from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
-from factorgraph_loc.evaluation.tables import comparison_cells, markdown
+from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
 from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
@@ -27,7 +28,7 @@ from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
 
 _ERROR = "error.txt"
-_TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
+_TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "report.html")
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,9 @@ def compare(
 
     An estimator that uses no randomness runs with the first of its seeds only. A run that fails, or whose process dies, becomes a
     row with its reason; the others go on. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows),
-    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``plots/*.png`` and
-    ``runs/LOG/ESTIMATOR/seedK/`` with the files of each run, or ``error.txt`` with the traceback.
+    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
+    :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png`` and ``runs/LOG/ESTIMATOR/seedK/`` with the files of
+    each run, or ``error.txt`` with the traceback.
     ``progress`` is given the number of runs done and of all.
 
     Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
@@ -89,6 +91,7 @@ def compare(
     keys = list(dict.fromkeys(key for row in rows for key in row))
     rows = [{key: row.get(key) for key in keys} for row in rows]
     _write_tables(rows, out)
+    _write_page(rows, work, out)
     for log in logs:
         tracks: dict[str, Track] = {}
         for i, job in enumerate(work):
@@ -195,3 +198,18 @@ def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
     write_text(out / "results.csv", table.write_csv())
     write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
     write_text(out / "table.md", markdown(*comparison_cells(rows)))
+
+
+def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Path) -> None:
+    keys = [str(i) for i in range(len(work))]
+    scenes = {job.log.name: Scene.of(job.log) for job in work}
+
+    def files(key: str) -> RunFiles:
+        job = work[int(key)]
+        return RunFiles(lambda name: (job.folder / name).read_bytes(), scenes[job.log.name])
+
+    table = pl.DataFrame(rows, infer_schema_length=None).with_columns(key=pl.Series(keys))
+    names = list(dict.fromkeys(job.config.estimator for job in work))
+    baseline = BASELINE if BASELINE in names else None
+    asked = {"logs": list(scenes), "estimators": names}
+    write_report(table, files, out / _TABLES[-1], baseline=baseline, title="Comparison", experiment=asked)

@@ -50,6 +50,9 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     assert set(pl.read_csv(out / "differences.csv")["log"]) == {"straight", "no/where"}
     assert "| particle_filter |" in (out / "table.md").read_text()
     assert (out / "plots/straight-trajectories.png").is_file()
+    page = (out / "report.html").read_text()
+    assert "6 runs. <strong>3 of them failed.</strong>" in page
+    assert "has no reference to start from" in page
 
     with pytest.raises(InputError, match="holds results already"):
         compare([log], configs[:1], out)
