@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         info,
         load,
         map,
+        report,
         run,
         simulate,
     )
@@ -39,6 +40,7 @@ __all__ = [
     "load",
     "load_results",
     "map",
+    "report",
     "run",
     "simulate",
 ]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from factorgraph_loc.calibration import calibrate as calibration
-from factorgraph_loc.calibration import report
+from factorgraph_loc.calibration import report as rig_report
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import features as feature_scores
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
@@ -26,7 +26,8 @@ from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.cluster import on_cluster
-from factorgraph_loc.experiments.experiment import Done, prepare, run_experiment
+from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
+from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
@@ -51,6 +52,7 @@ __all__ = [
     "info",
     "load",
     "map",
+    "report",
     "run",
     "simulate",
 ]
@@ -192,7 +194,7 @@ def calibrate(
         grids = Path(folder) / rig.name.removesuffix(RIG)
         found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
         try:
-            write_text(page, report.page(found))
+            write_text(page, rig_report.page(found))
             write_rig(found.rig, rig)
         except OSError as error:
             raise InputError(f"{rig}: cannot be written: {error.strerror}") from error
@@ -254,12 +256,24 @@ def experiment(
     ``jobs``: processes, else one per core; ``scheduler``: address of a ``dask.distributed`` cluster in place of them.
     ``progress`` is given the number of runs done, of all, and of failures. A run that fails is a row and a line of ``failures``.
     """
-    root = None if data_root is None else str(data_root)
-    prepared = prepare(
-        Path(file), list((changes or {}).items()), data_root=root, out=None if out is None else Path(out)
-    )
+    prepared = _prepared(file, changes, out, data_root)
     executor = None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed)
     return run_experiment(prepared, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
+
+
+def report(
+    file: str | Path,
+    *,
+    changes: Settings | None = None,
+    out: str | Path | None = None,
+    data_root: str | Path | None = None,
+    page: str | Path | None = None,
+) -> Path:
+    """Write the results of an experiment as one HTML page, ``report.html`` in its folder or ``page``, and return its path.
+
+    ``changes``, ``out`` and ``data_root`` as they were given to :func:`experiment`.
+    """
+    return report_experiment(_prepared(file, changes, out, data_root), None if page is None else Path(page))
 
 
 def images(
@@ -296,6 +310,13 @@ def features(
     scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)
     feature_scores.write_scores(scores, Path(out))
     return scores
+
+
+def _prepared(
+    file: str | Path, changes: Settings | None, out: str | Path | None, data_root: str | Path | None
+) -> Prepared:
+    folder, root = None if out is None else Path(out), None if data_root is None else str(data_root)
+    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder)
 
 
 def _one(log: LogLike) -> Log:

@@ -113,6 +113,13 @@ def test_an_experiment_gives_its_table(tmp_path):
     assert table["duration"].to_list() == [6.0, 6.0]
     assert table.equals(done.rows)
     assert told == [(0, 2, 0), (1, 2, 0), (2, 2, 0)]
+    page = fgloc.report(
+        tmp_path / "drives.toml",
+        changes={"simulation.drive.duration": 6.0},
+        out=tmp_path / "out",
+        page=tmp_path / "p.html",
+    )
+    assert "dead_reckoning" in page.read_text()
 
 
 def test_map_writes_a_world(office, tmp_path):

@@ -1,0 +1,72 @@
+"""The experiment files, and the example of how to script one."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from factorgraph_loc.estimators.registry import settings_of
+from factorgraph_loc.experiments.experiment_file import SIMULATION, nested, read_experiment
+from factorgraph_loc.shipped import manifests
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation.settings import merged
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "scripts/experiments").glob("*.toml"))
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_an_experiment_file_is_valid_down_to_its_settings(file):
+    experiment = read_experiment(file)
+    assert experiment.name == file.stem
+    for point in experiment.sweep.points():
+        for entry in experiment.estimators:
+            settings = dict(entry.settings)
+            for key, value in point.items():
+                first, _, rest = key.partition(".")
+                if first == entry.shown:
+                    settings = merged(settings, nested(rest, value))
+            settings_of(entry.name, settings)
+        for log in experiment.logs:
+            if log.log is not None:
+                assert any(Path(name).match(log.log) for name in manifests()), log.log
+                continue
+            settings = dict(log.settings)
+            for key, value in point.items():
+                first, _, rest = key.partition(".")
+                if first == SIMULATION:
+                    settings = merged(settings, nested(rest, value))
+            preset(log.simulate, settings)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_an_experiment_file_is_in_the_documentation(file):
+    assert f"scripts/experiments/{file.name}" in (ROOT / "docs/scripting.md").read_text()
+
+
+def test_the_example_runs(tmp_path):
+    """The example, of fewer and shorter drives."""
+    text = (ROOT / "scripts/example_experiment").read_text()
+    shorter = text.replace('seeds = "0:6"', 'seeds = "0:2"').replace("duration = 30.0", "duration = 5.0")
+    assert shorter.count("0:2") == shorter.count("duration = 5.0") == 1
+    script = tmp_path / "example.py"
+    script.write_text(shorter)
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"plaza2, ekf: off by 0\.\d\d m", done.stdout)
+    assert "8 runs, 0 of them failed" in done.stdout
+    assert (tmp_path / "out/example-experiment/errors.png").is_file()
+    assert (tmp_path / "out/example-experiment/report.html").is_file()
+    assert len(pl.read_parquet(tmp_path / "out/example-experiment/results.parquet")) == 8
