@@ -8,7 +8,7 @@ graph is also kept here, and the solver is rebuilt from it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -29,6 +29,10 @@ from factors.se2 import Array
 SOLVE_INTERVAL = (
     0.45  # s: how long images may wait for the solver; until then they update the newest pose, as a filter would
 )
+
+
+FARTHEST = 5.0  # m from the last estimate: a solver that failed there was lost before
+NOWHERE: Mapping[int, Array] = {}
 
 
 class SmootherSettings(GraphSettings):
@@ -132,7 +136,7 @@ class Smoother(RelocatingGraph):
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {str(error).strip().splitlines()[0]}"))
-            self._rebuild(newest)
+            self._rebuild(newest, error)
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
@@ -191,18 +195,27 @@ class Smoother(RelocatingGraph):
                 self._departed[0][key], self._departed[1][key] = self._constants[key], self._spreads[key]
             del self._constants[key], self._spreads[key]
 
-    def _rebuild(self, newest: Keyframe) -> None:
-        try:
-            self._start_again(newest)
-        except RuntimeError as error:
-            if not newest.nodes:
-                raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
-            self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", len(newest.nodes))
-            newest.nodes.clear()
-            self._rebuild(newest)
+    def _rebuild(self, newest: Keyframe, error: RuntimeError) -> None:
+        """A new solver after the old one failed: where that was last, if it was anywhere; then without what may throw."""
+        near = self._solver.linearized([*(k.key for k in self._keyframes), *self._constants])
+        moved = near.get(newest.key, newest_pose := self._filtered[newest.index][0])[:2] - newest_pose[:2]
+        if not all(np.all(np.isfinite(value)) for value in near.values()) or np.hypot(*moved) > FARTHEST:
+            near = {}
+        for throws in (True, False, False):
+            try:
+                self._start_again(newest, near, throws=throws)
+            except RuntimeError as again:
+                error = again
+            else:
+                return
+            if not throws and newest.nodes:
+                self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", len(newest.nodes))
+                newest.nodes.clear()
+        raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
 
-    def _start_again(self, newest: Keyframe) -> None:
-        """A new solver with what is in the graph.
+    def _start_again(self, newest: Keyframe, near: Mapping[int, Array] = NOWHERE, throws: bool = False) -> None:
+        """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
+        throw where a point gets behind a camera, at a tenth of the time.
 
         The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of, and so do
         constants and landmarks.
@@ -223,12 +236,13 @@ class Smoother(RelocatingGraph):
             noise = gtsam.noiseModel.Gaussian.Covariance(spreads[key])
             nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
         guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
+        guesses |= {key: value for key, value in near.items() if key in guesses}
         self._drop_astray(others, guesses)
         for keyframe in others:
             there = (node for node in keyframe.nodes if all(not is_pose(k) or k >= oldest.key for k in node.keys))
             nodes += [self._odometry_node(keyframe), *there]
-        # of those that are both, ours never throw
-        nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
+        if not throws:
+            nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
         self._solver.update(nodes, guesses, newest.t)
         self._read(newest, self._constants)
 

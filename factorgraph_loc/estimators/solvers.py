@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.variables import Node, Values, gather, is_point, is_pose, read, to_gtsam
 from factors import se2
-from factors.graph import custom_factor, jacobian_factor, read_pose, read_vector
+from factors.graph import custom_factor, jacobian_factor, pose_array, read_pose, read_vector
 from factors.se2 import Array
 
 RELINEARIZE_SKIP = 10  # updates between checks of which factors of the full history to linearise anew
@@ -35,6 +35,9 @@ class Solver(Protocol):
 
     def covariance(self, key: int) -> Array:
         """Marginal covariance of a variable, poses in the body frame."""
+
+    def linearized(self, keys: Iterable[int]) -> Values:
+        """Where variables were linearised last, near their estimates, of those that the solver has: also after a failure."""
 
 
 class FullHistory:
@@ -67,6 +70,9 @@ class FullHistory:
 
     def covariance(self, key: int) -> Array:
         return np.asarray(self._isam.marginalCovariance(key))
+
+    def linearized(self, keys: Iterable[int]) -> Values:
+        return _read_all(self._isam.getLinearizationPoint(), keys)
 
     def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
         """Values of the variables: as given in ``values``, else as the solver estimates them."""
@@ -117,6 +123,9 @@ class Window:
     def covariance(self, key: int) -> Array:
         return np.asarray(self._smoother.marginalCovariance(key))
 
+    def linearized(self, keys: Iterable[int]) -> Values:
+        return _read_all(self._smoother.getLinearizationPoint(), keys)
+
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""
         joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
@@ -153,3 +162,11 @@ class _Linear:
             elif np.abs(change).max() > MOVED:
                 return True
         return False
+
+
+def _read_all(values: gtsam.Values, keys: Iterable[int]) -> Values:
+    return {
+        key: pose_array(values.atPose2(key)) if is_pose(key) else np.asarray(values.atVector(key), dtype=float)
+        for key in keys
+        if values.exists(key)
+    }

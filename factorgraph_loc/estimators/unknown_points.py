@@ -11,16 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.graph_parts import Addition, Guess, Keyframe
 from factorgraph_loc.estimators.local_bundle import bundled
+from factorgraph_loc.estimators.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.new_points import NewPoints, Place, sightings_of
+from factorgraph_loc.estimators.point_looks import PointLooks
 from factorgraph_loc.estimators.refound_points import refound
 from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, lifted
@@ -60,16 +60,6 @@ class _Point:
     strikes: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """What a point of the graph looked like last: the feature's descriptor (D,) and size [px], and where the camera was (3,)."""
-
-    key: int
-    descriptor: NDArray[Any]
-    size: float
-    seen_from: Array
-
-
 @dataclass(frozen=True)
 class GraphView:
     """What :class:`UnknownPoints` sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
@@ -95,8 +85,9 @@ class UnknownPoints:
     _points: dict[Hashable, _Point] = field(default_factory=dict)
     _astray: list[_Point] = field(default_factory=list)  # in the graph, but seen no more under their name
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
-    _looks: dict[Hashable, _Look] = field(default_factory=dict)  # by name
-    _feature: str = ""
+    _looks: PointLooks = field(default_factory=PointLooks)
+    _loops: LoopClosure = field(default_factory=LoopClosure)
+    _way: float = 0.0  # m that the robot has gone
     _again_as: dict[Hashable, Hashable] = field(default_factory=dict)  # names of points that are followed by new tracks
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
@@ -117,7 +108,12 @@ class UnknownPoints:
         by the points. Its covariance stays: the points are known no better than the poses that saw them."""
         model = self.model if graph.changes is None else recalibrated(self.model, graph.changes)
         rows = list(rows)
+        if keyframe.from_previous is not None:
+            self._way += float(np.hypot(*keyframe.from_previous.delta[:2]))
         names = self._named(m, rows, lifted(model, *guess), graph)
+        certain: set[int] = set()  # rows
+        if isinstance(m, CameraFrame) and self._loops.due(m.t):
+            certain = self._revisited(model, Image(m, keyframe, guess, self._way), rows, names, graph)
         pixels = np.asarray(m.pixels[rows], dtype=float)
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
@@ -126,7 +122,8 @@ class UnknownPoints:
         few = spread_out(pixels[old], PER_KEYFRAME).tolist()
         old = [old[i] for i in few]
         points = [self._points[names[i]] for i in old]
-        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph)
+        known = np.array([rows[i] in certain for i in old], dtype=bool)
+        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known)
         if isinstance(m, CameraFrame):
             seen_from = lifted(model, *guess).position
             self._remember(
@@ -146,7 +143,7 @@ class UnknownPoints:
             self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
             self._points[name] = _Point(key, keyframe.t, np.asarray(np.linalg.inv(found.covariance), dtype=float))
             if isinstance(m, CameraFrame):
-                self._look(m, rows[names.index(name)], name, lifted(model, *guess).position)
+                self._looks.keep(key, m, rows[names.index(name)], lifted(model, *guess).position, self._way)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             prior = Node((key,), VectorPriorFactor(found.position, OPEN), 3)
@@ -162,32 +159,63 @@ class UnknownPoints:
         """What is seen, by name: of features the number of the track, or of that under which the point came into the graph."""
         if isinstance(m, PixelSightings):
             return [m.points[i] for i in rows]
-        self._again_as = {track: name for track, name in self._again_as.items() if name in self._points}
-        names: list[Hashable] = [self._again_as.get(track, track) for track in m.tracks[list(rows)].tolist()]
+        tracks = m.tracks[list(rows)].tolist()
+        # the track that a point came with may come back itself
+        gone = self._points.keys() - set(tracks)
+        self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
+        names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
         seen = set(names)
         lately = [name for name, point in self._points.items() if m.t - point.last < LOST]
-        lost = [name for name in lately if name not in seen and name in self._looks]
+        lost = [name for name in lately if name not in seen and self._points[name].key in self._looks]
         free = [i for i, name in zip(rows, names, strict=True) if name not in self._points]
         positions = np.array([graph.values[self._points[name].key] for name in lost]).reshape(-1, 3)
         place = {row: i for i, row in enumerate(rows)}
         for which, row in refound(
-            self.model, camera, positions, [self._looks[name].descriptor for name in lost], m, free
+            self.model, camera, positions, [self._looks[self._points[name].key].descriptor for name in lost], m, free
         ):
             track = names[place[row]]
             if self._new.count(track) < FEWEST_SIGHTINGS:
-                names[place[row]] = self._again_as[track] = lost[which]
+                names[place[row]] = lost[which]
+                self._follow(track, lost[which])
         return names
 
-    def _look(self, m: CameraFrame, row: int, name: Hashable, seen_from: Array) -> None:
-        self._feature = m.feature
-        self._looks[name] = _Look(self._points[name].key, m.descriptors[row], float(m.sizes[row]), seen_from)
+    def _follow(self, track: Hashable, name: Hashable) -> None:
+        """From now on a track, and no other, shows the point of that name."""
+        self._again_as = {other: of for other, of in self._again_as.items() if of != name}
+        self._again_as[track] = name
+
+    def _revisited(
+        self, model: CameraModel, image: Image, rows: Sequence[int], names: list[Hashable], graph: GraphView
+    ) -> set[int]:
+        """Those ``rows`` of an image that certainly show points last seen long ago; their ``names`` become those of the points."""
+        t = image.keyframe.t
+        old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._looks]
+        if not old:
+            return set()
+        points = [self._points[name] for name in old]
+        keys = [point.key for point in points]
+        covariances = np.linalg.inv(np.array([point.information for point in points]))
+        positions = np.array([graph.values[key] for key in keys])
+        seen = self._looks.map_of([str(name) for name in old], keys, positions, covariances)
+        ways = np.array([self._looks[key].way for key in keys])
+        revisit = self._loops.look(model, image, OldPoints(seen, keys, ways), graph.current)
+        if revisit is None:
+            return set()
+        certain: set[int] = set()
+        place, named = {row: i for i, row in enumerate(rows)}, set(names)
+        for which, row in zip(revisit.points.tolist(), revisit.features.tolist(), strict=True):
+            if row in place and old[which] not in named:
+                certain.add(row)
+                names[place[row]] = old[which]
+                self._follow(int(image.frame.tracks[row]), old[which])
+        return certain
 
     def _remember(self, m: CameraFrame, seen: Sequence[tuple[int, Hashable, bool]], seen_from: Array) -> None:
         """What points of the graph look like now; a track that is none of them after all goes its own way."""
         for row, name, agrees in seen:
             track = int(m.tracks[row])
             if agrees:
-                self._look(m, row, name, seen_from)
+                self._looks.keep(self._points[name].key, m, row, seen_from, self._way)
             elif self._again_as.pop(track, None) is not None:
                 self._points[name].strikes -= 1  # the point itself did nothing wrong
 
@@ -205,7 +233,7 @@ class UnknownPoints:
     def keep_only(self, keys: set[int]) -> None:
         """Give up the points of the graph but those with these ``keys``, and all that wait."""
         self._points = {name: point for name, point in self._points.items() if point.key in keys}
-        self._new = NewPoints(self.model)
+        self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
         """All points that were ever in the graph, those that were met under several keys under the first of them; of
@@ -217,23 +245,17 @@ class UnknownPoints:
         if not keys:
             return None
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
-        place = {key: i for i, key in enumerate(keys.values())}
-        looks = [look for look in self._looks.values() if look.key in place]
-        if not looks:
-            return PointMap.of(tuple(keys), positions, covariances)
-        return PointMap(
-            tuple(keys),
-            positions,
-            covariances,
-            self._feature,
-            np.array([place[look.key] for look in looks]),
-            np.array([look.descriptor for look in looks]),
-            np.array([look.seen_from for look in looks]),
-            np.array([look.size for look in looks]),
-        )
+        return self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
 
     def _placed(
-        self, model: CameraModel, points: list[_Point], pixels: Array, t: float, guess: Guess, graph: GraphView
+        self,
+        model: CameraModel,
+        points: list[_Point],
+        pixels: Array,
+        t: float,
+        guess: Guess,
+        graph: GraphView,
+        known: Truths,
     ) -> tuple[Guess, Truths]:
         """The guess placed by points of the graph, and which of these agree.
 
@@ -247,10 +269,10 @@ class UnknownPoints:
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
         recent = np.array([t - point.last < RECENT for point in points])
-        right = np.zeros(len(points), dtype=bool)
+        right = known.copy()
         placed = guess
-        revisited = max(REVISITED, math.ceil(AGREED * np.count_nonzero(~recent)))
-        for which, enough in ((recent, FEWEST), (~recent, revisited)):
+        revisited = max(REVISITED, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
+        for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])

@@ -164,11 +164,11 @@ def test_a_robot_at_rest_or_turning_on_the_spot(name, turn):
     assert result.learnt.points is None or np.all(np.isfinite(result.learnt.points.covariances))
 
 
-def with_features(log, lifetime, seed=5):
+def with_features(log, lifetime, seed=5, points=None):
     """The log with features in place of named points, whose tracks last for ``lifetime`` seconds."""
     rng = np.random.default_rng(seed)
-    points = camera_world.with_views(camera_world.room())
-    times = np.arange(0.13, SECONDS, 0.3)
+    points = camera_world.with_views(camera_world.room()) if points is None else points
+    times = np.arange(0.13, log.reference.t[-1], 0.3)
     frames = []
     for k, (t, pose) in enumerate(zip(times.tolist(), log.reference.at(times), strict=True)):
         found, shown = camera_world.frame(points, pose, t, rng, clutter=60)
@@ -190,3 +190,24 @@ def test_points_whose_tracks_end_are_found_again(log, name):
     apart = np.linalg.norm(points.positions[:, None] - true.positions[None], axis=2)
     assert np.median(apart.min(axis=1)) < 0.25
     assert len(points) < 1.3 * len(np.unique(apart.argmin(axis=1)))
+
+
+def test_a_track_that_comes_back_meets_the_one_that_took_its_place(log):
+    # two tracks of each point take turns; now and then both are in one image
+    film = with_features(log, 4.0)
+    frames = list(film.streams["camera"].frame)
+    for k, frame in enumerate(frames):
+        old = frame.tracks < 10**6
+        tracks = np.where(old, frame.tracks % 1000 + 1000 * (k // 7 % 2), frame.tracks)
+        both = np.flatnonzero(old)[:20] if k % 7 == 0 else np.empty(0, dtype=np.int64)
+        again = frame.tracks[both] % 1000 + 1000 * (1 - k // 7 % 2)
+        rows = np.concatenate((np.arange(len(tracks)), both))
+        frames[k] = replace(
+            frame,
+            pixels=frame.pixels[rows],
+            sizes=frame.sizes[rows],
+            descriptors=frame.descriptors[rows],
+            tracks=np.concatenate((tracks, again)),
+        )
+    streams = {**film.streams, "camera": FeatureStream(film.streams["camera"].t, frames)}
+    assert rmse(run(replace(film, streams=streams), CONFIGS["smoother"]), log) < 0.25
