@@ -34,7 +34,7 @@ from factors.odometry import Increment
 from factors.se2 import Array
 
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
-OUTSIDE = -2.0  # log-weight per motion of a particle that is where no robot can be
+OUTSIDE = -1.0  # log-weight per motion of a particle that is where no robot can be
 KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
 LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
 ONE_PLACE = 1.0  # m: largest standard deviation of a place

@@ -1,0 +1,138 @@
+"""A robot that drives until it knows where it is."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import parse_model
+from factorgraph_loc.planning import closed_loop
+from factorgraph_loc.planning.active_run import ActiveRun
+from factorgraph_loc.planning.closed_loop import run_active
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation.free_space import distance_to_walls
+from factorgraph_loc.world import World
+from factors import se2
+
+
+@cache
+def office(policy: str = "information", seed: int = 1, estimator: str = "active_mcl") -> ActiveRun:
+    return run_active(preset("office"), policy, estimator, seed)
+
+
+def test_a_run_ends_where_the_place_is_known() -> None:
+    run = office()
+    assert run.localized
+    assert run.error_position < 0.3
+    assert run.error_heading < math.radians(10.0)
+    assert run.metres < 20.0
+    assert len(run.planning_ms) == len(run.steps)
+    way = np.hypot(*np.diff(run.truth.poses[:, :2], axis=0).T).sum()
+    assert np.isclose(way, run.metres, atol=0.01)
+    assert run.seconds == run.truth.t[-1]
+
+
+def test_the_same_seed_is_the_same_run() -> None:
+    again = run_active(preset("office"), "information", "active_mcl", 1)
+    assert np.array_equal(again.truth.poses, office().truth.poses)
+    assert again.error_position == office().error_position
+
+
+@pytest.mark.parametrize("estimator", ["particle_filter", "smoother"])
+def test_policies_stand_on_any_estimator(estimator: str) -> None:
+    run = office(estimator=estimator)
+    assert run.localized
+    assert run.error_position < 0.3
+
+
+def test_runs_of_one_seed_share_world_and_start() -> None:
+    one, other = office(), office("patrol")
+    assert one.world == other.world
+    assert np.array_equal(one.truth.poses[0], other.truth.poses[0])
+
+
+def test_the_robot_never_comes_near_walls() -> None:
+    run = run_active(preset("symmetric"), "random", "active_mcl", 2, ActiveSettings(max_metres=20.0, particles=200))
+    gaps = distance_to_walls(run.world, run.truth.poses[:, :2])
+    # free cells of 0.2 m are those whose middle is 0.3 m from walls
+    assert gaps.min() > 0.3 - 0.2 / math.sqrt(2.0) - 1e-9
+
+
+def test_no_tags_is_a_failure_and_no_fault() -> None:
+    settings = ActiveSettings(max_metres=5.0, particles=200)
+    for policy in ("information", "nearest_tags"):
+        run = run_active(preset("office", {"world": {"tags": 0}}), policy, "active_mcl", 1, settings)
+        assert not run.localized
+        assert 4.9 < run.metres < 5.2
+
+
+def enclosed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box of 0.8 m around (3, 3) in a hall."""
+    x1, x2 = 2.6, 3.4
+    box = ((x1, x1, x2, x1), (x2, x1, x2, x2), (x2, x2, x1, x2), (x1, x2, x1, x1))
+    hall = ((0.0, 0.0, 9.0, 0.0), (9.0, 0.0, 9.0, 9.0), (9.0, 9.0, 0.0, 9.0), (0.0, 9.0, 0.0, 0.0))
+    tags = {"A": {"x": 1.0, "y": 1.0, "z": 1.2}}
+    world = World(tags=tags, walls=(*hall, *box))
+    monkeypatch.setattr(closed_loop, "make_world", lambda *_: world)
+
+
+@pytest.mark.parametrize("policy", ["information", "random", "patrol", "nearest_tags"])
+def test_an_enclosed_robot_waits_and_gives_up(monkeypatch: pytest.MonkeyPatch, policy: str) -> None:
+    enclosed(monkeypatch)
+    settings = ActiveSettings(start=(3.0, 3.0, 0.5), max_seconds=20.0, particles=200)
+    run = run_active(preset("office"), policy, "active_mcl", 1, settings)
+    assert not run.localized
+    assert run.seconds >= 20.0
+    assert np.abs(run.truth.poses[:, :2] - 3.0).max() < 0.4
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [((0.05, 3.0, 0.0), "start .* m from one"), ((-5.0, 3.0, 0.0), "start"), ((3.0, 3.0, 0.0), None)],
+)
+def test_a_start_in_a_wall_is_an_error(start: tuple[float, float, float], message: str | None) -> None:
+    simulation = preset("warehouse", {"world": {"width": 10.0, "depth": 10.0}})
+    settings = ActiveSettings(start=start, max_metres=0.1, particles=200)
+    if message is None:
+        assert np.allclose(run_active(simulation, "random", "active_mcl", 1, settings).truth.poses[0], start)
+        return
+    with pytest.raises(InputError, match=message):
+        run_active(simulation, "random", "active_mcl", 1, settings)
+
+
+@pytest.mark.parametrize(
+    ("policy", "estimator", "message"),
+    [("informaton", "active_mcl", "did you mean information"), ("random", "ekf", "no estimator of active runs")],
+)
+def test_wrong_names(policy: str, estimator: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        run_active(preset("office"), policy, estimator, 1)
+
+
+def test_faults_are_refused() -> None:
+    with pytest.raises(InputError, match="has faults"):
+        run_active(preset("bursty"), "random", "active_mcl", 1)
+
+
+@pytest.mark.parametrize("horizon", [0.0, -1.0])
+def test_a_horizon_of_zero_is_an_error(horizon: float) -> None:
+    with pytest.raises(InputError, match=r"policy\.horizon"):
+        parse_model(ActiveSettings, {"policy": {"horizon": horizon}}, "settings")
+
+
+def test_two_places_that_look_alike_are_told_apart() -> None:
+    """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
+    differ to find out, and to say nothing before."""
+    settings = ActiveSettings(start=(12.0, 12.0, 0.1))
+    run = run_active(preset("symmetric"), "information", "active_mcl", 3, settings)
+    assert run.localized
+    assert not run.claimed_wrong
+    early = [step for step in run.steps if 3.0 < step.metres < 6.0]
+    assert early
+    turned = se2.compose(np.array((30.0, 24.0, math.pi)), early[0].truth)
+    for place in (early[0].truth, turned):
+        assert np.mean(np.hypot(*(early[0].particles - place)[:, :2].T) < 2.0) > 0.1
+    assert run.metres > 8.0

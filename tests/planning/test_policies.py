@@ -1,0 +1,101 @@
+"""What policies choose."""
+
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.planning.paths import primitives
+from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.simulation.free_space import free_space
+from factorgraph_loc.world import World
+from factors.rfid_likelihood import RfidLikelihood, TagArray
+
+SIDE = 40.0
+SPACE = free_space(
+    World(walls=((0, 0, SIDE, 0), (SIDE, 0, SIDE, SIDE), (SIDE, SIDE, 0, SIDE), (0, SIDE, 0, 0))), clearance=0.3
+)
+MODEL = RfidSettings(preset="rackham", preset_z=1.2).model()
+# the robot is in the middle and looks along x; tags around a place to its left alone
+TAGS = np.array(((20.0, 27.0, 1.2), (18.0, 28.0, 1.2), (22.0, 28.0, 1.2)))
+
+
+def situation(candidates=None, free=None, tags=TAGS, seed=0):
+    rng = np.random.default_rng(seed)
+    particles = np.array((20.0, 20.0, 0.0)) + rng.standard_normal((500, 3)) * (0.8, 0.8, 0.1)
+    paths = tuple(primitives(6.0) if candidates is None else candidates)
+    likelihood = RfidLikelihood(MODEL, TagArray(tags, np.full(len(tags), np.nan))) if len(tags) else None
+    reach = np.full(len(paths), 3.0) if free is None else free
+    return Situation(particles, np.full(500, 1.0 / 500), likelihood, SPACE, paths, reach, ActiveSettings(), rng)
+
+
+def direction(choice):
+    return math.atan2(*choice.path.poses[-1, 1::-1])
+
+
+@pytest.mark.parametrize("name", ["information", "nearest_tags"])
+def test_they_go_where_tags_are(name):
+    choice = make_policy(name).choose(situation())
+    assert abs(direction(choice) - math.pi / 2.0) < 0.8
+    assert len(choice.values) == len(primitives(6.0))
+
+
+def test_the_literal_sign_goes_elsewhere():
+    here, there = make_policy("information").choose(situation()), make_policy("paper_literal").choose(situation())
+    assert abs(direction(here) - direction(there)) > 0.8
+    assert math.sin(direction(there)) < 0.5
+
+
+def test_what_a_way_costs_counts():
+    """At a price above all that can be learnt the shortest way is best."""
+    s = situation()
+    dear = s.settings.model_copy(update={"policy": s.settings.policy.model_copy(update={"per_metre": 50.0})})
+    choice = make_policy("information").choose(Situation(**{**s.__dict__, "settings": dear}))
+    assert np.isclose(choice.path.length, min(p.length for p in s.candidates))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_without_candidates_there_is_no_way(name):
+    assert make_policy(name).choose(situation(candidates=[], free=np.empty(0))).path is None
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_without_tags_the_robot_still_drives(name):
+    assert make_policy(name).choose(situation(tags=np.empty((0, 3)))).path.length > 1.0
+
+
+def test_patrol_goes_straight_on_and_then_where_it_is_freest():
+    paths = primitives(6.0)
+    assert direction(make_policy("patrol").choose(situation(paths))) == pytest.approx(0.0)
+    left = np.array([3.0 if p.poses[-1, 1] > 0.5 * p.length else 0.5 for p in paths])
+    kept, free = usable(paths, left, 3.0)
+    choice = make_policy("patrol").choose(situation(kept, free))
+    assert 0.4 < direction(choice) < 2.8
+    # back only where nothing else is
+    back = [i for i, p in enumerate(paths) if abs(math.atan2(p.poses[-1, 1], p.poses[-1, 0])) > 3.1]
+    only = make_policy("patrol").choose(situation([paths[i] for i in back], np.full(len(back), 3.0)))
+    assert abs(direction(only)) > 3.1
+
+
+def test_ways_end_where_the_sensor_sees_a_wall():
+    paths = primitives(6.0)
+    free = np.full(len(paths), 3.0)
+    free[0], free[1] = 0.5, 1.5
+    kept, left = usable(paths, free, 3.0)
+    assert len(kept) == len(paths) - 1 == len(left)
+    assert kept[0].length == pytest.approx(1.5)
+    assert kept[1].length == paths[2].length
+
+
+def test_random_takes_all_ways():
+    s = situation()
+    chosen = {id(make_policy("random").choose(s).path) for _ in range(1000)}
+    assert len(chosen) > 0.9 * len(s.candidates)
+
+
+def test_a_wrong_name_is_an_error():
+    with pytest.raises(InputError, match="did you mean patrol"):
+        make_policy("patroll")
