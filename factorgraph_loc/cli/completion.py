@@ -15,7 +15,7 @@ ESTIMATORS = (
     "batch",
     "space_batch",
 )
-PRESETS = ("office", "sparse", "bursty", "corridor", "warehouse")
+PRESETS = ("office", "sparse", "bursty", "corridor", "warehouse", "symmetric")
 PRIORS = ("reference", "log", "unknown")
 
 
