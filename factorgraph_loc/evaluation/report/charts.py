@@ -24,7 +24,7 @@ def ratios(results: Results, c: Comparison) -> Chart | None:
             continue
         dots: list[_Dot] = [(_short(a / b), log) for log, (a, b) in found.by_log.items() if a > 0.0 and b > 0.0]
         if dots:
-            grey = not c.is_significant(variant)
+            grey = c.p[variant] is not None and not c.is_significant(variant)
             rows.append({"v": place, "dots": dots, "mark": _median(dots), "grey": grey})
     if not rows:
         return None

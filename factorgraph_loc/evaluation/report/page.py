@@ -133,7 +133,7 @@ class _Page:
             "significantly different from the best. Causal is what the robot knows at the time, final what the whole log tells; "
             "compare neither with the other."
         )
-        return self._section("results", "Results", tag("p", note, class_="note"), tables.overview(results, best))
+        return self._section("results", "Results", _note(note), tables.overview(results, best))
 
     def _differences(self, against: Sequence[Comparison]) -> Html | str:
         if len(self._results.variants) < 2:
@@ -148,14 +148,14 @@ class _Page:
         )
         below = (
             f"Log by log, as a multiple of {self._baseline}: a dot is a log, the bar the median over logs; left of 1 is less. "
-            "Grey: not significant, or not tested."
+            "Grey: not significant."
         )
         return self._section(
             "differences",
             f"Differences from {self._baseline}",
-            tag("p", note, class_="note"),
+            _note(note),
             tables.differences(self._results, against),
-            tag("p", below, class_="note"),
+            _note(below),
             tag("div", *figures, class_="charts"),
         )
 
@@ -166,7 +166,7 @@ class _Page:
         ]
         note = "The figure of each log, pooled over its seeds, and below it the range over them. ● best of the row."
         controls = tag("div", class_="controls")
-        return self._section("by-log", "Log by log", tag("p", note, class_="note"), controls, *parts)
+        return self._section("by-log", "Log by log", _note(note), controls, *parts)
 
     def _trajectories(self, drawn: Reading) -> Html | str:
         if not drawn.tracks:
@@ -186,11 +186,11 @@ class _Page:
         return self._section(
             "trajectories",
             "Trajectories and errors over time",
-            tag("p", note, class_="note"),
+            _note(note),
             tag("div", class_="controls"),
             tag("div", class_="legend"),
             tag("div", class_="map"),
-            tag("p", below, class_="note"),
+            _note(below),
             tag("div", class_="strips"),
         )
 
@@ -202,12 +202,13 @@ class _Page:
             for kind in KINDS
         ]
         note = (
-            "The share of times at which the position error is below a value: farther left is better. Logs count alike."
+            "The share of times at which the position error is below a value: farther left is better. Of all logs those that "
+            "all estimators shown have, each counted alike."
         )
         return self._section(
             "distributions",
             "Distribution of errors",
-            tag("p", note, class_="note"),
+            _note(note),
             tag("div", class_="controls"),
             tag("div", class_="legend"),
             tag("div", *figures, class_="charts"),
@@ -223,7 +224,7 @@ class _Page:
         if not figures:
             return ""
         note = "Pooled over logs and seeds. Whiskers: the 95 % interval, or the range where logs or seeds are too few for one."
-        return self._section("sweeps", "Sweeps", tag("p", note, class_="note"), tag("div", *figures, class_="charts"))
+        return self._section("sweeps", "Sweeps", _note(note), tag("div", *figures, class_="charts"))
 
     def _consistency(self, drawn: Reading) -> Html | str:
         chart = charts.consistency(self._results, drawn.trust, drawn.nees)
@@ -237,9 +238,7 @@ class _Page:
             "A dot is a log, the bar the mean over logs. Shaded: where that mean lies with 95 % if the covariances are right, "
             "for as many values as are independent, since errors of successive poses go together."
         )
-        return self._section(
-            "consistency", "Consistency", tag("p", note, class_="note"), self._figure(chart, "Causal ANEES", caption)
-        )
+        return self._section("consistency", "Consistency", _note(note), self._figure(chart, "Causal ANEES", caption))
 
     def _times(self) -> Html | str:
         found = _known(self._results, tables.TIMINGS, whole=False)
@@ -251,16 +250,14 @@ class _Page:
         )
         drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self._results, m)) is not None]
         figures = [self._figure(chart, m.title, "A dot is a log, the bar the median over logs.") for m, chart in drawn]
-        return self._section(
-            "times", "Times", tag("p", note, class_="note"), tables.timing(self._results, found), *figures
-        )
+        return self._section("times", "Times", _note(note), tables.timing(self._results, found), *figures)
 
     def _failures(self) -> Html | str:
         count = sum(row["status"] != "ok" for row in self._results.rows)
         if not count:
             return ""
         note = f"{count} of {len(self._results.rows)} runs failed, and are in none of the figures."
-        return self._section("failures", "Failures", tag("p", note, class_="note"), tables.failures(self._results))
+        return self._section("failures", "Failures", _note(note), tables.failures(self._results))
 
     def _repeat(self, experiment: Mapping[str, Any], drawn: Reading) -> Html:
         parts: list[object] = []
@@ -279,16 +276,14 @@ class _Page:
         return self._section(
             "method",
             "How it was counted",
-            tag(
-                "p",
+            _note(
                 "Runs are paired by log and seed, and logs are what a statement is made of. With six logs or more intervals are "
                 "a percentile bootstrap that draws logs and, within each, seeds; with one log they are over its seeds, if there "
                 "are six or more, and say something of this log only. Else figures stand side by side, and nothing is tested. "
                 "The test is Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected as of Holm "
                 "within each column; below 0.05 a difference is called significant. The effect is the matched-pairs "
                 "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored against the reference "
-                "without alignment.",
-                class_="note",
+                "without alignment."
             ),
         )
 
@@ -297,6 +292,11 @@ def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list
     """The metrics of which there is any score; with ``whole`` all of them if there is none."""
     found = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return found or ([metric_of(k) for k in keys] if whole else [])
+
+
+def _note(note: str) -> Html:
+    """A paragraph that explains; a number and its percent sign stay together."""
+    return tag("p", note.replace(" %", "\u00a0%"), class_="note")
 
 
 def _toml(content: Any) -> Any:

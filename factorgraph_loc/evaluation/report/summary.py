@@ -60,7 +60,7 @@ def _best(c: Comparison) -> Html:
         parts.append(f"That of {_list(told)} is another.")
     missing = [v for v in c.pooled if c.contrasts.get(v) is not None and c.contrasts[v].count < c.pooled[c.best].count]
     if missing:
-        parts.append(f" {_list(missing)} lacks logs, and is compared on those that it has.")
+        parts.append(f" {_list(missing)} {'lacks' if len(missing) == 1 else 'lack'} some of the logs.")
     return join(parts)
 
 

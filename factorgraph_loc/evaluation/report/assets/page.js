@@ -30,8 +30,8 @@ function distributions(section) {
   const draw = () => {
     for (const place of section.querySelectorAll("[data-kind]")) {
       const found = page.errors[place.dataset.kind];
-      const chosen = +select.value;
-      const series = names.map((_, v) => ({ v, points: ecdf(found, v, chosen) }));
+      const logs = +select.value < 0 ? common(found) : [found[+select.value]];
+      const series = names.map((_, v) => ({ v, points: ecdf(logs, v) }));
       const visible = series.filter((s) => !hidden.has(s.v)).flatMap((s) => s.points);
       const low = visible.filter((p) => p[1] >= 4).map((p) => p[0]).reduce((a, b) => Math.min(a, b), Infinity);
       const high = visible.map((p) => p[0]).reduce((a, b) => Math.max(a, b), 0);
@@ -45,9 +45,15 @@ function distributions(section) {
   draws.push(draw);
 }
 
+// the logs of which every estimator that is shown, and has any errors at all, has some: others would not be compared fairly
+function common(found) {
+  const shown = names.map((_, v) => v).filter((v) => !hidden.has(v) && found.some((of) => of[v].length));
+  return found.filter((of) => shown.every((v) => of[v].length));
+}
+
 // share of times [%] at which the error lies below; of several logs each counts the same
-function ecdf(found, v, log) {
-  const lists = (log < 0 ? found.map((of) => of[v]) : [found[log][v]]).filter((list) => list && list.length);
+function ecdf(logs, v) {
+  const lists = logs.map((of) => of[v]).filter((list) => list.length);
   if (!lists.length) return [];
   const all = lists.flat().sort((a, b) => a - b);
   const step = Math.max(1, Math.floor(all.length / 150));
