@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import show
-from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list, parse_seeds
+from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
 from factorgraph_loc.cli.simulating import nested_changes, settings_of
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.seeds import parse_seeds
 
 if TYPE_CHECKING:
     from factorgraph_loc.planning.settings import ActiveSettings

@@ -110,18 +110,6 @@ def parse_list(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def parse_seeds(text: str) -> range:
-    """``0:10`` as the seeds 0 to 9, ``3`` as the seed 3 alone."""
-    first, colon, end = text.partition(":")
-    try:
-        seeds = range(int(first), int(end) if colon else int(first) + 1)
-    except ValueError:
-        seeds = range(0)
-    if not seeds or seeds[0] < 0:
-        raise InputError(f"--seeds is {text!r}, expected a number such as 3, or a range such as 0:10")
-    return seeds
-
-
 def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str, dict[str, Any]]:
     """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run."""
     from factorgraph_loc.estimators.registry import check_names

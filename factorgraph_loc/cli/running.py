@@ -27,9 +27,9 @@ from factorgraph_loc.cli.options import (
     Settings,
     WorldFile,
     parse_list,
-    parse_seeds,
     parse_settings,
 )
+from factorgraph_loc.experiments.seeds import parse_seeds
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.result import RunResult
@@ -137,7 +137,9 @@ def compare(
         show.rich_table(comparison_table(comparison.rows))
         for line in verdict(comparison.rows):
             typer.echo(line)
-        typer.echo(f"\nresults are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/")
+        typer.echo(
+            f"\nresults are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/"
+        )
     if comparison.failures:
         raise typer.Exit(1)
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value, parse_seeds
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.seeds import parse_seeds
 
 if TYPE_CHECKING:
     from factorgraph_loc.simulation import SimulationSettings

@@ -4,8 +4,9 @@ import shutil
 
 import pytest
 
-from factorgraph_loc.cli.options import parse_seeds, parse_settings
+from factorgraph_loc.cli.options import parse_settings
 from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.experiments.seeds import parse_seeds
 
 
 def assert_refused(result, *fragments):

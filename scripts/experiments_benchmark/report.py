@@ -1,0 +1,27 @@
+"""How long it takes to make the page of many runs, and how large it is."""
+
+from __future__ import annotations
+
+import time
+
+from benchmarking.report import Report
+
+from experiments_benchmark.options import ExperimentOptions, many
+from factorgraph_loc.experiments.experiment import run_experiment
+from factorgraph_loc.experiments.reporting import report_experiment
+
+SECONDS, BYTES = 20.0, 10e6  # at most
+
+
+def section(options: ExperimentOptions) -> Report:
+    report = Report("report", options)
+    prepared = many(options)
+    run_experiment(prepared, jobs=options.jobs)
+    prepared = many(options)  # as it is now
+    started = time.perf_counter()
+    page = report_experiment(prepared)
+    taken, size = time.perf_counter() - started, page.stat().st_size
+    report.say(f"The page of {options.many_runs} runs is made in {taken:.1f} s and has {size / 1e6:.1f} MB.")
+    if taken > SECONDS or size > BYTES:
+        report.failed.append(f"the page takes more than {SECONDS:.0f} s or {BYTES / 1e6:.0f} MB")
+    return report
