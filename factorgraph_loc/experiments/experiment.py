@@ -90,15 +90,16 @@ def run_experiment(
     """Make the runs that are not stored, with ``again`` those that failed too, and write the table of all results.
 
     ``jobs``: processes, by default one per core; ``executor``: what makes the runs instead, and yields their outcomes.
-    ``progress`` is given the number of runs done, of all, and of failures. The table is written however this ends.
+    ``progress`` is given the number of runs made, of those to be made, and of all failures. The table is written however this
+    ends.
     StoreError if the store cannot be written.
     """
     todo = prepared.todo(again=again)
     states = dict(prepared.states)
     waiting = {run.key for run in todo}
     failed = sum(states[run.key] == "failed" and run.key not in waiting for run in prepared.runs)
-    done = len(prepared.runs) - len(todo)
-    progress(done, len(prepared.runs), failed)
+    made = 0
+    progress(made, len(todo), failed)
     limits = prepared.experiment.limits
     outcomes = (
         executor(todo)
@@ -108,8 +109,8 @@ def run_experiment(
     try:
         for outcome in outcomes if todo else ():
             states[outcome.key] = outcome.status if outcome.status != "busy" else "missing"
-            done, failed = done + 1, failed + (outcome.status == "failed")
-            progress(done, len(prepared.runs), failed)
+            made, failed = made + 1, failed + (outcome.status == "failed")
+            progress(made, len(todo), failed)
     finally:
         for run in todo:  # an interrupt may come between a run's end and the news of it
             if states[run.key] not in ("ok", "failed"):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import importlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.experiments.experiment_file import canonical
-from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions, read_cache
+from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions, read_cache, write_cache
 from factorgraph_loc.experiments.log_source import LogSource
-from factorgraph_loc.files import write_text
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Facts:
     def save(self) -> None:
         """Keep what is new."""
         if self._new:
-            write_text(self._cache, json.dumps({"version": self._version, "facts": self._known}))
+            write_cache(self._cache, {"version": self._version, "facts": self._known})
             self._new = False
 
     def _keep(self, key: str, value: Any) -> Any:

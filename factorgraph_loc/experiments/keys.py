@@ -8,6 +8,7 @@ import json
 import platform
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from factorgraph_loc.files import write_text
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
 # parts of the package that no run goes through: a change to the report must not undo a night's work
-OUTSIDE = ("cli", "calibration", "planning", "evaluation/report")
+OUTSIDE = ("api.py", "cli", "calibration", "planning", "evaluation/report")
 _UNSETTLED = 2.0  # s: a file that young may change again within the same stamp
 
 
@@ -63,6 +64,12 @@ def read_cache(file: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def write_cache(file: Path, content: Mapping[str, Any]) -> None:
+    """Keep a JSON object; where it cannot be written, it is made again the next time."""
+    with suppress(OSError):
+        write_text(file, json.dumps(content))
+
+
 class FileDigests:
     """The sha256 of files; with ``cache``, a JSON file, by path, size and time of change, so that a file is read once."""
 
@@ -95,7 +102,7 @@ class FileDigests:
     def save(self) -> None:
         """Keep what is new."""
         if self._new and self._cache is not None:
-            write_text(self._cache, json.dumps(self._known))
+            write_cache(self._cache, self._known)
             self._new = False
 
 

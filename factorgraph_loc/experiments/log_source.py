@@ -124,8 +124,9 @@ def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSou
     if name in known:
         return [RecordedSource(name, **others)]
     if not any(c in name for c in "*?["):
-        # what is no path either is for the reader to tell
-        return [RecordedSource(str(folder / name) if (folder / name).exists() else name, **others)]
+        # what is nothing at all is for the reader to tell, which knows the nearest name
+        is_path = (folder / name).exists() or Path(name).exists()
+        return [RecordedSource(str(folder / name) if is_path else name, **others)]
     found = [k for k in known if Path(k).match(name)]
     pattern = Path(name)
     base, below = (Path(pattern.anchor), str(pattern.relative_to(pattern.anchor))) if pattern.anchor else (folder, name)

@@ -77,10 +77,6 @@ class Store:
             return "damaged"
         return "failed" if FAILURE in manifest["files"] else "ok"
 
-    def has(self, key: str) -> bool:
-        """Whether a run's results are there, be they a failure."""
-        return self.state(key) in ("ok", "failed")
-
     def read(self, key: str, name: str) -> bytes:
         """A file of a run, compared with its checksum; InputError if it is missing or damaged."""
         path = self.path(key) / name

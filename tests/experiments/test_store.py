@@ -40,7 +40,6 @@ def test_what_is_put_is_there_with_its_scores(store):
     assert store.state(KEY) == "missing"
     store.put(KEY, FILES)
     assert store.state(KEY, thorough=True) == "ok"
-    assert store.has(KEY)
     assert store.read(KEY, METRICS) == FILES[METRICS]
     row = store.row(KEY)
     assert row == {"status": "ok", "kind": None, "reason": None, "causal.position_rmse": 0.5, "timing.run_seconds": 2.0}
