@@ -1,12 +1,15 @@
 """An experiment on a real cluster of two worker processes: nothing is lost with a worker, nothing is stored twice."""
 
+import json
 import os
 import signal
 import sys
 from collections import Counter
 
 import pytest
+from typer.testing import CliRunner
 
+from factorgraph_loc.cli.main import app
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments import cluster
 from factorgraph_loc.experiments.experiment_file import Limits, read_experiment
@@ -106,6 +109,29 @@ def test_a_run_that_takes_too_long_is_a_failure_and_its_worker_begins_anew(worke
     assert sorted(o.status for o in kept) == ["failed", "ok"]
     tried = list(cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits(), again=True))
     assert [o.status for o in tried] == ["ok"]
+
+
+def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, planned, monkeypatch):
+    runs, folder = planned(1)
+    monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster, "make", lambda *_: os._exit(1))
+        (outcome,) = cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits())
+    assert outcome.status == "failed"
+    assert Store(folder).row(runs[0].key)["kind"] == "killed"
+    others = list(cluster.execute(runs[1:], folder, scheduler=workers.scheduler_address, limits=Limits()))
+    assert [other.status for other in others] == ["ok"]
+
+
+def test_the_command_takes_a_scheduler(workers, planned, tmp_path):
+    runs, folder = planned(1)
+    command = ["experiment", "run", str(tmp_path / "drives.toml"), "-o", str(folder), "--scheduler"]
+    done = CliRunner().invoke(app, [*command, workers.scheduler_address, "--json"])
+    assert done.exit_code == 0, done.output
+    assert {row["key"] for row in json.loads(done.stdout)["runs"]} == {run.key for run in runs}
+    both = CliRunner().invoke(app, [*command, workers.scheduler_address, "--jobs", "2"])
+    assert both.exit_code == 2
+    assert "expected one of them" in both.stderr
 
 
 def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypatch):
