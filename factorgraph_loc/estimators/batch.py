@@ -3,6 +3,9 @@
 While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
 are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins
 wide and narrows to its own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss).
+
+Where points that the map lacks are estimated, such a guess drifts too far to tell which sightings belong together. There the
+smoother goes ahead: its graph is the problem, its estimates are the start.
 """
 
 from __future__ import annotations
@@ -13,11 +16,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import PoseEstimate
+from factorgraph_loc.estimators.base import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
+from factorgraph_loc.estimators.smoother import Smoother, SmootherSettings
 from factorgraph_loc.estimators.variables import Values, pose_key
+from factorgraph_loc.measurements import Measurement
+from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
@@ -29,23 +35,14 @@ class BatchSettings(GraphSettings):
     widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
 
 
-class Batch(RelocatingGraph):
-    """The batch estimator; see the module."""
+class GraduatedGraph(RelocatingGraph):
+    """A graph that is solved at the end, with a robust loss that begins ``_widest`` times as wide."""
 
-    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
-        super().__init__(setup, settings)
-        self._widest = settings.widest_loss
-        self._guesses: Values = {}
+    _widest: float
 
-    def estimate(self) -> PoseEstimate:
-        """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
-        guess = super().estimate()
-        return guess if self._prior is None else replace(guess, status="unlocalized")
-
-    def _final(self) -> tuple[Array, Array]:
-        """The optimum over the whole log."""
+    def _optimum(self, start: Values) -> tuple[Array, Array]:
+        """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the best optimum that is found from ``start``."""
         problem = self._problem()
-        start = self._constant_priors()[0] | self._guesses
         best = problem.solve(start)
         width = self._widest
         if width > 1.0:
@@ -59,6 +56,64 @@ class Batch(RelocatingGraph):
             best = problem.solve(best.values)
         covariances = self._settle(problem, best.values)
         return np.array([best.values[k.key] for k in self._keyframes]), covariances
+
+
+class SmootherAhead(GraduatedGraph, Smoother):
+    """The smoother with the end of a batch."""
+
+    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
+        super().__init__(setup, SmootherSettings(**settings.model_dump(exclude={"widest_loss"})))
+        self._widest = settings.widest_loss
+
+
+class Batch(GraduatedGraph):
+    """The batch estimator; see the module."""
+
+    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
+        super().__init__(setup, settings)
+        self._widest = settings.widest_loss
+        self._guesses: Values = {}
+        self._ahead: SmootherAhead | None = None
+        if self._unknown is not None:
+            self._ahead = SmootherAhead(setup, settings)
+            self.diagnostics = self._ahead.diagnostics
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian."""
+        if self._ahead is not None:
+            self._ahead.initialize(prior)
+        else:
+            super().initialize(prior)
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if self._ahead is not None:
+            self._ahead.process(measurement)
+        else:
+            super().process(measurement)
+
+    def estimate(self) -> PoseEstimate:
+        """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
+        if self._ahead is not None:
+            return replace(self._ahead.estimate(), status="unlocalized")
+        guess = super().estimate()
+        return guess if self._prior is None else replace(guess, status="unlocalized")
+
+    def belief(self) -> Belief:
+        """The belief behind :meth:`estimate`."""
+        return super().belief() if self._ahead is None else self._ahead.belief()
+
+    def learnt(self) -> Learnt:
+        """The constants and landmarks that are estimated."""
+        return super().learnt() if self._ahead is None else self._ahead.learnt()
+
+    def trajectory(self) -> Trajectory:
+        """The optimum at the stamps of the ticks, from the start on; empty if there was none."""
+        return super().trajectory() if self._ahead is None else self._ahead.trajectory()
+
+    def _final(self) -> tuple[Array, Array]:
+        """The optimum over the whole log."""
+        return self._optimum(self._constant_priors()[0] | self._guesses)
 
     def _begin(self, first: Keyframe) -> None:
         self._guesses[first.key] = self._pose

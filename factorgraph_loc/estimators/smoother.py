@@ -74,16 +74,19 @@ class Smoother(RelocatingGraph):
             estimates = self._filtered
         elif isinstance(self._solver, FullHistory):
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
-            values |= {key: self._solver.value(key) for key in self._constants}
-            self._drop_astray(self._keyframes, values)
-            problem = self._problem()
-            values = problem.solve(values).values
-            return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
+            return self._optimum(values | {key: self._solver.value(key) for key in self._constants})
         else:
             for key in self._constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
             estimates = self._left + [self._marginal(k.key) for k in self._keyframes[len(self._left) :]]
         return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
+
+    def _optimum(self, start: Values) -> tuple[Array, Array]:
+        """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the optimum next to ``start``."""
+        self._drop_astray(self._keyframes, start)
+        problem = self._problem()
+        values = problem.solve(start).values
+        return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
 
     def _begin(self, first: Keyframe) -> None:
         self._filtered.append((self._pose, self._covariance))
