@@ -7,10 +7,12 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.experiments.experiment import Prepared
 from factorgraph_loc.experiments.index import collect
+from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
 
 PAGE = "report.html"
@@ -34,15 +36,17 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Path:
 
     path = out or prepared.folder / PAGE
     settings = prepared.experiment.report
+    is_there = settings.baseline in (rows["label"].to_list() if len(rows) else ())
     try:
         write_report(
             rows,
             files,
             path,
             metrics=settings.metrics,
-            baseline=settings.baseline,
+            baseline=settings.baseline if is_there else None,  # of results that are still being made
             title=prepared.experiment.name,
             experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
+            versions={"factorgraph-loc": __version__, "its source, sha256": code_version(), **library_versions()},
         )
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -41,13 +41,14 @@ def write_report(
     baseline: str | None = None,
     title: str = "Results",
     experiment: Mapping[str, Any] | None = None,
+    versions: Mapping[str, str] | None = None,
 ) -> None:
     """Write the page ``out``.
 
     ``rows``: one a run, with key, log, estimator, seed, status (ok, failed), reason, the scores, and where there are such label,
     sensors, kind (of a failure) and ``sweep.*``. ``runs``: the files of a run that went well, by its key. ``metrics``: scores to
     show. ``baseline``: the label that the others are compared with, by default the first. ``experiment``: what was asked for, as
-    plain values.
+    plain values. ``versions``: of what the runs were made with, by default those that the configuration of the first tells.
 
     Raises InputError for no rows, or a baseline that is no label.
     """
@@ -60,7 +61,7 @@ def write_report(
     page = _Page(
         results, _known(results, metrics), labels[baseline] if baseline else next(iter(results.variants)), runs
     )
-    write_text(out, page.html(title, experiment or {}))
+    write_text(out, page.html(title, experiment or {}, versions or {}))
 
 
 class _Page:
@@ -74,7 +75,7 @@ class _Page:
         self._charts: list[charts.Chart] = []
         self._sections: list[tuple[str, str]] = []
 
-    def html(self, title: str, experiment: Mapping[str, Any]) -> str:
+    def html(self, title: str, experiment: Mapping[str, Any], versions: Mapping[str, str]) -> str:
         results = self._results
         drawn = read_runs(results, self._metrics[0].key, self._runs)
         best = [results.compare(metric) for metric in self._metrics]
@@ -90,7 +91,7 @@ class _Page:
             self._consistency(drawn),
             self._times(),
             self._failures(),
-            self._repeat(experiment, drawn),
+            self._repeat(experiment, versions or drawn.versions, drawn),
             self._method(),
         ]
         content = {
@@ -259,7 +260,7 @@ class _Page:
         note = f"{count} of {len(self._results.rows)} runs failed, and are in none of the figures."
         return self._section("failures", "Failures", _note(note), tables.failures(self._results))
 
-    def _repeat(self, experiment: Mapping[str, Any], drawn: Reading) -> Html:
+    def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: Reading) -> Html:
         parts: list[object] = []
         if experiment:
             asked = tag("pre", tomli_w.dumps(_toml(experiment)))
@@ -267,9 +268,9 @@ class _Page:
         if drawn.configs:
             chosen = tag("div", tag("div", class_="controls"), tag("pre"), id="configs")
             parts.append(tag("details", tag("summary", "Effective configuration of a run"), chosen, open=""))
-        if drawn.versions:
-            versions = table(["", "version"], [[name, version] for name, version in drawn.versions.items()])
-            parts.append(tag("details", tag("summary", "Versions"), versions, open=""))
+        if versions:
+            lines = table(["", "version"], versions.items())
+            parts.append(tag("details", tag("summary", "Versions"), lines, open=""))
         return self._section("repeat", "To repeat it", *parts)
 
     def _method(self) -> Html:
