@@ -92,28 +92,30 @@ def run_picture(track: SeekingTrack) -> Figure:
 
 
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Boxes of the runs that came there, a dot for each; above them how many did not."""
+    """Boxes of all runs, a dot for each; those that never came there are as far up as the farthest drove, and counted."""
     names = policies(rows)
+    top = _farthest(rows, case)
     rng = np.random.default_rng(0)  # sideways, so that dots do not cover each other
     for i, policy in enumerate(names):
         driven = metres(runs_of(rows, case, policy))
-        known = driven[np.isfinite(driven)]
-        if len(known):
+        shown = np.minimum(driven, top)
+        if len(shown):
             style = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.6}
             props: dict[str, Any] = {f"{part}props": style for part in ("box", "whisker", "cap", "median")}
-            axis.boxplot([known], positions=[i], widths=0.6, showfliers=False, whis=(10, 90), **props)
-            axis.plot(i + rng.uniform(-0.2, 0.2, len(known)), known, ".", color="0.6", markersize=4, zorder=1)
-        if len(known) < len(driven):
-            text = f"{len(driven) - len(known)} of {len(driven)}\nnever"
+            axis.boxplot([shown], positions=[i], widths=0.6, showfliers=False, whis=(10, 90), **props)
+            axis.plot(i + rng.uniform(-0.2, 0.2, len(shown)), shown, ".", color="0.6", markersize=4, zorder=1)
+        never = int(np.sum(np.isinf(driven)))
+        if never:
+            text = f"{never} of {len(driven)}\nnever"
             axis.text(i, 0.98, text, ha="center", va="top", fontsize=11, transform=axis.get_xaxis_transform())
     axis.set_xticks(range(len(names)), names)
     axis.set_xlim(-0.6, len(names) - 0.4)
-    axis.set_ylim(0.0, 1.25 * axis.get_ylim()[1])  # room for the counts
+    axis.set_ylim(-0.02 * top, 1.25 * top)  # room for the counts
     axis.set_ylabel("metres (box: quartiles, 10 and 90 %)")
 
 
 def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    longest = max((row["metres"] or 0.0 for row in rows), default=0.0) or 1.0
+    longest = _farthest(rows, case)
     for policy, style in zip(policies(rows), styles(), strict=False):
         driven = np.sort(metres(runs_of(rows, case, policy)))
         known = driven[np.isfinite(driven)]
@@ -124,6 +126,11 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
     axis.set_xlim(0.0, longest)
     axis.set_xlabel("metres driven")
     axis.set_ylabel("share of runs localized")
+
+
+def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
+    """The most metres of a run in this world, 1 if none drove."""
+    return max((row["metres"] or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
 
 
 def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
