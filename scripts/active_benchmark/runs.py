@@ -1,0 +1,58 @@
+"""Runs of worlds, policies and estimators, and the tables of them."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from benchmarking.report import Options, Report
+
+from factorgraph_loc.evaluation.active import difference_cells, summary_cells
+from factorgraph_loc.evaluation.active_figures import comparison
+from factorgraph_loc.experiments.active import jobs_of, run_jobs, write_picture, write_tables
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation import preset
+
+WORLDS = ("office", "symmetric", "warehouse")
+SETTINGS = ActiveSettings()
+
+
+def compared(
+    name: str, options: Options, estimators: Mapping[str, Sequence[str]], seeds: Sequence[int], text: str
+) -> Report:
+    """The section ``name`` of all worlds and ``estimators``, each with its policies."""
+    report = Report(name, options)
+    jobs = [
+        job
+        for world in WORLDS
+        for estimator, policies in estimators.items()
+        for job in jobs_of(preset(world), policies, (estimator,), seeds, options.out, SETTINGS)
+    ]
+    results = run_jobs(jobs, options.jobs, lambda done, total: tell(name, done, total))
+    print(file=sys.stderr)
+    report.failed += results.failures
+    report.say(text)
+    for cells in (summary_cells, difference_cells):
+        report.table(*cells(results.rows))
+    folder = options.out / name
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tables(results.rows, folder)
+    write_picture(comparison(results.rows), folder / "comparison.png")
+    return report
+
+
+def tell(name: str, done: Any, total: Any) -> None:
+    print(f"\r{name}: {done} of {total}", end="", file=sys.stderr, flush=True)
+
+
+def goal(seeds: Sequence[int]) -> str:
+    """What is told of every table of runs."""
+    degrees = math.degrees(SETTINGS.heading_limit)
+    return (
+        f"{len(seeds)} robots in each world, the same for all policies; one gives up after {SETTINGS.max_metres:.0f} m. "
+        f"*Failed*: was not localized by then, within {SETTINGS.position_limit:g} m and {degrees:.0f} degrees both by its own "
+        "word and in truth. *Claimed wrongly*: said so once and was off by more than three times that. Errors are medians, "
+        "at the end; planning is the time of a step"
+    )
