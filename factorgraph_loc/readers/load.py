@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import inside, nearest, parse_model
+from factorgraph_loc.files import inside, nearest, parse_model, read_toml
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers import registry as readers
+from factorgraph_loc.readers.bag_file import is_bag
 from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
 from factorgraph_loc.shipped import manifests
@@ -48,8 +49,8 @@ def load(
 
     ``log`` is a manifest, a folder in the native format or its ``run.toml``, a name that ``manifests()`` lists, or, with
     ``reader``, any path. ``options`` are the reader's and go before a manifest's; a list, or text with commas, makes a log of
-    each value. ``rig`` and ``world`` replace those of the log. ``data_root``: where the files of manifests are, by default
-    the environment's FGLOC_DATA. InputError names what is wrong in one line.
+    each value. ``rig`` and ``world`` replace those of the log. ``data_root``: where the files of manifests are that are not
+    below the manifest's own folder, by default the environment's FGLOC_DATA. InputError names what is wrong in one line.
     """
     given = dict(options or {})
     source = _find(log, data_root, reader)
@@ -61,7 +62,11 @@ def load(
     }
     if empty := [key for key, values in choices.items() if not values]:
         raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
-    naming = [key for key, value in choices.items() if key in given or len(value) > 1]
+    naming = [
+        key
+        for key, values in choices.items()
+        if (key in given or len(values) > 1) and not any(isinstance(value, Mapping) for value in values)
+    ]
     replaced = replace(
         source,
         rig=read_rig(rig) if rig is not None else source.rig,
@@ -87,8 +92,10 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
         return _Source(reader, path, None if reader == "native" else _name(path))
     if path.is_dir() and (path / RUN_FILE).is_file():
         return _Source("native", path)
+    if is_bag(path):
+        raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        if path.name == RUN_FILE:
+        if path.name == RUN_FILE and "reader" not in read_toml(path):
             return _Source("native", path.parent)
         if path.suffix == ".toml":
             return _from_manifest(path, data_root)
@@ -109,13 +116,15 @@ def _from_manifest(file: Path, data_root: Path | None) -> _Source:
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
-        path = inside(find_data_root(data_root, file), manifest.path, file)
+        path = inside(file.parent, manifest.path, file)  # one's own manifest, beside its log
+        if not path.exists():
+            path = inside(find_data_root(data_root, file), manifest.path, file)
         if not path.exists():
             raise InputError(f"{file}: its data {path} does not exist")
     return _Source(
         reader=manifest.reader,
         path=path,
-        name=file.stem,
+        name=None if file.name == RUN_FILE else file.stem,
         options=manifest.options,
         rig=None if manifest.rig is None else read_rig(inside(file.parent, manifest.rig, file)),
         world=None if manifest.world is None else read_world(inside(file.parent, manifest.world, file)),

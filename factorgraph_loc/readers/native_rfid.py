@@ -56,7 +56,7 @@ def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warn
     InputError names file, row and field of what is wrong; reads outside every inventory are left out, with a warning.
     """
     if reads is not None:
-        _check_reads(reads)
+        check_reads(reads)
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)
     assert reads is not None
@@ -119,7 +119,8 @@ def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, an
     return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
-def _check_reads(reads: Table) -> None:
+def check_reads(reads: Table) -> None:
+    """InputError for a phase or a frequency that has another unit."""
     if "phase" not in reads.numbers:
         return
     phase, frequency = reads.numbers["phase"], reads.numbers["frequency"]

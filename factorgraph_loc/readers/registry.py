@@ -18,6 +18,7 @@ READERS: dict[str, str] = {
     "mrclam": "factorgraph_loc.readers.mrclam",
     "plaza": "factorgraph_loc.readers.plaza",
     "rf_robot": "factorgraph_loc.readers.rf_robot",
+    "rosbag": "factorgraph_loc.readers.rosbag",
     "sevenscenes": "factorgraph_loc.readers.sevenscenes",
     "starry_night": "factorgraph_loc.readers.starry_night",
     "utias_woods": "factorgraph_loc.readers.utias_woods",

@@ -132,8 +132,8 @@ def test_names_that_lead_nowhere(tmp_path, refused):
     refused(tmp_path, "no reader 'natve'", "did you mean native?", reader="natve")
     refused(tmp_path / "nothing", "does not exist", reader="mrclam")
     refused(tmp_path, "expected a folder in the native format", reader="native")
-    (tmp_path / "x.bag").write_text("")
-    refused(tmp_path / "x.bag", "is not a manifest (.toml)")
+    (tmp_path / "x.dat").write_text("")
+    refused(tmp_path / "x.dat", "is not a manifest (.toml)")
 
 
 def test_the_native_format_has_no_options(native, refused):

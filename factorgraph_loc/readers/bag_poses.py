@@ -1,0 +1,89 @@
+"""Poses in a bag: those of odometry, and the reference that estimates are scored against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import FileModel
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.bag_clock import Clock
+from factorgraph_loc.readers.bag_file import Bag, Stamped
+from factorgraph_loc.readers.bag_rows import Rows
+from factorgraph_loc.trajectory import Integers, Trajectory
+from factors.se2 import Array
+
+POSES: dict[str, Callable[[Any], Any]] = {
+    "nav_msgs/msg/Odometry": attrgetter("pose.pose"),
+    "geometry_msgs/msg/PoseStamped": attrgetter("pose"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": attrgetter("pose.pose"),
+    "geometry_msgs/msg/TransformStamped": attrgetter("transform"),
+}
+TF = "tf2_msgs/msg/TFMessage"
+UNIT = 0.01  # what the length of a quaternion may be off
+
+
+class ReferenceTopic(FileModel):
+    """A topic of poses, or of tf, and then the frames: the robot is ``child`` in the world ``parent``. ``has_heading``: whether the
+    heading means something."""
+
+    topic: str
+    parent: str | None = None
+    child: str | None = None
+    has_heading: bool = True
+    clock: Clock | None = None
+
+
+class Poses:
+    """Gathers the poses of a topic."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name)
+        if topic.type not in POSES:
+            raise InputError(
+                f"{bag.path}: topic {name} is of type {topic.type}, expected one of {', '.join(sorted(POSES))}"
+            )
+        self._pose = POSES[topic.type]
+        # a transform says translation and rotation where a pose says position and orientation
+        self._parts = (
+            ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
+        )
+        self.rows = Rows(f"{bag.path} {name}", 7)
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        self.rows.append(item, t_ns, seven(self._pose(item.message), *self._parts))
+
+    def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
+        """Stamps (N,) and planar poses (N, 3), of equal stamps the last; InputError names the message of what is wrong."""
+        rows, t_ns = self.rows.rows, self.rows.t_ns
+        poses = planar(self.rows.source, rows, self.rows.values)
+        keep = checks.in_order(self.rows.source, rows, t_ns, warnings)
+        return t_ns[keep], poses[keep]
+
+    def trajectory(self, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
+        t_ns, poses = self.in_order(warnings)
+        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading)
+
+
+def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
+    """x, y, z [m] and the quaternion x, y, z, w of a pose, or of a transform."""
+    p, q = getattr(pose, position), getattr(pose, orientation)
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def planar(source: str, rows: Integers, table: Array) -> Array:
+    """Poses (N, 3) of positions and quaternions (N, 7). InputError for what is not finite, and a quaternion that is no unit one."""
+    for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
+        checks.require_finite(source, rows, name, table[:, i])
+    length = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
+    bad = np.flatnonzero(np.abs(length - 1.0) > UNIT)
+    if len(bad):
+        i = int(bad[0])
+        raise bad_field(source, "length of the quaternion", float(length[i]), "1", row=int(rows[i]))
+    qx, qy, qz, qw = table[:, 3:].T
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
+    return np.column_stack((table[:, :2], heading))
