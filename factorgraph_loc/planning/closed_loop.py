@@ -35,7 +35,7 @@ ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
 SHOWN = 300  # particles of a belief that are kept
 SPREAD = 2000  # poses that stand for a belief without particles
 WRONG = 3.0  # times the limits: an error that is no bad luck
-MODES, LIKELY, TAGS = 3, 0.1, 4  # places with at least so much weight from which ways lead to the nearest tags
+MODES, LIKELY, TAGS = 3, 0.1, 2  # places with at least so much weight from which ways lead to the nearest tags
 PAUSE = 1.0  # s that a robot waits that cannot go anywhere
 SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
 
@@ -176,7 +176,7 @@ class _Loop:
         for mode in belief.modes[:MODES]:
             if mode.weight >= LIKELY and np.all(np.isfinite(mode.pose)):
                 ways = waypoint_paths(self._space, mode.pose, self._places)
-                ways = [way for way in ways if way.length >= self._settings.policy.horizon / 2.0]
+                ways = [way for way in ways if way.length >= self._settings.policy.horizon]
                 out += sorted(ways, key=lambda way: way.length)[:TAGS]
         return out
 

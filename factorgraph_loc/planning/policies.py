@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.cloud import pose_moments
 from factorgraph_loc.files import nearest
 from factorgraph_loc.planning.information import expected_gain
 from factorgraph_loc.planning.paths import STEP, Path
@@ -26,8 +27,10 @@ from factors import se2
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
-NOTHING = 0.3  # nats: an expected gain that is as good as none, by the noise of the expectation
+# m: standard deviation of a belief in many places, and the gains [nats] that are as good as none, there and in one place
+LOST, NOTHING, ALMOST_NOTHING = 3.0, 0.3, 1e-3
 AHEAD = 1.0  # m that must be free
+COMMITTED = 0.5  # of a long way, before another is chosen
 BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
 NEAR = 3  # tags that tell a place
 
@@ -83,12 +86,16 @@ class Information:
             samples=settings.samples,
             space=s.space,
         )
-        if np.max(gains) < NOTHING:
+        _, covariance = pose_moments(s.particles, s.weights)
+        lost = np.linalg.eigvalsh(covariance[:2, :2])[-1] > LOST**2
+        if np.max(gains) < (NOTHING if lost else ALMOST_NOTHING):
             return self._otherwise.choose(s)
         rates = s.settings.speed, s.settings.turn_rate
         costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
         values = self._sign * gains - np.array(costs)
-        return Choice(s.candidates[int(np.argmax(values))], settings.replan, values)
+        best = s.candidates[int(np.argmax(values))]
+        # who goes far away for something is on the way for long
+        return Choice(best, max(settings.replan, COMMITTED * best.length), values)
 
 
 class Random:

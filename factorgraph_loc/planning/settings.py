@@ -19,9 +19,9 @@ class PolicySettings(FileModel):
     it chooses anew. ``per_metre`` and ``per_second``: what a way costs, in nats. ``samples``: particles of the belief that the
     expectation is taken over. ``dimensions``: whose entropy counts."""
 
-    horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 6.0
-    replan: Metres = 2.0
-    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.05
+    horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 3.0
+    replan: Metres = 1.0
+    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.1
     per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
     dimensions: Annotated[tuple[Dimension, ...], Field(min_length=1)] = ("x", "y")

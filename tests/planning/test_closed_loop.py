@@ -11,7 +11,7 @@ from factorgraph_loc.files import parse_model
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import run_active
-from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.free_space import distance_to_walls
 from factorgraph_loc.world import World
@@ -126,7 +126,7 @@ def test_a_horizon_of_zero_is_an_error(horizon: float) -> None:
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
     differ to find out, and to say nothing before."""
-    settings = ActiveSettings(start=(12.0, 12.0, 0.1))
+    settings = ActiveSettings(start=(12.0, 12.0, 0.1), policy=PolicySettings(horizon=6.0, replan=2.0))
     run = run_active(preset("symmetric"), "information", "active_mcl", 3, settings)
     assert run.localized
     assert not run.claimed_wrong
