@@ -52,15 +52,21 @@ def _best(c: Comparison) -> Html:
     tied = [v for v in c.contrasts if c.can_tell and c.p[v] is not None and not c.is_significant(v)]
     worse = [v for v in c.contrasts if c.is_significant(v)]
     if tied:
-        parts.append(f"It cannot be told apart from that of {_list(tied)}. ")
+        parts += ["It cannot be told apart from that of ", _list(tied), ". "]
     if worse:
         told = [
-            f"{v} ({c.metric.text(c.contrasts[v].difference, sign=True)}{unit}, p {p_value(c.p[v])})" for v in worse
+            join(
+                [
+                    tag("strong", v),
+                    f" ({c.metric.text(c.contrasts[v].difference, sign=True)}{unit}, p {p_value(c.p[v])})",
+                ]
+            )
+            for v in worse
         ]
-        parts.append(f"That of {_list(told)} is another.")
+        parts += ["That of ", _and(told), " is another."]
     missing = [v for v in c.pooled if c.contrasts.get(v) is not None and c.contrasts[v].count < c.pooled[c.best].count]
     if missing:
-        parts.append(f" {_list(missing)} {'lacks' if len(missing) == 1 else 'lack'} some of the logs.")
+        parts += [" ", _list(missing), f" {'lacks' if len(missing) == 1 else 'lack'} some of the logs."]
     return join(parts)
 
 
@@ -68,20 +74,24 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
     sure = [v for v, (mean, _, high) in trust.items() if mean > high]
     timid = [v for v, (mean, low, _) in trust.items() if mean < low]
     right = [v for v, (mean, low, high) in trust.items() if low <= mean <= high]
-    told = []
+    told: list[Html] = []
     if sure:
-        told.append(f"{_list(sure)} {_is(sure)} surer than the causal errors allow")
+        told.append(join([_list(sure), f" {_is(sure)} surer than the causal errors allow"]))
     if timid:
-        told.append(f"{_list(timid)} {_is(timid)} less sure than {'it' if len(timid) == 1 else 'they'} could be")
+        told.append(
+            join([_list(timid), f" {_is(timid)} less sure than {'it' if len(timid) == 1 else 'they'} could be"])
+        )
     if right:
-        told.append(f"the stated covariances of {_list(right)} fit the errors")
-    return [join(["Trust: " + "; ".join(told) + "."])] if told else []
+        told.append(join(["the stated covariances of ", _list(right), " fit the errors"]))
+    return [join(["Trust: ", join(told, "; "), "."])] if told else []
 
 
 def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]:
     told: list[Html] = []
     if poor := results.unscored():
-        told.append(join([f"Fewer than {SCORED} poses of {_list(poor)} have a reference: nothing is scored there."]))
+        told.append(
+            join([f"Fewer than {SCORED} poses of ", _list(poor), " have a reference: nothing is scored there."])
+        )
     found = [c for comparison in comparisons for c in comparison.contrasts.values()]
     if found and all(c.p is None for c in found):
         units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"
@@ -111,7 +121,11 @@ def _is(names: Sequence[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
-def _list(names: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``; of many the first, and how many more."""
-    shown = [*names[:5], f"{len(names) - 5} more"] if len(names) > 6 else list(names)
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
+def _list(names: Sequence[str]) -> Html:
+    """**a**, **a** and **b**, **a**, **b** and **c**; of many the first, and how many more."""
+    return _and([tag("strong", name) for name in names])
+
+
+def _and(parts: Sequence[Html]) -> Html:
+    shown: list[object] = [*parts[:5], f"{len(parts) - 5} more"] if len(parts) > 6 else list(parts)
+    return join([join(shown[:-1], ", "), " and ", shown[-1]]) if len(shown) > 1 else join(shown)

@@ -147,7 +147,7 @@ function hover(root, marks) {
 }
 
 // of line k of n: those drawn first are broader, so that they show below those that lie on them
-const thickness = (k, n) => 1.6 + 1.1 * Math.min(3, n - 1 - k);
+const thickness = (k, n) => 1.6 + 0.7 * Math.min(3, n - 1 - k);
 
 const colour = (v) => "c" + (v % 7) + (v >= 7 ? " d" + (Math.floor(v / 7) % 3) : "");
 
