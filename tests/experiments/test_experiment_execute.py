@@ -8,7 +8,7 @@ import pytest
 
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments import execute
-from factorgraph_loc.experiments.experiment import prepare, run_experiment
+from factorgraph_loc.experiments.experiment import PACE, estimate_seconds, prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.index import load_results
 from factorgraph_loc.experiments.plan import plan
@@ -225,6 +225,20 @@ def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out):
         run_experiment(experiment(), executor=stopped)
     assert load_results(out)["label"].to_list() == ["fake"]
     assert [one.label for one in experiment().todo()] == ["ekf"]
+
+
+def test_how_long_runs_take_is_told_from_like_ones(experiment, out):
+    prepared = experiment()
+    fake, ekf = prepared.runs
+    assert estimate_seconds(prepared.runs, out) == pytest.approx(2 * fake.duration / PACE)
+    rows = run_experiment(prepared, executor=here(out)).rows
+    taken = rows["timing.run_seconds"].to_list()
+    assert estimate_seconds([ekf], out) == pytest.approx(taken[1])
+    longer = dataclasses.replace(fake, log="another", duration=3.0 * fake.duration)
+    assert estimate_seconds([longer, ekf], out) == pytest.approx(3.0 * taken[0] + taken[1])
+    assert estimate_seconds([dataclasses.replace(ekf, label="new", estimator="batch")], out) == pytest.approx(
+        ekf.duration / PACE
+    )
 
 
 def test_a_table_that_is_no_table_is_told(experiment, out):

@@ -1,5 +1,8 @@
 """What an experiment's file may say, and what is said of one that is wrong."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from factorgraph_loc.errors import InputError
@@ -104,3 +107,11 @@ def test_what_is_wrong_is_one_line_with_key_and_value(read, text, fragments):
 def test_a_misspelt_change_names_the_nearest(read, change, hint):
     with pytest.raises(InputError, match=f"did you mean {hint}"):
         read(GOOD, change)
+
+
+def test_the_file_of_the_documentation_is_one(read):
+    page = Path(__file__).parents[2] / "docs" / "experiments.md"
+    (text,) = re.findall(r"```toml\n(.*?)```", page.read_text(), re.DOTALL)
+    experiment = read(text)
+    assert len(experiment.sweep.points()) == 4
+    assert experiment.report.baseline == "ekf"
