@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,11 @@ def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
 
 def write_index(table: pl.DataFrame, folder: Path) -> None:
     """Write the table into ``folder``, at once or not at all; StoreError where it cannot be written."""
+    content = io.BytesIO()  # polars itself says of a full disk that the file is out of specification
+    table.write_parquet(content)
     try:
         with replacing(folder / INDEX) as temporary:
-            table.write_parquet(temporary)
+            temporary.write_bytes(content.getvalue())
     except OSError as error:
         raise StoreError(f"{folder / INDEX}: cannot be written: {error.strerror or error}") from error
 

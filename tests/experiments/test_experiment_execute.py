@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -157,10 +158,10 @@ def experiment(log, tmp_path, out):
     """``experiment(text)``: an experiment prepared from its file, with the log of a nasty name."""
     write_native(dataclasses.replace(log, name=NASTY), tmp_path / "log")
 
-    def make(text="estimators = ['fake', 'ekf']", **options):
+    def make(text="estimators = ['fake', 'ekf']", folder=out, **options):
         file = tmp_path / "a.toml"
         file.write_text(f'name = "a"\nlogs = ["log"]\n{text}')
-        return prepare(file, out=out, **options)
+        return prepare(file, out=folder, **options)
 
     return make
 
@@ -225,6 +226,18 @@ def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out):
         run_experiment(experiment(), executor=stopped)
     assert load_results(out)["label"].to_list() == ["fake"]
     assert [one.label for one in experiment().todo()] == ["ekf"]
+
+
+def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when_there_is_room(experiment, small_disk):
+    disk = small_disk(120)
+    text = "estimators = ['particle_filter']\nseeds = '0:20'"
+    with pytest.raises(StoreError, match="No space left on device"):
+        run_experiment(experiment(text, folder=disk), executor=here(disk))
+    counts = experiment(text, folder=disk, verify=True).counts()
+    assert 0 < counts["ok"] < 20
+    assert set(counts) == {"ok", "missing"}
+    subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)
+    assert len(run_experiment(experiment(text, folder=disk), executor=here(disk)).rows) == 20
 
 
 def test_how_long_runs_take_is_told_from_like_ones(experiment, out):
