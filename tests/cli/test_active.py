@@ -45,7 +45,7 @@ def test_policies_are_compared(fgloc, tmp_path):
         assert text in done.stdout
     rows = pl.read_parquet(out / "results.parquet")
     assert sorted(rows.select("policy", "seed").rows()) == [(p, s) for p in ("information", "random") for s in (0, 1)]
-    assert (rows["metres"] <= 8.2).all()
+    assert (rows["metres"] <= 8.3).all()  # a step of a way more
     assert (out / "plots" / "comparison.png").exists()
 
 
@@ -68,7 +68,7 @@ def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     assert done.exit_code == 0, done.stderr  # that is a result
     (row,) = pl.read_parquet(out / "results.parquet").to_dicts()
     assert not row["localized"]
-    assert 2.0 < row["metres"] <= 3.2
+    assert 2.0 < row["metres"] <= 3.3  # a step of its way more
     assert "never" in done.stdout
 
 

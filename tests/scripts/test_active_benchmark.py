@@ -35,6 +35,7 @@ def asked(monkeypatch):
         return ActiveResults(rows, failed)
 
     monkeypatch.setattr(runs, "run_jobs", run_jobs)
+    monkeypatch.setattr(runs, "write_picture", lambda figure, path: path.write_text(figure.get_suptitle()))
     return jobs
 
 
@@ -49,7 +50,7 @@ def test_every_policy_runs_in_every_world_on_the_same_seeds(asked, tmp_path):
     assert "3 robots in each world" in text
     assert "| symmetric | information / paper_literal | active_mcl | 3 | 0.0 (0.0 to 0.0) |" in text
     assert (tmp_path / "policies" / "results.parquet").exists()
-    assert (tmp_path / "policies" / "comparison.png").exists()
+    assert (tmp_path / "policies" / "comparison.png").read_text().endswith("3 runs of each")
 
 
 def test_what_fails_is_told(asked, tmp_path):
