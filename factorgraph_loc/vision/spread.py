@@ -18,8 +18,8 @@ def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None)
         return np.arange(len(pixels))
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     side = max(math.sqrt(float(np.prod(high - low)) / count), 1.0)
-    _, cells = np.unique(np.floor((pixels - low) / side), axis=0, return_inverse=True)
-    cells = cells.ravel()
+    column, line = np.floor((pixels - low) / side).T
+    cells = column * (line.max() + 1.0) + line
     order = np.lexsort((np.zeros(len(pixels)) if priority is None else -np.asarray(priority), cells))
     turns = np.empty(len(pixels), dtype=np.int64)
     turns[order] = np.arange(len(pixels)) - np.searchsorted(
