@@ -20,7 +20,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
-from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window
+from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window, read_all
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point, is_pose
 from factors import se2
 from factors.odometry import between_factor
@@ -31,8 +31,10 @@ SOLVE_INTERVAL = (
 )
 
 
-FARTHEST = 5.0  # m from the last estimate: a solver that failed there was lost before
 NOWHERE: Mapping[int, Array] = {}
+# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
+JUMPED = 50.0
+ITERATIONS_AFTER_FAILURE = 10
 
 
 class SmootherSettings(GraphSettings):
@@ -54,6 +56,7 @@ class Smoother(RelocatingGraph):
         self._settings = settings
         self._failed: list[str] = []
         self._solver = self._new_solver()
+        self._last = gtsam.Values()  # all estimates after the last update, where landmarks are estimated
         # where landmarks are estimated an update takes long: what is seen between keyframes waits for the next one
         self._waits = settings.landmarks != "known"
         self._waiting = Addition()
@@ -136,12 +139,23 @@ class Smoother(RelocatingGraph):
         self._leave(newest.t, [k for k in self._constants if k not in values and not is_point(k)])
         try:
             self._solver.update(nodes, values, newest.t)
+            self._check_jump(newest)
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {str(error).strip().splitlines()[0]}"))
             self._rebuild(newest, error)
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
+
+    def _check_jump(self, newest: Keyframe) -> None:
+        """RuntimeError if points that are estimated took the newest pose where it cannot be."""
+        if self._unknown is None:
+            return
+        pose, spread = self._filtered[newest.index]
+        off = se2.log(se2.between(pose, self._solver.value(newest.key)))
+        if not off @ np.linalg.solve(spread, off) < JUMPED:
+            raise RuntimeError("the estimate jumped")
+        self._last = self._solver.estimates()
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
         """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
@@ -199,11 +213,8 @@ class Smoother(RelocatingGraph):
             del self._constants[key], self._spreads[key]
 
     def _rebuild(self, newest: Keyframe, error: RuntimeError) -> None:
-        """A new solver after the old one failed: where that was last, if it was anywhere; then without what may throw."""
-        near = self._solver.linearized([*(k.key for k in self._keyframes), *self._constants])
-        moved = near.get(newest.key, newest_pose := self._filtered[newest.index][0])[:2] - newest_pose[:2]
-        if not all(np.all(np.isfinite(value)) for value in near.values()) or np.hypot(*moved) > FARTHEST:
-            near = {}
+        """A new solver after the old one failed, from what that told before; then without what may throw."""
+        near = read_all(self._last, [*(k.key for k in self._keyframes), *self._constants])
         for throws in (True, False, False):
             try:
                 self._start_again(newest, near, throws=throws)
@@ -220,12 +231,13 @@ class Smoother(RelocatingGraph):
         """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
         throw where a point gets behind a camera, at a tenth of the time.
 
-        The oldest keyframe of a window carries its causal estimate as prior, which its own factors are part of, and so do
+        The oldest keyframe of a window carries its last estimate as prior, which its own factors are part of, and so do
         constants and landmarks.
         """
         self._solver, self._waiting, self._solved = self._new_solver(), Addition(), newest.t
         oldest, *others = self._keyframes[len(self._left) :]
         pose, spread = self._filtered[oldest.index]
+        pose = near.get(oldest.key, pose)
         means, spreads = self._constants, self._spreads
         nodes: list[Node] = []
         if oldest.index == 0:
@@ -241,6 +253,8 @@ class Smoother(RelocatingGraph):
         guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
         guesses |= {key: value for key, value in near.items() if key in guesses}
         self._drop_astray(others, guesses)
+        if near and isinstance(self._solver, FullHistory):
+            guesses = self._problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
         for keyframe in others:
             there = (node for node in keyframe.nodes if all(not is_pose(k) or k >= oldest.key for k in node.keys))
             nodes += [self._odometry_node(keyframe), *there]

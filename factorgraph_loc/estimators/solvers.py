@@ -36,8 +36,8 @@ class Solver(Protocol):
     def covariance(self, key: int) -> Array:
         """Marginal covariance of a variable, poses in the body frame."""
 
-    def linearized(self, keys: Iterable[int]) -> Values:
-        """Where variables were linearised last, near their estimates, of those that the solver has: also after a failure."""
+    def estimates(self) -> gtsam.Values:
+        """Estimates of all variables, to be :func:`read_all` if they are needed."""
 
 
 class FullHistory:
@@ -71,8 +71,8 @@ class FullHistory:
     def covariance(self, key: int) -> Array:
         return np.asarray(self._isam.marginalCovariance(key))
 
-    def linearized(self, keys: Iterable[int]) -> Values:
-        return _read_all(self._isam.getLinearizationPoint(), keys)
+    def estimates(self) -> gtsam.Values:
+        return self._isam.calculateEstimate()
 
     def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
         """Values of the variables: as given in ``values``, else as the solver estimates them."""
@@ -123,8 +123,8 @@ class Window:
     def covariance(self, key: int) -> Array:
         return np.asarray(self._smoother.marginalCovariance(key))
 
-    def linearized(self, keys: Iterable[int]) -> Values:
-        return _read_all(self._smoother.getLinearizationPoint(), keys)
+    def estimates(self) -> gtsam.Values:
+        return self._smoother.calculateEstimate()
 
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""
@@ -164,7 +164,8 @@ class _Linear:
         return False
 
 
-def _read_all(values: gtsam.Values, keys: Iterable[int]) -> Values:
+def read_all(values: gtsam.Values, keys: Iterable[int]) -> Values:
+    """Those variables that GTSAM holds a value of."""
     return {
         key: pose_array(values.atPose2(key)) if is_pose(key) else np.asarray(values.atVector(key), dtype=float)
         for key in keys
