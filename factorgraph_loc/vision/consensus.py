@@ -31,6 +31,7 @@ HYPOTHESES, ROUND = 96, 16  # at most, and between looks whether that is enough
 MISSED = 1e-3  # probability that no sample of right points was drawn
 REACH = 10.0  # standard deviations of the prediction, within which a correction may lie
 FARTHEST = 3.0  # reaches, of a single step
+ROUNDING = 1e-12  # of a covariance's largest eigenvalue: smaller ones are none
 RIDGE = 1e-9  # of the information: keeps it invertible where the points are as good as at the camera
 LOOSE, GATE = 25.0, 13.8  # squared residuals of those that agree with three, and with all (99.9 %)
 JOINT = 0.99  # probability of all together to be compatible, if all are right
@@ -146,7 +147,8 @@ def _joint(
 def _root(camera: CameraPose) -> Array:
     """A root (6, 6) of the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    # what is a matter of rounding must not decide in which directions a sample may move
+    return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
 def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:

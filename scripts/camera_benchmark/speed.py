@@ -147,15 +147,17 @@ def chained(job: Chain) -> Links:
         folder.mkdir()
         settings = drive.settings()
         log = with_map(with_images(simulate(settings, drive.seed), settings, drive.seed, folder), points)
-        with spent(frontend, "follow") as follow, spent(Associator, "guided") as associate:
+        with (
+            spent(frontend, "follow") as follow,
+            spent(Associator, "guided") as guided,
+            spent(Associator, "relocalized") as relocalized,
+        ):
             prepared = prepare(log, config.sensors or (), config.estimator)
             started = perf_counter()
             run(prepared.log, config)
             smooth = perf_counter() - started
-    find = prepared.seconds - sum(follow)
-    return Links(
-        prepared.images, drive.feature, len(points), find, sum(follow), sum(associate), smooth - sum(associate)
-    )
+    find, associate = prepared.seconds - sum(follow), sum(guided) + sum(relocalized)
+    return Links(prepared.images, drive.feature, len(points), find, sum(follow), associate, smooth - associate)
 
 
 def rendered(_: Chain) -> float:
