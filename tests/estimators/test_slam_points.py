@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from factorgraph_loc.estimators.solvers import FullHistory
+from factorgraph_loc.estimators.variables import pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import FeatureStream, VelocityStream
 from factorgraph_loc.points import PointMap
@@ -142,6 +144,24 @@ def test_points_leave_the_window_and_are_kept(mapped):
     full, window = mapped("smoother"), mapped("smoother_lag")
     assert len(window.learnt.points) > 0.8 * len(full.learnt.points)
     assert len(set(window.learnt.points.names)) == len(window.learnt.points)
+
+
+def test_a_step_that_leads_astray_is_undone(mapped, log, monkeypatch):
+    value, told = FullHistory.value, []
+
+    def astray(self, key):
+        found = value(self, key)
+        if key != pose_key(20) or told:
+            return found
+        told.append(key)
+        return found + np.array((5.0, 0.0, 0.0))
+
+    monkeypatch.setattr(FullHistory, "value", astray)
+    result = run(log, CONFIGS["smoother"])
+    assert [text for _, text in result.diagnostics.events] == ["solver rebuilt: the estimate jumped"]
+    causal = np.linalg.norm(result.poses[:, :2] - log.reference.at(result.t)[:, :2], axis=1)
+    assert causal.max() < 1.0
+    assert rmse(result, log) < 1.2 * rmse(mapped("smoother"), log)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4])
