@@ -70,10 +70,13 @@ class Contrast:
     left_out: int
 
 
-def pooled(scores: ByLog, *, rms: bool) -> Pooled | None:
-    """A figure pooled over seeds, then over logs, each log counted once: root mean square, or else the mean. None without any."""
-    clusters = [np.array([[v] for v in seeds.values() if v is not None]).reshape(-1, 1) for seeds in scores.values()]
-    clusters = [cluster for cluster in clusters if len(cluster)]
+def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
+    """A figure pooled over seeds, then over logs, each log counted once: root mean square, or else the mean. None without any.
+
+    ``alike``: for logs that are variations of one, its name; together they count as one log.
+    """
+    known = {log: np.array([[v] for v in seeds.values() if v is not None]) for log, seeds in scores.items()}
+    clusters = _clusters(known, alike)
     if not clusters:
         return None
     per_log = np.array([_average(cluster, rms)[0] for cluster in clusters])
@@ -84,27 +87,32 @@ def pooled(scores: ByLog, *, rms: bool) -> Pooled | None:
     return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread), len(clusters))
 
 
-def contrast(a: ByLog, b: ByLog, *, rms: bool, interval: bool = True) -> Contrast | None:
+def contrast(
+    a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
+) -> Contrast | None:
     """Compare two sets of runs by the logs and seeds that both have; None if they have none in common.
 
     One that ran with one seed is paired with each seed of the other. Without ``interval`` there is none, which saves its time.
+    ``alike``: see :func:`pooled`; ``by_log`` tells these logs apart.
     """
     found = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in found.values()) + sum(len(b[log]) for log in b if log not in a)
     left_out += sum(len(a[log]) for log in a if log not in b)
-    clusters = {log: scores for log, (scores, _) in found.items() if len(scores)}
+    scores = {log: both for log, (both, _) in found.items() if len(both)}
+    clusters = _clusters(scores, alike)
     if not clusters:
         return None
-    by_log = {log: _average(scores, rms) for log, scores in clusters.items()}
-    total = _average(np.array(list(by_log.values())), rms)
-    units, enough = _units(list(clusters.values()))
-    pairs = next(iter(clusters.values())) if units == "seeds" else np.array(list(by_log.values()))
+    per_log = np.array([_average(cluster, rms) for cluster in clusters])
+    total = _average(per_log, rms)
+    units, enough = _units(clusters)
+    pairs = clusters[0] if units == "seeds" else per_log
     low, high, p, effect = None, None, None, None
     if enough and interval:
-        drawn = draw_pooled(list(clusters.values()), rms=rms)
+        drawn = draw_pooled(clusters, rms=rms)
         low, high = bounds(drawn[:, 0] - drawn[:, 1])
     if enough:
         p, effect = signed_rank(pairs[:, 0] - pairs[:, 1]), rank_biserial(pairs[:, 0] - pairs[:, 1])
+    values = {log: _average(both, rms).tolist() for log, both in scores.items()}
     return Contrast(
         difference=float(total[0] - total[1]),
         low=low,
@@ -113,8 +121,8 @@ def contrast(a: ByLog, b: ByLog, *, rms: bool, interval: bool = True) -> Contras
         effect=effect,
         units=units,
         count=len(pairs),
-        by_log={log: (float(x), float(y)) for log, (x, y) in by_log.items()},
-        pairs=sum(map(len, clusters.values())),
+        by_log={log: (x, y) for log, (x, y) in values.items()},
+        pairs=sum(map(len, clusters)),
         left_out=left_out,
     )
 
@@ -199,6 +207,15 @@ def _ranks(differences: Array) -> Array:
 def _average(scores: Array, rms: bool) -> Array:
     """Over the rows of ``scores`` (K, C)."""
     return np.asarray(np.sqrt(np.mean(np.square(scores), axis=0)) if rms else np.mean(scores, axis=0))
+
+
+def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
+    """The scores (K, C) of each log that has any; of logs that are alike together."""
+    merged: dict[str, list[Array]] = {}
+    for log, found in scores.items():
+        if len(found):
+            merged.setdefault((alike or {}).get(log, log), []).append(found)
+    return [np.concatenate(parts) for parts in merged.values()]
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:

@@ -110,6 +110,22 @@ def test_few_logs_stand_side_by_side():
     assert found.by_log["log3"] == (4.0, 5.0)
 
 
+def test_variations_of_a_log_count_as_one():
+    """Six worlds at three speeds are no 18 logs."""
+    rng = np.random.default_rng(4)
+    worlds = [(f"world{i}, {speed} m/s", f"world{i}") for i in range(6) for speed in (1, 2, 3)]
+    a, b = ({log: {0: float(v)} for (log, _), v in zip(worlds, rng.uniform(x, x + 1, 18), strict=True)} for x in (1, 2))
+    apart, together = contrast(a, b, rms=False), contrast(a, b, rms=False, alike=dict(worlds))
+    assert (apart.count, together.count) == (18, 6)
+    assert together.p == pytest.approx(least_p(6))
+    assert apart.p < together.p
+    assert together.difference == pytest.approx(apart.difference)
+    assert len(together.by_log) == 18
+    figure = pooled(a, rms=False, alike=dict(worlds))
+    assert (figure.count, figure.logs) == (6, 6)
+    assert figure.low < figure.value < figure.high
+
+
 def test_what_lacks_a_partner_is_counted():
     a = {"one": {0: 1.0, 1: None}, "two": {0: 1.0}, "three": {0: 1.0, 1: 1.0}}
     b = {"one": {0: 2.0, 1: 2.0}, "two": {0: 1.5}, "four": {0: 1.0}}

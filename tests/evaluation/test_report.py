@@ -133,6 +133,16 @@ def test_failures_stand_with_their_reason(made, tmp_path):
     assert "2 of 4 [15, 85] %" in words
 
 
+def test_shares_of_those_that_found_their_place(made, tmp_path):
+    some = made({"a": 0.1}, LOGS[:2], 2, count=40)
+    assert "localized before the end" not in words_of(page_of(some, tmp_path))
+    found = pl.col("key") == "0000"
+    some.rows = some.rows.with_columns(time_to_localized=pl.when(found).then(None).otherwise(12.0))
+    words = words_of(page_of(some, tmp_path))
+    assert "localized before the end" in words
+    assert "3 of 4 [30, 95] %" in words
+
+
 def test_all_failed_is_a_page_too(made, tmp_path):
     some = made({"a": 0.1}, ["one"], count=40)
     some.rows = some.rows.with_columns(pl.lit("failed").alias("status"), pl.lit("no memory").alias("reason"))
@@ -167,7 +177,8 @@ def test_a_swept_simulation_makes_other_logs(made):
     swept = made({"ekf": 0.1}, LOGS[:1], count=40, sweep=("sweep.simulation.tags", [10, 20]))
     results = Results(swept.rows)
     assert list(results.variants) == ["ekf"]
-    assert list(results.logs) == ["log0 (tags 10)", "log0 (tags 20)"]
+    assert results.logs == {"log0 (tags 10)": "log0", "log0 (tags 20)": "log0"}
+    assert results.compare(metric_of("causal.position_rmse")).pooled["ekf"].logs == 1
 
 
 def test_sensors_tell_variants_apart(made):

@@ -134,6 +134,8 @@ class _Page:
             "significantly different from the best. Causal is what the robot knows at the time, final what the whole log tells; "
             "compare neither with the other."
         )
+        if len(set(results.logs.values())) < len(results.logs):
+            note += " Logs that differ in a swept setting alone count as one log."
         return self._section("results", "Results", _note(note), tables.overview(results, best))
 
     def _differences(self, against: Sequence[Comparison]) -> Html | str:

@@ -52,9 +52,11 @@ class Comparison:
 
 
 class Results:
-    """``variants`` and ``logs`` by name, in the order of the rows; ``rows``: all of them, as dictionaries.
+    """``variants`` by name, in the order of the rows; ``logs``: the names of the logs by what they are called here; ``rows``: all
+    of them, as dictionaries.
 
-    A simulated log counts as another one for each value of a setting of the simulation that is swept.
+    A simulated log is shown as another one for each value of a setting of the simulation that is swept; intervals and tests count
+    these as one.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
@@ -100,8 +102,7 @@ class Results:
             name: c
             for name in scores
             if name != against
-            and (c := contrast(scores[name], scores[against], rms=metric.rms, interval=reference is not None))
-            is not None
+            and (c := self._contrast(metric, scores[name], scores[against], interval=reference is not None)) is not None
         }
         corrected = holm([c.p for c in contrasts.values()])
         return Comparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
@@ -120,10 +121,13 @@ class Results:
             )
         ]
 
+    def _contrast(self, metric: Metric, a: ByLog, b: ByLog, *, interval: bool) -> Contrast | None:
+        return contrast(a, b, rms=metric.rms, interval=interval, alike=self.logs)
+
     def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
         key = (metric.key, variant)
         if key not in self._pooled:
-            self._pooled[key] = pooled(scores, rms=metric.rms)
+            self._pooled[key] = pooled(scores, rms=metric.rms, alike=self.logs)
         return self._pooled[key]
 
     def _variant(self, row: Row, several: set[str]) -> Variant:

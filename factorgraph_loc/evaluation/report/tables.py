@@ -31,11 +31,17 @@ def name(results: Results, variant: str) -> Html:
 
 def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
     """All logs together: a row a variant, a column a metric, the best of each marked, and how many runs went well."""
+    # that a place was found says something where it had to be looked for
+    is_sought = any(row.get("time_to_localized") for row in results.rows)
     rows = []
     for variant in results.variants:
         cells: list[object] = [_pooled_cell(c, variant) for c in comparisons]
-        rows.append([name(results, variant), *cells, _went_well(results.of(variant))])
-    return table(["", *(c.metric.heading for c in comparisons), "runs that went well"], rows, class_="figures")
+        runs = results.of(variant)
+        if is_sought:
+            cells.append(_share([row.get("time_to_localized") is not None for row in runs]))
+        rows.append([name(results, variant), *cells, _share([row["status"] == "ok" for row in runs])])
+    shares = ["localized before the end"] * is_sought + ["runs that went well"]
+    return table(["", *(c.metric.heading for c in comparisons), *shares], rows, class_="figures")
 
 
 def differences(results: Results, comparisons: Sequence[Comparison]) -> Html:
@@ -147,10 +153,9 @@ def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float 
     return _cell(("● " if is_best else "") + metric.text(value), *lines, class_="best" if is_best else None)
 
 
-def _went_well(rows: Sequence[Row]) -> Html:
-    well = sum(row["status"] == "ok" for row in rows)
-    low, high = wilson(well, len(rows))
-    return _cell(f"{well} of {len(rows)}", f"[{100 * low:.0f}, {100 * high:.0f}] %")
+def _share(held: Sequence[bool]) -> Html:
+    low, high = wilson(sum(held), len(held))
+    return _cell(f"{sum(held)} of {len(held)}", f"[{100 * low:.0f}, {100 * high:.0f}] %")
 
 
 def _cell(value: str, *lines: str, class_: str | None = None) -> Html:
