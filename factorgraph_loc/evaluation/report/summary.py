@@ -63,7 +63,7 @@ def _best(c: Comparison) -> Html:
             )
             for v in worse
         ]
-        parts += ["That of ", _and(told), " is another."]
+        parts += ["It differs significantly from that of ", _and(told), "."]
     missing = [v for v in c.pooled if c.contrasts.get(v) is not None and c.contrasts[v].count < c.pooled[c.best].count]
     if missing:
         parts += [" ", _list(missing), f" {'lacks' if len(missing) == 1 else 'lack'} some of the logs."]
