@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import show
+from factorgraph_loc.cli.manifest import info_of_bag
 from factorgraph_loc.cli.options import (
     DataRoot,
     Json,
@@ -56,10 +57,14 @@ def info(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Show what a log holds, and what looks wrong with it."""
+    """Show what a log holds, and what looks wrong with it; of a ROS bag, its topics."""
     from factorgraph_loc.evaluation.inspect import inspect
     from factorgraph_loc.readers import manifests, read_manifest, verify
+    from factorgraph_loc.readers.bag_file import is_bag
 
+    if reader is None and is_bag(Path(log)) and Path(log).exists():
+        info_of_bag(Path(log), json)
+        return
     known = manifests()
     if reader is None and log in known:
         for fault in verify(read_manifest(known[log]), data_root):
@@ -78,7 +83,9 @@ def info(
 
 def convert(
     log: LogName,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Folder to write, or a ROS bag: a name with .bag, .mcap or .db3.")
+    ],
     format: Annotated[Format, typer.Option(help="Of the tables.")] = Format.csv,
     reader: Reader = None,
     reader_option: ReaderOption = None,
@@ -87,15 +94,22 @@ def convert(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Write a log in the native format: a folder of tables that any program can read."""
+    """Write a log in the native format, a folder of tables that any program can read, or as a ROS bag."""
     from factorgraph_loc.readers import write_native
+    from factorgraph_loc.readers.bag_export import write_bag
+    from factorgraph_loc.readers.bag_file import SUFFIXES
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
-    write_native(loaded, out, format=format.value)
+    if out.suffix in SUFFIXES:
+        files = write_bag(loaded, out)
+        folder = out.parent
+    else:
+        write_native(loaded, out, format=format.value)
+        files, folder = list(out.iterdir()), out
     if json:
-        show.document({"log": loaded.name, "folder": str(out), "files": sorted(path.name for path in out.iterdir())})
+        show.document({"log": loaded.name, "folder": str(folder), "files": sorted(path.name for path in files)})
     else:
         typer.echo(f"wrote {out}")
 

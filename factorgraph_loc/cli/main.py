@@ -17,9 +17,11 @@ from factorgraph_loc.cli import (
     features,
     images,
     inspecting,
+    manifest,
     mapping,
     running,
     simulating,
+    viewing,
 )
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
@@ -62,8 +64,10 @@ app = typer.Typer(
 app.command()(inspecting.datasets)
 app.command()(inspecting.info)
 app.command()(inspecting.convert)
+app.command()(manifest.manifest)
 app.command()(running.run)
 app.command()(running.compare)
+app.command()(viewing.view)
 app.command()(calibrating.calibrate)
 app.command("map")(mapping.map_)
 app.command()(images.images)

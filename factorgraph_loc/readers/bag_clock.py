@@ -12,22 +12,26 @@ from factorgraph_loc.readers.bag_fields import has_header
 from factorgraph_loc.readers.bag_file import Bag, Stamped, Topic
 
 Clock = Literal["header", "receive"]
+TF = "tf2_msgs/msg/TFMessage"
 APART = 0.5  # s: offsets of topics that differ by more come from different clocks, no longer from delays
 
 
 class Stamper:
-    """Stamps of the messages of one topic [ns], by a ``clock``; messages without a header are stamped as they were received."""
+    """Stamps of the messages of one topic [ns], by a ``clock``; messages without a header are stamped as they were received.
+
+    Those of tf have headers within, which :meth:`choose` is for."""
 
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
         self.topic = topic
-        self.has_header = has_header(bag, topic)
+        self._before = has_header(bag, topic)
+        self.has_header = self._before or topic.type == TF
         self._where = f"{bag.path}: topic {topic.name}"
         self._use_header = self.has_header and clock == "header"
         self._delays = array("q")
         self._any_set = False
 
     def stamp(self, item: Stamped) -> int:
-        if not self.has_header:
+        if not self._before:
             return item.received
         return self.choose(item.message.header.stamp, item.received)
 

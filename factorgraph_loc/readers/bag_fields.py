@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.readers.bag_file import Bag, Topic
 
@@ -62,7 +64,7 @@ class Fields:
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
     """InputError with the fields that the topic's messages have, if ``path`` is none of them."""
     known = leaves(store, topic.type)
-    if path not in known:
+    if path not in known and path + LIST not in known:
         raise InputError(f"{where} is {path!r}, which {topic.type} lacks; its fields: {', '.join(known)}")
     if path.count(LIST) > 1:
         raise InputError(f"{where} is {path!r}, a list within a list, expected at most one {LIST}")
@@ -95,10 +97,12 @@ def as_text(value: Any) -> str:
     """A name: a text as it is, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
     if isinstance(value, str):
         return value.strip()
-    if hasattr(value, "tobytes"):
-        return str(value.tobytes().hex()).upper()
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        return value.tobytes().hex().upper()
     if isinstance(value, (bytes, bytearray)):
         return value.hex().upper()
+    if isinstance(value, (np.ndarray, list)):  # the numbers of the markers of a bundle
+        return "-".join(str(part) for part in value)
     return str(value)
 
 

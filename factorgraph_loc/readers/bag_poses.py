@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
+from factorgraph_loc.log import StartPose
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_file import Bag, Stamped
@@ -17,13 +18,13 @@ from factorgraph_loc.readers.bag_rows import Rows
 from factorgraph_loc.trajectory import Integers, Trajectory
 from factors.se2 import Array
 
+WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSES: dict[str, Callable[[Any], Any]] = {
     "nav_msgs/msg/Odometry": attrgetter("pose.pose"),
     "geometry_msgs/msg/PoseStamped": attrgetter("pose"),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": attrgetter("pose.pose"),
+    WITH_COVARIANCE: attrgetter("pose.pose"),
     "geometry_msgs/msg/TransformStamped": attrgetter("transform"),
 }
-TF = "tf2_msgs/msg/TFMessage"
 UNIT = 0.01  # what the length of a quaternion may be off
 
 
@@ -35,6 +36,13 @@ class ReferenceTopic(FileModel):
     parent: str | None = None
     child: str | None = None
     has_heading: bool = True
+    clock: Clock | None = None
+
+
+class StartTopic(FileModel):
+    """A topic whose first pose is a known start, with its covariance."""
+
+    topic: str
     clock: Clock | None = None
 
 
@@ -69,6 +77,33 @@ class Poses:
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading)
 
 
+class Start:
+    """Gathers the first pose with covariance of a topic: where the robot is known to start."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name)
+        if topic.type != WITH_COVARIANCE:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
+        self._source = f"{bag.path} {name}"
+        self._found: tuple[int, Any] | None = None
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._found is None:
+            self._found = (t_ns, item.message.pose)
+
+    def pose(self, t0_ns: int) -> StartPose:
+        """InputError if a variance of x, y or heading is not above zero."""
+        assert self._found is not None
+        t_ns, told = self._found
+        first = np.ones(1, dtype=np.int64)
+        pose = planar(self._source, first, np.array([seven(told.pose)]))[0]
+        variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
+        for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
+            if not 0.0 < variance < np.inf:
+                raise bad_field(self._source, f"covariance {name}", variance, "more than 0", row=1)
+        return StartPose((t_ns - t0_ns) / 1e9, pose, np.sqrt(variances))
+
+
 def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
     """x, y, z [m] and the quaternion x, y, z, w of a pose, or of a transform."""
     p, q = getattr(pose, position), getattr(pose, orientation)
@@ -76,7 +111,15 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
 
 
 def planar(source: str, rows: Integers, table: Array) -> Array:
-    """Poses (N, 3) of positions and quaternions (N, 7). InputError for what is not finite, and a quaternion that is no unit one."""
+    """Poses (N, 3) of positions and quaternions (N, 7), which are checked."""
+    check_rotations(source, rows, table)
+    qx, qy, qz, qw = table[:, 3:].T
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
+    return np.column_stack((table[:, :2], heading))
+
+
+def check_rotations(source: str, rows: Integers, table: Array) -> None:
+    """InputError for a number of positions and quaternions (N, 7) that is not finite, and a quaternion that is no unit one."""
     for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
         checks.require_finite(source, rows, name, table[:, i])
     length = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
@@ -84,6 +127,3 @@ def planar(source: str, rows: Integers, table: Array) -> Array:
     if len(bad):
         i = int(bad[0])
         raise bad_field(source, "length of the quaternion", float(length[i]), "1", row=int(rows[i]))
-    qx, qy, qz, qw = table[:, 3:].T
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    return np.column_stack((table[:, :2], heading))

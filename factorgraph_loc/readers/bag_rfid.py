@@ -24,12 +24,14 @@ SIGNALS = ("rssi", "phase", "frequency")
 
 class RfidTopic(FileModel):
     """``fields``: where a message has the EPC, the antenna, and what else it tells. ``antenna``: the name of the only antenna,
-    where messages do not tell it. ``rounds``: ``message`` where each message holds the reads of one inventory round, none if it
-    read nothing; ``gaps`` where rounds are found from pauses of ``round_gap`` seconds between reads."""
+    where messages do not tell it. ``frames``: those of antennas in tf_static, where they are not their names. ``rounds``:
+    ``message`` where each message holds the reads of one inventory round, none if it read nothing; ``gaps`` where rounds are
+    found from pauses of ``round_gap`` seconds between reads."""
 
     topic: str
     fields: dict[ReadField, str]
     antenna: str | None = None
+    frames: dict[str, str] = Field(default_factory=dict)
     rounds: Literal["gaps", "message"] = "gaps"
     round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
     phase_unit: Literal["rad", "deg"] = "rad"

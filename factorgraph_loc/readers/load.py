@@ -147,6 +147,6 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         metadata={**log.metadata, **source.metadata},
     )
     warnings = list(log.warnings)
-    if log.rig is readers.DEFAULT_RIG:
+    if log.rig.name == readers.DEFAULT_RIG.name:
         warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
     return replace(log, warnings=(*warnings, *checks.look_over(log)))

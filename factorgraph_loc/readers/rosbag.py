@@ -1,36 +1,46 @@
 """ROS bags by a mapping of topics: ``fgloc manifest BAG`` proposes one.
 
-The bag is read once, as a stream; of its messages only the numbers that a log needs are kept.
+The bag is read once, as a stream; of its messages only the numbers that a log needs are kept, and images go to files.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.log import Log, Stream
-from factorgraph_loc.readers import bag_clock
-from factorgraph_loc.readers.bag_clock import Clock, Stamper
+from factorgraph_loc.log import Log, RfidStream, Stream
+from factorgraph_loc.readers import bag_clock, bag_rig
+from factorgraph_loc.readers.bag_camera import CameraTopic, Images, Info
+from factorgraph_loc.readers.bag_clock import TF, Clock, Stamper
 from factorgraph_loc.readers.bag_file import Bag, Stamped, open_bag
+from factorgraph_loc.readers.bag_frames import STATIC, FrameReference, StaticFrames
+from factorgraph_loc.readers.bag_landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
 from factorgraph_loc.readers.bag_motion import ImuTopic, OdometryTopic, YawRates, odometry
-from factorgraph_loc.readers.bag_poses import Poses, ReferenceTopic
+from factorgraph_loc.readers.bag_poses import Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.readers.bag_rfid import Reads, RfidTopic
-from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 
 
 class Options(FileModel):
     """Which topic is which sensor. ``clock``: which stamps count, those of the messages' headers or those of their receipt; a topic
-    may have its own."""
+    may have its own. ``base_frame``: the robot's, of which tf_static says where sensors sit."""
 
     odometry: OdometryTopic
     imu: ImuTopic | None = None
     rfid: RfidTopic | None = None
+    bearing_range: LandmarkTopic | None = None
+    camera: CameraTopic | None = None
+    sightings: PixelTopic | None = None
     reference: ReferenceTopic | None = None
+    start: StartTopic | None = None
     clock: Clock = "header"
+    base_frame: str = "base_link"
 
 
 class Gatherer(Protocol):
@@ -39,66 +49,161 @@ class Gatherer(Protocol):
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
 
-@dataclass(frozen=True)
-class _Ear:
-    """Who listens to a topic, and by which clock."""
+class Listeners:
+    """Who takes the messages of which topic, and by which clock."""
 
-    stamper: Stamper
-    gatherer: Gatherer
+    def __init__(self, bag: Bag, clock: Clock) -> None:
+        self.bag, self.clock = bag, clock
+        self.stampers: list[Stamper] = []
+        self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
+
+    def stamper(self, topic: str, clock: Clock | None) -> Stamper:
+        """By the topic's own clock, or by that of the bag."""
+        return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
+
+    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
+        """``timed``: whether stamps of the topic mean something."""
+        self._of.setdefault(topic, []).append((stamper, gatherer))
+        if timed:
+            self.stampers.append(stamper)
+
+    def run(self) -> None:
+        """Read the bag."""
+        for item in self.bag.messages(list(self._of)):
+            for stamper, gatherer in self._of[item.topic]:
+                gatherer.add(item, stamper.stamp(item))
+        for stamper in self.stampers:
+            stamper.check()
+
+
+@dataclass
+class Gathered:
+    """What takes the messages of each sensor that the manifest names."""
+
+    imu: YawRates | None = None
+    rfid: Reads | None = None
+    bearing_range: Landmarks | None = None
+    camera: Images | None = None
+    info: Info | None = None
+    sightings: PixelsOfPoints | None = None
+    reference: Poses | FrameReference | None = None
+    start: Start | None = None
 
 
 def read(path: Path | None, options: Options) -> Log:
     """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of what is wrong."""
     if path is None:
         raise InputError("rosbag: the path of the bag is missing")
-    with open_bag(path) as bag:
-        return _read(bag, options)
+    with open_bag(path) as bag, ExitStack() as stack:
+        return _read(bag, options, stack)
 
 
-def _read(bag: Bag, options: Options) -> Log:
-    ears: dict[str, list[_Ear]] = {}
-
-    def listen(gatherer: Gatherer, topic: str, clock: Clock | None) -> None:
-        stamper = Stamper(bag, bag.topic(topic), clock or options.clock)
-        ears.setdefault(topic, []).append(_Ear(stamper, gatherer))
-
+def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
+    listeners = Listeners(bag, options.clock)
     motion = odometry(bag, options.odometry)
-    listen(motion, options.odometry.topic, options.odometry.clock)
-    imu = YawRates(bag, options.imu) if options.imu else None
-    if options.imu and imu:
-        listen(imu, options.imu.topic, options.imu.clock)
-    reads = Reads(bag, options.rfid) if options.rfid else None
-    if options.rfid and reads:
-        listen(reads, options.rfid.topic, options.rfid.clock)
-    reference = Poses(bag, options.reference.topic) if options.reference else None
-    if options.reference and reference:
-        listen(reference, options.reference.topic, options.reference.clock)
+    listeners.add(options.odometry.topic, motion, listeners.stamper(options.odometry.topic, options.odometry.clock))
+    frames = StaticFrames()
+    if STATIC in bag.topics and bag.topics[STATIC].type == TF and bag.topics[STATIC].count:
+        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    gathered = _listen(listeners, options)
+    if gathered.camera:
+        stack.callback(gathered.camera.discard)
+    listeners.run()
 
-    for item in bag.messages(list(ears)):
-        for ear in ears[item.topic]:
-            ear.gatherer.add(item, ear.stamper.stamp(item))
-
-    stampers = [ear.stamper for heard in ears.values() for ear in heard]
-    for stamper in stampers:
-        stamper.check()
-    clock, warnings = bag_clock.report(stampers, options.clock)
+    clock, warnings = bag_clock.report(listeners.stampers, options.clock)
     t_ns, moved = motion.stream(warnings)
     t0_ns = int(t_ns[0])
     streams: dict[str, Stream] = {"odometry": moved}
-    if imu:
-        streams["imu"] = imu.stream(t0_ns, warnings)
-    if reads:
-        streams["rfid"] = reads.rounds(warnings).stream(t0_ns)
-    log = Log(
-        name=bag.path.resolve().stem,
-        rig=DEFAULT_RIG,
-        world=World(name=bag.path.resolve().stem),
+    if gathered.imu:
+        streams["imu"] = gathered.imu.stream(t0_ns, warnings)
+    if gathered.rfid:
+        streams["rfid"] = gathered.rfid.rounds(warnings).stream(t0_ns)
+    if gathered.bearing_range:
+        streams["bearing_range"] = gathered.bearing_range.stream(frames, options.base_frame, t0_ns, warnings)
+    if gathered.camera:
+        streams["camera"] = gathered.camera.stream(t0_ns, warnings)
+    if gathered.sightings:
+        streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
+    rig = _rig(streams, gathered, options, frames, warnings)
+    name = bag.path.resolve().stem
+    return Log(
+        name=name,
+        rig=rig,
+        world=World(name=name),
         streams=streams,
+        reference=_reference(gathered, options, frames, t0_ns, warnings),
+        start=gathered.start.pose(t0_ns) if gathered.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={"clock": clock},
     )
-    if options.reference and reference:
-        trajectory = reference.trajectory(t0_ns, options.reference.has_heading, warnings)
-        log = replace(log, reference=trajectory, warnings=tuple(warnings))
-    return log
+
+
+def _listen(listeners: Listeners, options: Options) -> Gathered:
+    """All that the manifest names beside odometry."""
+    bag, out = listeners.bag, Gathered()
+    if options.imu:
+        out.imu = YawRates(bag, options.imu)
+        listeners.add(options.imu.topic, out.imu, listeners.stamper(options.imu.topic, options.imu.clock))
+    if options.rfid:
+        out.rfid = Reads(bag, options.rfid)
+        listeners.add(options.rfid.topic, out.rfid, listeners.stamper(options.rfid.topic, options.rfid.clock))
+    if options.bearing_range:
+        seen = options.bearing_range
+        out.bearing_range = Landmarks(bag, seen)
+        listeners.add(seen.topic, out.bearing_range, listeners.stamper(seen.topic, seen.clock))
+    if options.sightings:
+        out.sightings = PixelsOfPoints(bag, options.sightings)
+        listeners.add(
+            options.sightings.topic,
+            out.sightings,
+            listeners.stamper(options.sightings.topic, options.sightings.clock),
+        )
+    if options.camera:
+        out.camera = Images(bag, options.camera.topic, options.camera.clock or options.clock)
+        if not out.camera.known:
+            listeners.add(
+                options.camera.topic, out.camera, listeners.stamper(options.camera.topic, options.camera.clock)
+            )
+        if options.camera.info:
+            out.info = Info(bag, options.camera.info)
+            listeners.add(options.camera.info, out.info, listeners.stamper(options.camera.info, None), timed=False)
+    if options.reference:
+        topic = options.reference
+        stamper = listeners.stamper(topic.topic, topic.clock)
+        if bag.topic(topic.topic).type != TF:
+            out.reference = Poses(bag, topic.topic)
+        elif topic.parent is None or topic.child is None:
+            raise InputError(f"{bag.path} {topic.topic}: reference.parent and reference.child are missing: two frames")
+        else:
+            out.reference = FrameReference(bag, topic.topic, topic.parent, topic.child, stamper)
+        listeners.add(topic.topic, out.reference, stamper)
+    if options.start:
+        out.start = Start(bag, options.start.topic)
+        listeners.add(options.start.topic, out.start, listeners.stamper(options.start.topic, options.start.clock))
+    return out
+
+
+def _reference(
+    gathered: Gathered, options: Options, frames: StaticFrames, t0_ns: int, warnings: list[str]
+) -> Trajectory | None:
+    if options.reference is None:
+        return None
+    has_heading = options.reference.has_heading
+    if isinstance(gathered.reference, FrameReference):
+        return gathered.reference.trajectory(frames, t0_ns, has_heading, warnings)
+    return None if gathered.reference is None else gathered.reference.trajectory(t0_ns, has_heading, warnings)
+
+
+def _rig(
+    streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, warnings: list[str]
+) -> Rig:
+    """What the bag tells of the robot; a rig of the manifest replaces it."""
+    base = options.base_frame
+    camera = bag_rig.camera_of(gathered.info, frames, base, warnings) if gathered.info else None
+    reads = streams.get("rfid")
+    rfid = None
+    if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
+        rfid = bag_rig.antennas_of(set(reads.antenna), options.rfid.frames, frames, base, warnings)
+    usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
+    return bag_rig.rig_of(usable, camera, rfid)

@@ -1,0 +1,65 @@
+"""``fgloc manifest``, and what ``fgloc info`` says of a ROS bag: its topics, and what they could be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import Json
+
+BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")]
+
+
+def manifest(bag: BagPath) -> None:
+    """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file, and look through it."""
+    from factorgraph_loc.readers.bag_file import open_bag
+    from factorgraph_loc.readers.bag_manifest import manifest_text, propose
+
+    path, here = bag.resolve(), Path.cwd().resolve()
+    below = path.is_relative_to(here)
+    if not below:
+        show.note(f"the manifest names {path.name} alone: put it into {path.parent}, or give --data-root {path.parent}")
+    root = here if below else path.parent
+    stem = path.with_suffix("") if path.is_file() else path
+    beside = {
+        kind: (file.relative_to(root)).as_posix()
+        for kind in ("rig", "world")
+        if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file()
+    }
+    with open_bag(path) as opened:
+        text = manifest_text(opened, propose(opened), path.relative_to(root).as_posix(), beside)
+    typer.echo(text, nl=False)
+
+
+def info_of_bag(bag: Path, json: Json) -> None:
+    """The topics of a bag."""
+    from factorgraph_loc.readers.bag_file import open_bag
+    from factorgraph_loc.readers.bag_manifest import propose
+
+    with open_bag(bag) as opened:
+        uses = propose(opened).uses
+        duration = opened.duration
+        topics = list(opened.topics.values())
+    rates = {t.name: (t.count - 1) / duration if duration > 0.0 and t.count > 1 else None for t in topics}
+    if json:
+        rows = [
+            {"topic": t.name, "type": t.type, "messages": t.count, "rate": rates[t.name], "use": uses.get(t.name)}
+            for t in topics
+        ]
+        show.document({"bag": str(bag), "duration": duration, "topics": rows})
+        return
+    show.fields({"bag": str(bag), "duration": f"{duration:.1f} s"})
+    typer.echo()
+    header = ("topic", "type", "messages", "rate [Hz]", "looks like")
+    show.table(header, [_row(t.name, t.type, t.count, rates[t.name], uses.get(t.name, "")) for t in topics])
+    typer.echo()
+    typer.echo(
+        f"`fgloc manifest {bag} > run.toml` proposes how to read it; then `fgloc info run.toml` shows what it holds"
+    )
+
+
+def _row(name: str, kind: str, count: int, rate: float | None, use: str) -> tuple[str, ...]:
+    return (name, kind, str(count), "" if rate is None else f"{rate:.1f}", use)

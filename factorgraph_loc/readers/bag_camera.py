@@ -1,0 +1,197 @@
+"""Images in a bag: written to the user's cache folder when the bag is first read, one at a time, for a log names files.
+
+Compressed images are written as they are, others as PGM or PPM, whose pixels are those of the message.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import FileModel, parse_model
+from factorgraph_loc.log import ImageStream
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.bag_clock import Clock
+from factorgraph_loc.readers.bag_file import Bag, Stamped
+from factorgraph_loc.trajectory import Integers
+from factorgraph_loc.vision.feature_cache import cache_folder
+from factors.se2 import Array
+
+RAW = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+INFO = "sensor_msgs/msg/CameraInfo"
+MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
+INDEX = "images.csv"
+COLUMNS = ("row", "stamp", "file")
+Pixels = NDArray[Any]
+
+# to channels in the order red, green, blue
+ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
+    "mono8": (np.uint8, 1, lambda p: p),
+    "8UC1": (np.uint8, 1, lambda p: p),
+    "mono16": (np.uint16, 1, lambda p: p),
+    "16UC1": (np.uint16, 1, lambda p: p),
+    "rgb8": (np.uint8, 3, lambda p: p),
+    "bgr8": (np.uint8, 3, lambda p: p[:, :, ::-1]),
+    "8UC3": (np.uint8, 3, lambda p: p[:, :, ::-1]),
+    "rgba8": (np.uint8, 4, lambda p: p[:, :, :3]),
+    "bgra8": (np.uint8, 4, lambda p: p[:, :, 2::-1]),
+    "bayer_rggb8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerRGGB2RGB)),
+    "bayer_bggr8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerBGGR2RGB)),
+    "bayer_gbrg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGBRG2RGB)),
+    "bayer_grbg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGRBG2RGB)),
+}
+
+
+class CameraTopic(FileModel):
+    """A topic of images, and that of its ``info``: lens, size and the frame it sits in."""
+
+    topic: str
+    info: str | None = None
+    clock: Clock | None = None
+
+
+class Images:
+    """Gathers the images of a topic. ``known``: they lie in the cache folder already, so that their messages need not be read."""
+
+    def __init__(self, bag: Bag, name: str, clock: Clock) -> None:
+        topic = bag.topic(name)
+        if topic.type not in {RAW, COMPRESSED}:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {RAW} or {COMPRESSED}")
+        self._source = f"{bag.path} {name}"
+        self._compressed = topic.type == COMPRESSED
+        self._folder = cache_folder() / "bags" / _key(bag.path, name, clock)
+        self._rows: list[tuple[int, int, str]] = []
+        self._temporary: Path | None = None
+        if (self._folder / INDEX).is_file():
+            self._rows = _read_index(self._folder)
+        self.known = bool(self._rows) and all((self._folder / file).is_file() for _, _, file in self._rows)
+        if not self.known:
+            self._rows = []
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._temporary is None:
+            self._folder.parent.mkdir(parents=True, exist_ok=True)
+            self._temporary = Path(tempfile.mkdtemp(prefix=".images.", dir=self._folder.parent))
+        where = f"{self._source}:{item.row}"
+        if self._compressed:
+            content = item.message.data.tobytes()
+            suffix = next((suffix for magic, suffix in MAGIC.items() if content.startswith(magic)), None)
+            if suffix is None:
+                raise InputError(f"{where}: format is {item.message.format!r}, expected JPEG, PNG, WebP or BMP")
+        else:
+            content, suffix = netpbm(item.message, where)
+        file = f"{item.row:06d}{suffix}"
+        (self._temporary / file).write_bytes(content)
+        self._rows.append((item.row, t_ns, file))
+
+    def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
+        """The images by their stamps; those that were written now take their place in the cache folder."""
+        if self._temporary is not None:
+            with (self._temporary / INDEX).open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows([COLUMNS, *self._rows])
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._temporary.replace(self._folder)
+            self._temporary = None
+        rows, t_ns = (np.array([row[i] for row in self._rows], dtype=np.int64) for i in (0, 1))
+        keep = _last_of_each(self._source, rows, t_ns, warnings)
+        return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][2] for i in keep.tolist()])
+
+    def discard(self) -> None:
+        """Leave nothing half-written behind."""
+        if self._temporary is not None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+
+
+class Info:
+    """Gathers the first message that tells of a camera."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name)
+        if topic.type != INFO:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {INFO}")
+        self._source = f"{bag.path} {name}"
+        self._message: Any = None
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._message is None:
+            self._message = item.message
+
+    @property
+    def frame(self) -> str:
+        return str(self._message.header.frame_id)
+
+    def settings(self, mounting: dict[str, float], warnings: list[str]) -> CameraSettings:
+        """The camera, sitting where ``mounting`` says."""
+        info = self._message
+        k: Array = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=float)
+        d: Array = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, dtype=float)
+        lens = np.zeros(4)
+        lens[: min(4, len(d))] = d[:4]
+        if np.any(d[4:]):
+            model = info.distortion_model
+            warnings.append(
+                f"{self._source}: of the lens ({model}) only k1, k2, p1, p2 are taken, the rest is {d[4:].tolist()}"
+            )
+        content = {
+            "width": int(info.width),
+            "height": int(info.height),
+            "fx": float(k[0]),
+            "fy": float(k[4]),
+            "cx": float(k[2]),
+            "cy": float(k[5]),
+            "distortion": tuple(lens.tolist()),
+        }
+        return parse_model(CameraSettings, content | mounting, self._source)
+
+
+def netpbm(image: Any, where: str) -> tuple[bytes, str]:
+    """A raw image as the content of a file, and its suffix. InputError for an encoding that is not read, and missing pixels."""
+    if image.encoding not in ENCODINGS:
+        raise InputError(f"{where}: encoding is {image.encoding!r}, expected one of {', '.join(ENCODINGS)}")
+    kind, channels, convert = ENCODINGS[image.encoding]
+    width, height, step = int(image.width), int(image.height), int(image.step)
+    used = width * channels * np.dtype(kind).itemsize
+    data = np.asarray(image.data, dtype=np.uint8)
+    if len(data) != step * height or step < used:
+        raise InputError(f"{where}: has {len(data)} bytes, expected {height} rows of {max(step, used)}")
+    packed: Pixels = (
+        np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(kind).reshape(height, width, channels)
+    )
+    if kind is np.uint16 and not image.is_bigendian:
+        packed = packed.byteswap()  # Netpbm is big-endian
+    pixels = np.ascontiguousarray(convert(packed[:, :, 0] if channels == 1 else packed))
+    mark, suffix = ("P5", ".pgm") if pixels.ndim == 2 else ("P6", ".ppm")
+    return f"{mark}\n{width} {height}\n{np.iinfo(kind).max}\n".encode() + pixels.tobytes(), suffix
+
+
+def _last_of_each(source: str, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
+    """Indices of the images in order of arrival, of several at one stamp the last."""
+    return checks.sightings_in_order(source, rows, t_ns, ["image"] * len(rows), warnings)
+
+
+def _key(path: Path, topic: str, clock: Clock) -> str:
+    """A name for the images of a topic, another one if the bag changes."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    facts = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    return hashlib.sha256(repr((facts, topic, clock)).encode()).hexdigest()[:24]
+
+
+def _read_index(folder: Path) -> list[tuple[int, int, str]]:
+    """What the index says; nothing if it is damaged."""
+    try:
+        with (folder / INDEX).open(newline="", encoding="utf-8") as file:
+            return [(int(row["row"]), int(row["stamp"]), str(row["file"])) for row in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

@@ -1,0 +1,59 @@
+"""What a bag itself tells of the robot: its camera, and where camera and antennas sit. The rest is as of a robot not known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.readers.bag_camera import Info
+from factorgraph_loc.readers.bag_frames import StaticFrames, angles_of_camera
+from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
+from factorgraph_loc.rig import Rig
+from factors.se2 import Array
+
+
+def camera_of(info: Info, frames: StaticFrames, base: str, warnings: list[str]) -> CameraSettings:
+    """The camera of a ``CameraInfo``, looking ahead from the robot's middle where tf_static does not say where it sits."""
+    pose = frames.pose(info.frame, base)
+    if pose is None:
+        warnings.append(
+            f"camera: tf_static does not say where {info.frame} sits on {base}: taken to look ahead from its origin"
+        )
+        return info.settings({}, warnings)
+    roll, pitch, yaw = angles_of_camera(pose[:3, :3])
+    x, y, z = pose[:3, 3].tolist()
+    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, warnings)
+
+
+def antennas_of(
+    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, warnings: list[str]
+) -> RfidSettings:
+    """Antennas whose frames are ``given``, or have their names; x of such a frame is the boresight."""
+    antennas, unknown = {}, []
+    for name in sorted(names):
+        pose = frames.pose(given.get(name, name), base)
+        if pose is None:
+            unknown.append(name)
+        antennas[name] = AntennaSettings() if pose is None else _antenna(pose)
+    if unknown:
+        warnings.append(
+            f"rfid: tf_static does not say where antennas {', '.join(unknown)} sit: taken to be at the origin of {base}"
+        )
+    return RfidSettings(antennas=antennas)
+
+
+def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
+    """A rig with what is known; the noise of a robot of which nothing is."""
+    # identified pixels are of the camera, which has no settings of another name
+    return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
+
+
+def _antenna(pose: Array) -> AntennaSettings:
+    x, y, z = pose[:3, 3].tolist()
+    ahead = pose[:3, 0]
+    pitch = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
+    return AntennaSettings(x=x, y=y, z=z, yaw=math.atan2(ahead[1], ahead[0]), pitch=pitch)
