@@ -59,7 +59,7 @@ def section(options: ExperimentOptions) -> Report:
         report.failed.append(f"{again} results were made again")
     counts = ", ".join(f"{count} times {how}" for how, count in kills.items())
     report.say(
-        f"kill -9 at {sum(kills.values())} random moments ({counts}) within {finished} experiments of {RUNS} runs, each started "
+        f"`kill -9` at {sum(kills.values())} random moments ({counts}) within {finished} experiments of {RUNS} runs, each started "
         f"again until it was done: {len(report.failed)} faults. All files but {TIMINGS} are those of "
         f"an undisturbed experiment to the byte, and {again} results were made twice."
     )
