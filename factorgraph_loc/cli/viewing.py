@@ -1,0 +1,72 @@
+"""``fgloc view``: results and their log in a viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_loc.cli.options import DataRoot, LogOptions, Reader, ReaderOption, RigFile, WorldFile
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.shipped import manifests
+
+if TYPE_CHECKING:
+    from factorgraph_loc.exports.runs import StoredRun
+    from factorgraph_loc.log import Log
+
+What = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="RUN...|LOG",
+        help="Folders of `fgloc run` or `fgloc compare`, and their log if `fgloc datasets` does not list it; or a log alone.",
+    ),
+]
+
+
+def view(
+    what: What,
+    rrd: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer in place of opening it.")
+    ] = None,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+) -> None:
+    """Look at a log and at runs of it along time, in Rerun."""
+    from factorgraph_loc.exports import rerun_scene
+
+    log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
+    if rrd is None:
+        rerun_scene.show(log, runs)
+        return
+    rerun_scene.write_rrd(log, runs, rrd)
+    typer.echo(f"wrote {rrd}: rerun {rrd} shows it")
+
+
+def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[StoredRun]]:
+    """The log that is named among ``what``, or else the one that all runs there are of, and its runs.
+
+    InputError if there are several logs, or if the log of the runs is not known by its name.
+    """
+    from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
+
+    places = [name for name in what if is_results(Path(name))]
+    logs = [name for name in what if name not in places]
+    if len(logs) > 1:
+        raise InputError(f"{', '.join(logs)} are {len(logs)} logs, expected one log and folders of its results")
+    folders = [run for name in places for run in find_runs(Path(name))]
+    named = sorted({folder.log for folder in folders})
+    if not logs and len(named) > 1:
+        raise InputError(f"{places[0]}: holds runs of {', '.join(named)}, expected one of them to be named too")
+    if not logs and named[0] not in manifests():
+        raise InputError(
+            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be named too"
+        )
+    log = options.load_one(logs[0] if logs else named[0])
+    of_log = [folder for folder in folders if folder.log == log.name]
+    if folders and not of_log:
+        raise InputError(f"{places[0]}: holds runs of {', '.join(named)}, expected some of the log {log.name}")
+    return log, read_runs(of_log, log)

@@ -1,0 +1,331 @@
+"""A log and runs of it as a recording of Rerun (https://rerun.io), to be looked at along the time of the log.
+
+Everything is in the world's frame [m], z up; the time line ``log_time`` counts seconds from the log's start. Everything
+is sent in columns: what is logged piece by piece with ``set_time(duration=...)`` is a file that Rerun 0.41 cannot end. The library
+``rerun-sdk`` is optional, and imported where it is used only.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.exports import scene
+from factorgraph_loc.exports.runs import StoredRun
+from factorgraph_loc.exports.scene import Colour, colours
+from factorgraph_loc.files import replacing
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors import reprojection
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+TIMELINE = "log_time"
+WORLD, PLOTS, EVENTS = "/world", "/plots", "/events"
+REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)  # RGB
+LINE, POINT = 0.02, 0.06  # m: radii
+ARROW = 0.6  # m
+FRUSTUM = 0.4  # m from the camera to its image
+BATCH = 16  # pictures that are sent at once
+NEAREST = 300  # points of the map that are drawn into an image
+
+
+def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
+    """Write a file that ``rerun FILE`` opens.
+
+    InputError where ``rerun-sdk`` is not installed, or an image cannot be read.
+    """
+    recording = _recording()
+    try:
+        with replacing(path) as temporary:
+            recording.save(temporary, _blueprint(log, runs))
+            _record(recording, log, runs)
+            recording.flush()
+            recording.disconnect()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def show(log: Log, runs: Sequence[StoredRun]) -> None:
+    """Open the viewer, or use one that is open; InputError as of :func:`write_rrd`, and without a display."""
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
+    recording = _recording()
+    recording.spawn(default_blueprint=_blueprint(log, runs))
+    _record(recording, log, runs)
+    recording.flush()
+
+
+def _recording() -> rr.RecordingStream:
+    try:
+        import rerun as rr  # noqa: PLC0415 - an optional library
+    except ImportError as error:
+        raise InputError("the viewer needs rerun-sdk: pip install 'factorgraph-loc[viewer]'") from error
+    return rr.RecordingStream("fgloc")
+
+
+def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
+    import rerun as rr  # noqa: PLC0415
+
+    recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    _map(recording, log)
+    if log.reference is not None:
+        _path(recording, f"{WORLD}/reference/path", log.reference, REFERENCE)
+        _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
+    for run, colour in zip(runs, colours(), strict=False):
+        _run(recording, run, colour)
+    _camera(recording, log, runs)
+
+
+def _map(recording: rr.RecordingStream, log: Log) -> None:
+    """Walls, landmarks, tags and points; and which landmarks and tags are lit when."""
+    import rerun as rr  # noqa: PLC0415
+
+    if log.world.walls:
+        walls = np.array(log.world.walls).reshape(-1, 2, 2)
+        lines = np.concatenate((walls, np.zeros((len(walls), 2, 1))), axis=2)
+        recording.log(f"{WORLD}/walls", rr.LineStrips3D(lines, radii=LINE, colors=DARK), static=True)
+    if log.world.points is not None:
+        recording.log(f"{WORLD}/points", rr.Points3D(log.world.points.positions, radii=LINE, colors=DARK), static=True)
+    _lamps(recording, "tags", scene.tag_positions(log), scene.read_tags(log))
+    _lamps(recording, "landmarks", scene.landmark_positions(log), scene.seen_landmarks(log))
+
+
+def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Array], lights: scene.Lights) -> None:
+    import rerun as rr  # noqa: PLC0415
+
+    if not positions:
+        return
+    places = np.array(list(positions.values()))
+    marks = rr.Points3D(places, radii=POINT, colors=DARK, labels=list(positions), show_labels=False)
+    recording.log(f"{WORLD}/{what}", marks, static=True)
+    lit = [[name for name in names if name in positions] for names in lights.names]
+    if any(lit):
+        flat = [name for names in lit for name in names]
+        columns = rr.Points3D.columns(positions=np.array([positions[name] for name in flat]), labels=flat)
+        times = _times(lights.t)
+        recording.send_columns(f"{WORLD}/{what}/lit", times, columns.partition([len(names) for names in lit]))
+        look = rr.Points3D.from_fields(radii=2.0 * POINT, colors=LIT, show_labels=True)
+        recording.log(f"{WORLD}/{what}/lit", look, static=True)
+
+
+def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
+    """What a run estimated, and how far it was off."""
+    import rerun as rr  # noqa: PLC0415
+
+    at = f"{WORLD}/{run.name}"
+    _path(recording, f"{at}/final", run.final, colour)
+    _trail(recording, f"{at}/causal", run.causal, colour)
+    _robot(recording, f"{at}/robot", run.causal if len(run.causal) else run.final, colour)
+    t, outlines = scene.ellipses(run.causal)
+    _lines_over_time(recording, f"{at}/ellipse", t, outlines, colour)
+    if run.landmarks:
+        centres = np.array([point.position for point in run.landmarks.values()])
+        rims = scene.outlines(centres, np.array([point.covariance for point in run.landmarks.values()]))
+        learnt = rr.Points3D(
+            _on_floor(centres), radii=POINT, colors=colour, labels=list(run.landmarks), show_labels=False
+        )
+        recording.log(f"{at}/landmarks", learnt, static=True)
+        recording.log(
+            f"{at}/landmarks/ellipses", rr.LineStrips3D(list(_on_floor(rims)), radii=LINE, colors=colour), static=True
+        )
+    for name, (stamps, values) in run.series.items():
+        if len(stamps):
+            plot = f"{PLOTS}/{name}/{run.name}"
+            recording.log(plot, rr.SeriesLines(colors=colour, names=run.name), static=True)
+            recording.send_columns(plot, _times(stamps), rr.Scalars.columns(scalars=values))
+    if run.events:
+        when, texts = zip(*run.events, strict=True)
+        recording.send_columns(f"{EVENTS}/{run.name}", _times(np.array(when)), rr.TextLog.columns(text=texts))
+
+
+def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
+    """A whole trajectory, at all times."""
+    import rerun as rr  # noqa: PLC0415
+
+    lines = [_on_floor(part) for part in scene.segments(trajectory, MAX_REFERENCE_GAP)]
+    if lines:
+        recording.log(at, rr.LineStrips3D(lines, radii=LINE / 2.0, colors=colour), static=True)
+
+
+def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
+    """The way up to each time: its pieces, of which the view shows those of the past."""
+    positions = trajectory.poses[:, :2]
+    _lines_over_time(recording, at, trajectory.t[1:], np.stack((positions[:-1], positions[1:]), axis=1), colour)
+
+
+def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
+    """One line (L, 2) of ``lines`` (K, L, 2) from each of the times ``t`` (K,) on."""
+    import rerun as rr  # noqa: PLC0415
+
+    if len(t):
+        recording.send_columns(at, _times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
+        recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
+
+
+def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
+    """The robot where it was, as an arrow where its heading is known."""
+    import rerun as rr  # noqa: PLC0415
+
+    if not len(trajectory):
+        return
+    half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))
+    turns = np.column_stack((np.zeros((len(half), 2)), np.sin(half), np.cos(half)))
+    poses = rr.Transform3D.columns(translation=_on_floor(trajectory.poses[:, :2]), quaternion=turns)
+    recording.send_columns(at, _times(trajectory.t), poses)
+    recording.log(f"{at}/place", rr.Points3D([(0.0, 0.0, 0.0)], radii=2.0 * POINT, colors=colour), static=True)
+    if trajectory.has_heading:
+        arrow = rr.Arrows3D(vectors=[(ARROW, 0.0, 0.0)], radii=LINE, colors=colour)
+        recording.log(f"{at}/heading", arrow, static=True)
+
+
+def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
+    """What the camera saw, as a picture before the first robot; identified points in it, and where the map's points should be."""
+    import rerun as rr  # noqa: PLC0415
+
+    settings = log.rig.camera
+    if settings is None or not _has_pictures(log):
+        return
+    model, at, poses = settings.model(), _camera_path(log, runs), _carrier(log, runs)
+    if poses is not None:
+        place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
+        recording.log(at, place, static=True)
+    lens = rr.Pinhole(
+        image_from_camera=model.matrix(),
+        resolution=(model.width, model.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM,
+    )
+    recording.log(at, lens, static=True)
+    for some in _batches(scene.images(log)):
+        _pictures(recording, f"{at}/image", some)
+        if log.world.points is not None and poses is not None:
+            t = np.array([t for t, _ in some])
+            expected = [
+                _expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=MAX_REFERENCE_GAP)
+            ]
+            _pixels_over_time(recording, f"{at}/image/map", t, expected)
+            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
+    seen = list(scene.sightings(log))
+    if seen:
+        labels = [name for _, names, _ in seen for name in names]
+        t = np.array([t for t, _, _ in seen])
+        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in seen], labels)
+        look = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
+        recording.log(f"{at}/image/landmarks", look, static=True)
+
+
+def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
+    while some := list(itertools.islice(pictures, BATCH)):
+        yield some
+
+
+def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
+    import rerun as rr  # noqa: PLC0415
+
+    t, contents = zip(*pictures, strict=True)
+    columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
+    recording.send_columns(at, _times(np.array(t)), columns)
+
+
+def _pixels_over_time(
+    recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
+) -> None:
+    """The points (K, 2) in each picture; the viewer counts pixels from the corner of the first, not from its centre."""
+    import rerun as rr  # noqa: PLC0415
+
+    columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
+    recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
+
+
+def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
+    """The pixels (K, 2) of the nearest ``points`` (P, 3) that are in the picture from ``pose`` (3,), if that is known."""
+    if not np.isfinite(pose).all():
+        return np.empty((0, 2))
+    pixels, depths = reprojection.predict(model, pose, points)
+    visible = np.flatnonzero((depths > 0.0) & model.contains(pixels))
+    return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
+
+
+def _has_pictures(log: Log) -> bool:
+    return "camera" in log.streams or "sightings" in log.streams
+
+
+def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
+    """The poses of the robot whose camera is drawn: of the first run that has some, else the reference."""
+    found = [t for run in runs for t in (run.causal, run.final) if len(t)]
+    return found[0] if found else log.reference
+
+
+def _camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
+    drawn = [run.name for run in runs if len(run.causal) or len(run.final)]
+    name = drawn[0] if drawn else "reference"
+    return f"{WORLD}/{name}/robot/camera" if drawn or log.reference is not None else "/camera"
+
+
+def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
+    """How the viewer is arranged: the plan, seen from above; beside it camera, errors and events, where there are any."""
+    import rerun as rr  # noqa: PLC0415
+    import rerun.blueprint as rrb  # noqa: PLC0415
+
+    past = rrb.VisibleTimeRanges(
+        timeline=TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
+    )
+    centre, size = _extent(log, runs)
+    eye = rrb.EyeControls3D(
+        position=(centre[0], centre[1] - 0.3 * size, 1.1 * size), look_target=(*centre, 0.0), eye_up=(0.0, 0.0, 1.0)
+    )
+    plan = rrb.Spatial3DView(
+        origin=WORLD,
+        name="plan",
+        overrides={f"{WORLD}/{run.name}/causal": past for run in runs},
+        eye_controls=eye,
+    )
+    beside: list[rrb.View] = []
+    if log.rig.camera is not None and _has_pictures(log):
+        beside.append(rrb.Spatial2DView(origin=_camera_path(log, runs), name="camera"))
+    titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
+    beside += [
+        rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title)
+        for name, title in titles.items()
+        if any(len(run.series[name][0]) for run in runs)
+    ]
+    if any(run.events for run in runs):
+        beside.append(rrb.TextLogView(origin=EVENTS, name="events"))
+    whole = rrb.Horizontal(plan, rrb.Vertical(*beside), column_shares=(2, 1)) if beside else plan
+    return rrb.Blueprint(whole, rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+
+
+def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
+    """The middle (2,) of all that is drawn, and its larger side [m]."""
+    parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
+    parts += [p[None, :2] for p in (*scene.tag_positions(log).values(), *scene.landmark_positions(log).values())]
+    if log.reference is not None:
+        parts.append(log.reference.poses[:, :2])
+    points = np.concatenate(parts)
+    if not len(points):
+        return np.zeros(2), 10.0
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2.0, max(float((high - low).max()), 1.0)
+
+
+def _times(t: Array) -> list[rr.TimeColumn]:
+    import rerun as rr  # noqa: PLC0415
+
+    return [rr.TimeColumn(TIMELINE, duration=t)]
+
+
+def _on_floor(points: Array) -> Array:
+    """Points (..., 2) as (..., 3) with z = 0."""
+    return np.concatenate((points, np.zeros((*points.shape[:-1], 1))), axis=-1)

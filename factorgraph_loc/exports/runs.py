@@ -1,0 +1,162 @@
+"""Runs read back from the folders that ``fgloc run`` and ``fgloc compare`` write."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import LearntPoint
+from factorgraph_loc.experiments.output import COVARIANCES, FILES
+from factorgraph_loc.files import read_text, read_toml
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+COMPLETE = FILES[-1]  # written last: where it is, the others are
+OUTSIDE = 60.0  # s that an estimate may lie outside of its log
+SERIES = ("error_position", "error_heading", "nees")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where a run is kept, and what it is of. ``config``: the effective configuration as ``config.toml`` has it."""
+
+    path: Path
+    config: dict[str, Any]
+
+    @property
+    def log(self) -> str:
+        return str(self.config["log"])
+
+    @property
+    def estimator(self) -> str:
+        return str(self.config["estimator"])
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run as it was written; times in seconds from the start of its log.
+
+    ``causal``: the estimates from the first localized one on; ``final``: the best estimate of the whole past; both may be empty.
+    ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) of the causal
+    estimates. ``landmarks``: those that the estimator learnt. ``events``: time and text.
+    """
+
+    name: str
+    folder: RunFolder
+    causal: Trajectory
+    final: Trajectory
+    series: dict[str, tuple[Array, Array]]
+    landmarks: dict[str, LearntPoint]
+    events: tuple[tuple[float, str], ...]
+
+
+def is_results(path: Path) -> bool:
+    """Whether ``path`` is a folder with the results of a run or of a comparison."""
+    return (path / COMPLETE).is_file() or any(path.glob(f"runs/*/*/seed*/{COMPLETE}"))
+
+
+def find_runs(path: Path) -> list[RunFolder]:
+    """The runs below ``path``, a folder of ``fgloc run`` or ``fgloc compare``; InputError if there is none."""
+    folders = (
+        [path] if (path / COMPLETE).is_file() else sorted(p.parent for p in path.glob(f"runs/*/*/seed*/{COMPLETE}"))
+    )
+    if not folders:
+        raise InputError(f"{path}: holds no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
+    return [RunFolder(folder, _config(folder)) for folder in folders]
+
+
+def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
+    """The runs in ``folders``, of ``log``; each is named by its estimator, and by its seed or folder where that is not enough.
+
+    InputError if a run is not of this log, or if one of its files is not as it was written.
+    """
+    names = [folder.estimator for folder in folders]
+    with_seeds = [f"{folder.estimator}-seed{folder.config.get('seed', 0)}" for folder in folders]
+    if len(set(names)) < len(names):
+        names = with_seeds
+    if len(set(names)) < len(names):
+        names = [f"{name}-{folder.path.name}" for name, folder in zip(with_seeds, folders, strict=True)]
+    if len(set(names)) < len(names):
+        raise InputError(f"{folders[0].path}: a run is named twice, expected different ones")
+    return [_read(folder, name, log) for folder, name in zip(folders, names, strict=True)]
+
+
+def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
+    if folder.log != log.name:
+        raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
+    path = folder.path / "estimates.parquet"
+    try:
+        table = pl.read_parquet(path)
+        table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)
+        causal = table.filter(pl.col("kind") == "causal")
+        localized = causal.filter(pl.col("status") == "localized")["t"].min()
+        causal = causal.filter(pl.col("t") >= (np.inf if localized is None else localized), pl.col("x").is_finite())
+        final = table.filter(pl.col("kind") == "final")
+        run = StoredRun(
+            name,
+            folder,
+            _trajectory(causal),
+            _trajectory(final),
+            {key: _series(causal, key) for key in SERIES},
+            _landmarks(folder.path / "learnt.json"),
+            _events(folder.path / "events.csv", log.t0_ns),
+        )
+    except (OSError, pl.exceptions.PolarsError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{folder.path}: cannot be read as results of a run: {' '.join(str(error).split())}"
+        ) from error
+    _check_times(run, log)
+    return run
+
+
+def _check_times(run: StoredRun, log: Log) -> None:
+    """A run of another log of the same name is told by its times."""
+    first, last = log.span()
+    for trajectory in (run.causal, run.final):
+        if len(trajectory) and (trajectory.t[0] < first - OUTSIDE or trajectory.t[-1] > last + OUTSIDE):
+            raise InputError(
+                f"{run.folder.path}: has estimates from {trajectory.t[0]:.1f} s to {trajectory.t[-1]:.1f} s of the log's time, "
+                f"expected some between {first:.1f} s and {last:.1f} s: is it a run of another log {log.name}?"
+            )
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    path = folder / "config.toml"
+    config = read_toml(path)
+    for key in ("log", "estimator"):
+        if not isinstance(config.get(key), str):
+            raise InputError(f"{path}: {key} is {config.get(key)!r}, expected a name")
+    return config
+
+
+def _trajectory(table: pl.DataFrame) -> Trajectory:
+    covariances = np.empty((len(table), 3, 3))
+    for name, (i, j) in COVARIANCES.items():
+        covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return Trajectory(table["t"].to_numpy(), table.select("x", "y", "heading").to_numpy(), covariances)
+
+
+def _series(table: pl.DataFrame, key: str) -> tuple[Array, Array]:
+    known = table.filter(pl.col(key).is_not_null())
+    return known["t"].to_numpy(), known[key].to_numpy()
+
+
+def _landmarks(path: Path) -> dict[str, LearntPoint]:
+    found = {}
+    for name, entry in json.loads(read_text(path))["landmarks"].items():
+        xx, xy, yy = (np.nan if value is None else value for value in entry["covariance"])
+        found[name] = LearntPoint(np.array((entry["x"], entry["y"]), dtype=float), np.array(((xx, xy), (xy, yy))))
+    return found
+
+
+def _events(path: Path, t0_ns: int) -> tuple[tuple[float, str], ...]:
+    table = pl.read_csv(path, schema_overrides={"t_ns": pl.Int64, "event": pl.String})
+    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.select("t_ns", "event").iter_rows())

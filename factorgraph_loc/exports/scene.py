@@ -1,0 +1,149 @@
+"""What viewers draw of a log, whatever the viewer: what is read or seen when, ellipses, images."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation import figures
+from factorgraph_loc.log import BearingRangeStream, ImageStream, Log, RfidStream, SightingStream
+from factorgraph_loc.measurements import PixelSightings
+from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.trajectory import Trajectory
+from factors.se2 import Array
+
+LIT = 0.5  # s that a tag or landmark stays lit after it was read or seen
+CORNERS = 32  # of an ellipse
+SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # sigmas at which a Gaussian of two dimensions holds 95 %
+JPEG_QUALITY = 90
+Colour = tuple[int, int, int]  # red, green, blue of 255
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
+_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Which things are lit from each time on: ``t`` (N,) seconds, ``names``: N tuples."""
+
+    t: Array
+    names: tuple[tuple[str, ...], ...]
+
+
+def colours() -> Iterator[Colour]:
+    """The colour of the first, second, ... run, as in the plots."""
+    for colour in itertools.cycle(figures.COLOURS[:-1]):  # the last is black, as is the ground of viewers
+        red, green, blue = bytes.fromhex(colour[1:])
+        yield red, green, blue
+
+
+def read_tags(log: Log) -> Lights:
+    """The tags that are read, each for :data:`LIT` seconds from when the antenna had it."""
+    stream = log.streams.get("rfid")
+    if not isinstance(stream, RfidStream):
+        return _lights((), ())
+    t = stream.t - stream.age + log.rig.time_offset("rfid")
+    rows = [i for i, epc in enumerate(stream.epc) if epc]
+    return _lights(t[rows].tolist(), [stream.epc[i] for i in rows])
+
+
+def seen_landmarks(log: Log) -> Lights:
+    """The landmarks whose range or bearing is measured, each for :data:`LIT` seconds."""
+    stream = log.streams.get("bearing_range")
+    if not isinstance(stream, BearingRangeStream):
+        return _lights((), ())
+    return _lights((stream.t + log.rig.time_offset("bearing_range")).tolist(), stream.landmark)
+
+
+def tag_positions(log: Log) -> dict[str, Array]:
+    """Where the tags of the map are (3,) [m], by EPC, the survey's errors corrected as the rig knows them."""
+    known = tag_map(log.world, log.rig.survey)
+    return dict(zip(known.names, known.tags.points, strict=True))
+
+
+def landmark_positions(log: Log) -> dict[str, Array]:
+    """Where the landmarks of the map are (3,) [m], on the floor."""
+    return {name: np.array((mark.x, mark.y, 0.0)) for name, mark in log.world.landmarks.items()}
+
+
+def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
+    """Stamps (K,) and closed outlines (K, CORNERS + 1, 2) of the ellipses that hold 95 % of each position's Gaussian.
+
+    Poses without a covariance have none.
+    """
+    if trajectory.covariances is None:
+        return np.empty(0), np.empty((0, CORNERS + 1, 2))
+    covariances = trajectory.covariances[:, :2, :2]
+    known = np.isfinite(covariances).all(axis=(1, 2))
+    return trajectory.t[known], outlines(trajectory.poses[known, :2], covariances[known])
+
+
+def outlines(centres: Array, covariances: Array) -> Array:
+    """Closed outlines (K, CORNERS + 1, 2) of the ellipses that hold 95 % of Gaussians (K, 2), (K, 2, 2)."""
+    variances, axes = np.linalg.eigh(covariances)
+    lengths = SCALE_95 * np.sqrt(np.maximum(variances, 0.0))
+    return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
+
+
+def images(log: Log) -> Iterator[tuple[float, bytes]]:
+    """Time and JPEG of each image of the camera; InputError names one that cannot be read."""
+    stream = log.streams.get("camera")
+    if not isinstance(stream, ImageStream):
+        return
+    for t, file in zip((stream.t + log.rig.time_offset("camera")).tolist(), stream.file, strict=True):
+        yield t, _jpeg(Path(file))
+
+
+def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
+    """Time, names (K) and pixels (K, 2) of the identified points in each image."""
+    stream = log.streams.get("sightings")
+    if not isinstance(stream, SightingStream):
+        return
+    for seen in stream.measurements(log.rig.time_offset("sightings")):
+        assert isinstance(seen, PixelSightings)
+        yield seen.t, seen.points, seen.pixels
+
+
+def _jpeg(file: Path) -> bytes:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    if content.startswith(b"\xff\xd8"):
+        return content
+    picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR) if content else None
+    if picture is None:
+        raise InputError(f"{file}: is no image that can be read")
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+
+
+def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
+    """Each name is lit from each of its times on, for :data:`LIT` seconds."""
+    switches = sorted(
+        s for start, name in zip(t, names, strict=True) for s in ((start, 1, name), (start + LIT, -1, name))
+    )
+    lit: dict[str, int] = {}
+    stamps: list[float] = []
+    shown: list[tuple[str, ...]] = []
+    for i, (at, change, name) in enumerate(switches):
+        lit[name] = lit.get(name, 0) + change
+        if not lit[name]:
+            del lit[name]
+        if i + 1 == len(switches) or switches[i + 1][0] > at:
+            now = tuple(lit)
+            if not shown or set(shown[-1]) != set(now):
+                stamps.append(at)
+                shown.append(now)
+    return Lights(np.array(stamps), tuple(shown))
+
+
+def segments(trajectory: Trajectory, max_gap: float) -> list[Array]:
+    """The paths (K, 2) of a trajectory between gaps above ``max_gap`` seconds."""
+    breaks = [0, *(np.flatnonzero(np.diff(trajectory.t) > max_gap) + 1).tolist(), len(trajectory)]
+    return [trajectory.poses[i:j, :2] for i, j in itertools.pairwise(breaks) if j - i > 1]
