@@ -21,9 +21,8 @@ def section(options: ExperimentOptions) -> Report:
     started = time.perf_counter()
     page = report_experiment(prepared)
     taken, size = time.perf_counter() - started, page.stat().st_size
-    report.say(
-        f"The page of {options.many_runs} runs, of one estimator on one short log, is made in {taken:.1f} s and has {size / 1e6:.1f} MB."
-    )
+    runs = f"{options.many_runs} runs, of one estimator on one short log"
+    report.say(f"The page of {runs}, is made in {taken:.1f} s and has {size / 1e6:.1f} MB.")
     if taken > SECONDS or size > BYTES:
         report.failed.append(f"the page takes more than {SECONDS:.0f} s or {BYTES / 1e6:.0f} MB")
     return report
