@@ -132,7 +132,7 @@ class Info:
     def frame(self) -> str:
         return str(self._message.header.frame_id)
 
-    def settings(self, mounting: dict[str, float], warnings: list[str]) -> CameraSettings:
+    def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
         """The camera, sitting where ``mounting`` says."""
         info = self._message
         k: Array = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=float)
@@ -140,10 +140,7 @@ class Info:
         lens = np.zeros(4)
         lens[: min(4, len(d))] = d[:4]
         if np.any(d[4:]):
-            model = info.distortion_model
-            warnings.append(
-                f"{self._source}: of the lens ({model}) only k1, k2, p1, p2 are taken, the rest is {d[4:].tolist()}"
-            )
+            notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are taken, not {d[4:].tolist()}")
         content = {
             "width": int(info.width),
             "height": int(info.height),

@@ -12,7 +12,7 @@ from factorgraph_loc.readers.bag_fields import has_header
 from factorgraph_loc.readers.bag_file import Bag, Stamped, Topic
 
 Clock = Literal["header", "receive"]
-TF = "tf2_msgs/msg/TFMessage"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
 APART = 0.5  # s: offsets of topics that differ by more come from different clocks, no longer from delays
 
 
@@ -24,7 +24,7 @@ class Stamper:
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
         self.topic = topic
         self._before = has_header(bag, topic)
-        self.has_header = self._before or topic.type == TF
+        self.has_header = self._before or topic.type in TF
         self._where = f"{bag.path}: topic {topic.name}"
         self._use_header = self.has_header and clock == "header"
         self._delays = array("q")

@@ -133,7 +133,7 @@ def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
         out.take("reference", plain[0])
         out.notes.append(f"{plain[0].name} is taken as the reference: leave it out if it is an estimate, not the truth")
     for topic in topics:
-        if topic.type == TF and topic.name != STATIC and not plain:
+        if topic.type in TF and topic.name != STATIC and not plain:
             text = (
                 f'[options.reference] topic = "{topic.name}", parent = "map", child = "base_link" would take it from tf'
             )

@@ -16,39 +16,34 @@ from factorgraph_loc.rig import Rig
 from factors.se2 import Array
 
 
-def camera_of(info: Info, frames: StaticFrames, base: str, warnings: list[str]) -> CameraSettings:
-    """The camera of a ``CameraInfo``, looking ahead from the robot's middle where tf_static does not say where it sits."""
+def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> CameraSettings:
+    """The camera of a ``CameraInfo``, looking ahead from the robot's origin where tf_static does not say where it sits."""
     pose = frames.pose(info.frame, base)
     if pose is None:
-        warnings.append(
-            f"camera: tf_static does not say where {info.frame} sits on {base}: taken to look ahead from its origin"
-        )
-        return info.settings({}, warnings)
+        notes.append(f"where {info.frame} sits on {base} is not told, the camera is taken to look ahead from there")
+        return info.settings({}, notes)
+    notes.append("where the camera sits is told by tf_static")
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
-    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, warnings)
+    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
 
 
 def antennas_of(
-    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, warnings: list[str]
+    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, notes: list[str]
 ) -> RfidSettings:
     """Antennas whose frames are ``given``, or have their names; x of such a frame is the boresight."""
-    antennas, unknown = {}, []
-    for name in sorted(names):
-        pose = frames.pose(given.get(name, name), base)
-        if pose is None:
-            unknown.append(name)
-        antennas[name] = AntennaSettings() if pose is None else _antenna(pose)
-    if unknown:
-        warnings.append(
-            f"rfid: tf_static does not say where antennas {', '.join(unknown)} sit: taken to be at the origin of {base}"
-        )
-    return RfidSettings(antennas=antennas)
+    poses = {name: frames.pose(given.get(name, name), base) for name in sorted(names)}
+    for is_told, text in (
+        (True, "where antennas {} sit is told by tf_static"),
+        (False, "where antennas {} sit is not told, they are taken to be at the origin of {}"),
+    ):
+        if which := [name for name, pose in poses.items() if (pose is not None) == is_told]:
+            notes.append(text.format(", ".join(which), base))
+    return RfidSettings(antennas={name: AntennaSettings() if p is None else _antenna(p) for name, p in poses.items()})
 
 
 def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
     """A rig with what is known; the noise of a robot of which nothing is."""
-    # identified pixels are of the camera, which has no settings of another name
     return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
 
 

@@ -103,7 +103,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     motion = odometry(bag, options.odometry)
     listeners.add(options.odometry.topic, motion, listeners.stamper(options.odometry.topic, options.odometry.clock))
     frames = StaticFrames()
-    if STATIC in bag.topics and bag.topics[STATIC].type == TF and bag.topics[STATIC].count:
+    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
         listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
     gathered = _listen(listeners, options)
     if gathered.camera:
@@ -124,7 +124,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         streams["camera"] = gathered.camera.stream(t0_ns, warnings)
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
-    rig = _rig(streams, gathered, options, frames, warnings)
+    notes: list[str] = []  # of the bag's own rig, which one of the manifest replaces
+    rig = _rig(streams, gathered, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
         name=name,
@@ -135,7 +136,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         start=gathered.start.pose(t0_ns) if gathered.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata={"clock": clock},
+        metadata={"clock": clock} | ({"robot in the bag": "; ".join(notes)} if notes else {}),
     )
 
 
@@ -171,7 +172,7 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
     if options.reference:
         topic = options.reference
         stamper = listeners.stamper(topic.topic, topic.clock)
-        if bag.topic(topic.topic).type != TF:
+        if bag.topic(topic.topic).type not in TF:
             out.reference = Poses(bag, topic.topic)
         elif topic.parent is None or topic.child is None:
             raise InputError(f"{bag.path} {topic.topic}: reference.parent and reference.child are missing: two frames")
@@ -196,14 +197,14 @@ def _reference(
 
 
 def _rig(
-    streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, warnings: list[str]
+    streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, notes: list[str]
 ) -> Rig:
     """What the bag tells of the robot; a rig of the manifest replaces it."""
     base = options.base_frame
-    camera = bag_rig.camera_of(gathered.info, frames, base, warnings) if gathered.info else None
+    camera = bag_rig.camera_of(gathered.info, frames, base, notes) if gathered.info else None
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
-        rfid = bag_rig.antennas_of(set(reads.antenna), options.rfid.frames, frames, base, warnings)
+        rfid = bag_rig.antennas_of(set(reads.antenna), options.rfid.frames, frames, base, notes)
     usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
     return bag_rig.rig_of(usable, camera, rfid)

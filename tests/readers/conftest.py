@@ -109,6 +109,8 @@ class BagMaker:
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
         self.store.register(get_types_from_msg(READS, "shop_msgs/msg/Reads"))
         if self.ros1:
+            frames = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(frames, "tf2_msgs/msg/TFMessage"))
             self.writer = rosbag1.Writer(path)
         else:
             self.writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
