@@ -22,12 +22,15 @@ PIXELS = ("t_ns", "landmark", "u", "v")
 FOLDER = "camera"
 
 
-def make_images(table: Table, t0_ns: int, warnings: list[str]) -> ImageStream:
-    """The images that there are, in order of arrival; of several at one stamp the last.
+def make_images(table: Table, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
+    """The images that there are, in order of arrival; of several at one stamp the last. They lie below ``folder``, by default that
+    of the native format.
 
-    InputError for a path that leaves the log's folder, and a stamp that is late by more than 0.5 s."""
+    InputError for a path that leaves the folder, and a stamp that is late by more than 0.5 s."""
     checks.arrivals(table.path, table.rows, table.t_ns, warnings)
-    paths = [_image(table.path, row, name) for row, name in zip(table.rows.tolist(), table.names["file"], strict=True)]
+    within = table.path.parent / FOLDER if folder is None else folder
+    named = zip(table.rows.tolist(), table.names["file"], strict=True)
+    paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]
     last = {t: i for i, t in enumerate(table.t_ns.tolist())}
     if dropped := len(paths) - len(last):
         warnings.append(f"{table.path}: {dropped} rows have the stamp of a later row and are left out")
@@ -72,10 +75,10 @@ def write_images(files: Sequence[Path], folder: Path) -> list[str]:
     return names
 
 
-def _image(table: Path, row: int, name: str) -> Path | None:
-    """The path of an image below the log's folder; None if there is no such file."""
+def _image(folder: Path, source: str, name: str) -> Path | None:
+    """The path of an image below ``folder``; None if there is no such file."""
     try:
-        path = inside(table.parent, f"{FOLDER}/{name}", f"{table}:{row}")
+        path = inside(folder, name, source)
         return path if path.is_file() else None
     except (OSError, ValueError):  # no name that a file could have
         return None

@@ -15,6 +15,7 @@ from factorgraph_loc.rig import BearingRangeSettings, Rig
 
 READERS: dict[str, str] = {
     "native": "factorgraph_loc.readers.native",
+    "mapped": "factorgraph_loc.readers.mapped",
     "mrclam": "factorgraph_loc.readers.mrclam",
     "plaza": "factorgraph_loc.readers.plaza",
     "rf_robot": "factorgraph_loc.readers.rf_robot",

@@ -1,0 +1,141 @@
+"""A folder of tables that other programs wrote, each by a mapping of its columns: what a manifest says in place of a program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, ColumnMapping, read_mapped
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import FileModel, inside
+from factorgraph_loc.log import Log, Stream
+from factorgraph_loc.readers import native
+from factorgraph_loc.readers.mapped_poses import (
+    OdometryFile,
+    Offset,
+    ReferenceFile,
+    odometry_stream,
+    read_odometry,
+    read_reference,
+)
+from factorgraph_loc.readers.mapped_rfid import RfidFile, read_inventories, read_reads, texts_of
+from factorgraph_loc.readers.native_camera import make_images
+from factorgraph_loc.readers.native_rfid import Rounds, read_rounds
+from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.readers.tables import NAMES, Table
+from factorgraph_loc.world import World
+
+SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "imu": (("t", "w"),),
+    "bearing_range": (("t", "landmark", "range"), ("t", "landmark", "bearing"), ("t", "landmark", "range", "bearing")),
+    "camera": (("t", "file"),),
+    "sightings": (("t", "landmark", "u", "v"),),
+}
+UNITS = {"w": RATE, "range": LENGTH, "bearing": ANGLE, "u": PURE, "v": PURE}
+
+
+class SensorFile(ColumnMapping):
+    """``clock_offset`` [s]: added to all stamps."""
+
+    clock_offset: Offset = 0.0
+
+
+class ImageFile(SensorFile):
+    """``folder``: where the images lie, by default that of the log."""
+
+    folder: str = "."
+
+
+class InventoryFile(SensorFile):
+    """``columns``: t (the end of a round), antenna, duration. The antennas' names are those of ``rfid``."""
+
+
+class Options(FileModel):
+    """Which file below the folder is which sensor, and the reference. The folder is the manifest's ``path``."""
+
+    odometry: OdometryFile | None = None
+    imu: SensorFile | None = None
+    rfid: RfidFile | None = None
+    inventories: InventoryFile | None = None
+    bearing_range: SensorFile | None = None
+    camera: ImageFile | None = None
+    sightings: SensorFile | None = None
+    reference: ReferenceFile | None = None
+
+
+def read(path: Path | None, options: Options) -> Log:
+    """The log in the folder ``path``; t = 0 at its first stamp. InputError names file, row and column of what is wrong."""
+    if path is None or not path.is_dir():
+        raise InputError(f"{path}: is no folder: path in the manifest names the folder of the log's files")
+    if options.odometry is None:
+        raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
+    warnings: list[str] = []
+    odometry_path = inside(path, options.odometry.file, path)
+    odometry_t_ns, moves, increments = read_odometry(odometry_path, options.odometry, warnings)
+    tables = {
+        sensor: _table(inside(path, mapping.file, path), sensor, mapping, warnings)
+        for sensor in SHAPES
+        if (mapping := getattr(options, sensor)) is not None
+    }
+    rounds = _rounds(path, options, warnings)
+    stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
+    t0_ns = min(int(t_ns.min()) for t_ns in stamps)
+    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
+    for sensor, table in tables.items():
+        if sensor == "camera" and options.camera is not None:
+            streams[sensor] = make_images(table, t0_ns, warnings, inside(path, options.camera.folder, path))
+        else:
+            streams[sensor] = native.make_stream(sensor, table, t0_ns, warnings)
+    if rounds:
+        streams["rfid"] = rounds.stream(t0_ns)
+    reference = None
+    if (told := options.reference) is not None:
+        times = None if told.times is None else inside(path, told.times, path)
+        reference = read_reference(inside(path, told.file, path), times, told, t0_ns, warnings)
+        if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
+            warnings.append(
+                f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
+                f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; look at units.t and clock_offset"
+            )
+    name = path.resolve().name
+    return Log(
+        name=name,
+        rig=DEFAULT_RIG,
+        world=World(name=name),
+        streams=streams,
+        reference=reference,
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+    )
+
+
+def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) -> Table:
+    """A file as the table of that sensor in the native format."""
+    mapped = read_mapped(path, mapping, SHAPES[sensor])
+    if mapped.passed:
+        warnings.append(f"{path}: {mapped.passed} objects without the columns of {sensor} are left out")
+    numbers = {name: mapped.numbers(name, UNITS[name]) for name in mapped.fields if name in UNITS}
+    if sensor == "bearing_range":
+        numbers = {name: numbers.get(name, np.full(len(mapped.rows), np.nan)) for name in ("range", "bearing")}
+    names = {name: texts_of(mapped, name) for name in mapped.fields if name in NAMES}
+    return Table(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+
+
+def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | None:
+    told = options.rfid
+    if told is None:
+        if options.inventories is not None:
+            raise InputError(f"{folder}: [options] has inventories without rfid")
+        return None
+    reads = read_reads(inside(folder, told.file, folder), told, warnings)
+    inventories = None
+    if options.inventories is not None:
+        mapping = options.inventories
+        if told.round_gap is not None:
+            raise InputError(f"{folder}: rfid.round_gap means nothing beside inventories, which tell the rounds")
+        inventories = read_inventories(
+            inside(folder, mapping.file, folder), mapping, mapping.clock_offset, told.antennas
+        )
+    gap = native.ROUND_GAP if told.round_gap is None else told.round_gap
+    return read_rounds(reads, inventories, gap, warnings)

@@ -1,0 +1,117 @@
+"""Odometry and references by a mapping of columns: velocities, motions, poses or the ways of two wheels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, SPEED, ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.log import IncrementStream, VelocityStream
+from factorgraph_loc.readers import checks
+from factorgraph_loc.readers.space_poses import headings_of, read_kitti
+from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows
+from factors import se2
+from factors.se2 import Array
+
+Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION))
+ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
+UNITS = {"v": SPEED, "w": RATE, "heading": ANGLE, "dtheta": ANGLE, **dict.fromkeys(QUATERNION, PURE)}
+
+
+class OdometryFile(ColumnMapping):
+    """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
+    quaternion (poses, of which only the motion between them counts); left, right (ways of the wheels, with their ``track``).
+    ``clock_offset`` [s]: added to all stamps."""
+
+    track: Annotated[float, Field(gt=0.0, le=10.0, description="m between the wheels")] | None = None
+    clock_offset: Offset = 0.0
+
+
+class ReferenceFile(ColumnMapping):
+    """Where the robot really was. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
+
+    format: Literal["columns", "tum", "kitti"] = "columns"
+    columns: dict[str, str] = Field(default_factory=dict)
+    times: str | None = None
+    has_heading: bool = True
+    clock_offset: Offset = 0.0
+
+
+def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tuple[Integers, Array, bool]:
+    """Stamps (N,), and velocities (N, 2) or increments (N, 3) with whether they are the latter. InputError names file and row."""
+    mapped = read_mapped(path, options, ODOMETRY)
+    if ("left" in mapped.fields) != (options.track is not None):
+        raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
+    t_ns, columns = _columns(mapped, options.clock_offset)
+    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
+    t_ns = t_ns[keep]
+    kept = {name: values[keep] for name, values in columns.items()}
+    if "v" in kept:
+        return t_ns, np.column_stack((kept["v"], kept["w"])), False
+    if "dx" in kept:
+        moves = np.column_stack((kept["dx"], kept["dy"], kept["dtheta"]))
+        return t_ns, moves, True
+    if options.track is not None:
+        left, right = np.diff(kept["left"]), np.diff(kept["right"])
+        arc, turn = (left + right) / 2.0, (right - left) / options.track
+        return t_ns, _after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
+    poses = _planar(path, mapped.rows[keep], kept)
+    return t_ns, _after_rest(se2.between(poses[:-1], poses[1:])), True
+
+
+def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int) -> IncrementStream | VelocityStream:
+    t = checks.seconds(t_ns, t0_ns)
+    return IncrementStream(t, *values.T) if increments else VelocityStream(t, *values.T)
+
+
+def read_reference(
+    path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str]
+) -> Trajectory:
+    """The reference in seconds after ``t0_ns``; InputError names file and row of what is wrong."""
+    if options.format != "columns" and (options.columns or options.units):
+        raise InputError(f"{path}: format {options.format} has no columns or units to map")
+    if (options.format == "kitti") != (times is not None):
+        raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
+    shift = round(options.clock_offset * 1e9)
+    if options.format == "tum":
+        rows, t_ns, poses = read_tum_rows(path)
+        t_ns = t_ns + shift
+    elif times is not None:
+        rows, t_ns, space = read_kitti(path, times)
+        t_ns, poses = t_ns + shift, space.planar().poses
+    else:
+        mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
+        if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
+            raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
+        rows = mapped.rows
+        t_ns, columns = _columns(mapped, options.clock_offset)
+        poses = _planar(path, rows, columns)
+    keep = checks.in_order(path, rows, t_ns, warnings)
+    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
+
+
+def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
+    columns = {name: mapped.numbers(name, UNITS.get(name, LENGTH)) for name in mapped.fields if name != "t"}
+    for name, values in columns.items():
+        checks.require_finite(mapped.path, mapped.rows, mapped.mapping.columns[name], values)
+    return mapped.stamps("t", offset), columns
+
+
+def _planar(path: Path, rows: Integers, columns: dict[str, Array]) -> Array:
+    if "qw" in columns:
+        heading = headings_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
+    else:
+        heading = columns.get("heading", np.zeros(len(rows)))
+    return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
+
+
+def _after_rest(moves: Array) -> Array:
+    """Motions (N - 1, 3) as increments (N, 3): the first row only says when the motion begins."""
+    return np.vstack((np.zeros((1, 3)), moves))
