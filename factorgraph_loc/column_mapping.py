@@ -39,6 +39,7 @@ POWER = {"dBm": 1.0, "cdBm": 0.01}
 FREQUENCY = {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6}
 DURATION = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PURE = {"1": 1.0}
+EpcCase = Literal["as written", "upper", "lower"]
 
 
 class ColumnMapping(FileModel):
@@ -138,6 +139,13 @@ def read_mapped(
     if not cells.rows:
         raise InputError(f"{path}: holds no rows")
     return Mapped(cells, mapping, tuple(f for f, column in mapping.columns.items() if column in cells.columns), passed)
+
+
+def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
+    """EPCs in the letters in which log and map are compared."""
+    if case == "as written":
+        return list(epcs)
+    return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]
 
 
 def iso_nanoseconds(text: str) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -73,6 +73,17 @@ class PointMap:
             np.empty((0, 0)),
             np.empty((0, 3)),
             nothing,
+        )
+
+    def with_points(self, others: PointMap, source: object) -> PointMap:
+        """The same with ``others`` that are known by name alone; InputError at a name that is there already."""
+        if double := [name for name in others.names if name in self.index]:
+            raise InputError(f"{source}: the point {double[0]} is there twice, expected names that differ")
+        return replace(
+            self,
+            names=(*self.names, *others.names),
+            positions=np.concatenate((self.positions, others.positions)),
+            covariances=np.concatenate((self.covariances, others.covariances)),
         )
 
 

@@ -8,16 +8,19 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
+from factorgraph_loc.column_mapping import ANGLE, LENGTH, ColumnMapping, EpcCase, in_case, read_mapped
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
+from factorgraph_loc.markers import Marker, corner_points
+from factorgraph_loc.occupancy import read_walls
 from factorgraph_loc.points import POINTS_SUFFIX, PointMap, read_points, write_points
 from factors.se2 import Array
 
@@ -72,6 +75,17 @@ class Tag(FileModel):
     covariance: Covariance | None = None
 
 
+class TagsFile(ColumnMapping):
+    """A table of tags as another program wrote it, with the columns epc, x, y and perhaps z, facing, sigma. ``epc_case``: in which
+    letters EPCs are compared with the reads."""
+
+    epc_case: EpcCase = "as written"
+
+
+class _Markers(FileModel):
+    markers: dict[str, Marker]
+
+
 class World(FileModel):
     """A map. ``landmarks``: by name, as measurements name them. ``tags``: RFID tags by EPC, as they were surveyed: what a rig
     knows of the survey's errors is applied where they are used. ``points``: what a camera sees. ``walls``: segments (x1, y1, x2,
@@ -101,10 +115,19 @@ def read_world(path: Path) -> World:
 
 
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
-    """A map as it stands in a file ``source``; tables that it names lie below ``folder``. InputError as of :func:`read_world`."""
+    """A map as it stands in a file ``source``; tables that it names lie below ``folder``. InputError as of :func:`read_world`.
+
+    ``walls`` may name an occupancy map, ``tags`` a table of another program with the mapping of its columns; the corners of
+    ``markers`` become points.
+    """
     tags = content.get("tags")
     if isinstance(tags, str):
         content = {**content, "tags": read_tags(inside(folder, tags, source))}
+    elif isinstance(tags, dict) and isinstance(tags.get("file"), str):
+        mapping = parse_model(TagsFile, tags, f"{source} [tags]")
+        content = {**content, "tags": read_mapped_tags(inside(folder, mapping.file, source), mapping)}
+    if isinstance(walls := content.get("walls"), str):
+        content = {**content, "walls": read_walls(inside(folder, walls, source))}
     points = content.get("points")
     if points is not None:
         if not isinstance(points, str):
@@ -113,6 +136,11 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
         if not path.exists():
             raise InputError(f"{source}: points names {points!r}, which is missing")
         content = {**content, "points": read_points(path)}
+    if "markers" in content:
+        markers = parse_model(_Markers, {"markers": content["markers"]}, source).markers
+        known = content.get("points")
+        points = corner_points(markers) if known is None else known.with_points(corner_points(markers), source)
+        content = {key: value for key, value in content.items() if key != "markers"} | {"points": points}
     return parse_model(World, content, source)
 
 
@@ -123,16 +151,27 @@ def read_tags(path: Path) -> dict[str, Tag]:
     of the two it hears, and only who surveyed them can.
     """
     cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
-    numbers = {name: cells.numbers(name) for name in shape[1:]}
+    return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name) for name in shape[1:]})
+
+
+def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
+    """Read a table of another program; what is wrong with it is an InputError as of :func:`read_tags`."""
+    mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
+    units = {"facing": ANGLE}
+    numbers = {name: mapped.numbers(name, units.get(name, LENGTH)) for name in mapped.fields if name != "epc"}
+    return _tags(path, mapped.cells.rows, in_case(mapped.texts("epc"), mapping.epc_case), numbers)
+
+
+def _tags(path: Path, rows: Sequence[int], epcs: Sequence[str], numbers: Mapping[str, Array]) -> dict[str, Tag]:
     tags: dict[str, Tag] = {}
-    rows: dict[str, int] = {}
-    for i, (row, epc) in enumerate(zip(cells.rows, cells.columns["epc"], strict=True)):
+    found: dict[str, int] = {}
+    for i, (row, epc) in enumerate(zip(rows, epcs, strict=True)):
         if not epc or epc in tags:
-            expected = f"another EPC than in row {rows[epc]}" if epc else "the EPC of a tag"
+            expected = f"another EPC than in row {found[epc]}" if epc else "the EPC of a tag"
             raise bad_field(path, "epc", epc, expected, row=row)
         values = {name: float(column[i]) for name, column in numbers.items() if not math.isnan(column[i])}
         tags[epc] = parse_model(Tag, values, f"{path}:{row}")
-        rows[epc] = row
+        found[epc] = row
     return tags
 
 

@@ -9,7 +9,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from factorgraph_loc.column_mapping import ANGLE, DURATION, FREQUENCY, POWER, PURE, ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.column_mapping import (
+    ANGLE,
+    DURATION,
+    FREQUENCY,
+    POWER,
+    PURE,
+    ColumnMapping,
+    EpcCase,
+    Mapped,
+    in_case,
+    read_mapped,
+)
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.readers.native_rfid import check_reads
@@ -84,7 +95,7 @@ class RfidFile(ColumnMapping):
     antenna: str | None = None
     antennas: dict[str, str] = Field(default_factory=dict)
     channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")], ...] | Channels | None = None
-    epc_case: Literal["as written", "upper", "lower"] = "as written"
+    epc_case: EpcCase = "as written"
     round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] | None = None
     clock_offset: Annotated[float, Field(ge=-1e10, le=1e10, description="s")] = 0.0
 
@@ -155,12 +166,10 @@ def texts_of(mapped: Mapped, field: str) -> list[str]:
     return list(mapped.texts(field))
 
 
-def _epcs(mapped: Mapped, case: str) -> list[str]:
+def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
     """EPCs as the map writes them: without the marks of Python's bytes, which some versions of sllurp leave."""
     plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts_of(mapped, "epc")]
-    if case == "as written":
-        return plain
-    return [text.upper() if case == "upper" else text.lower() for text in plain]
+    return in_case(plain, case)
 
 
 def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:

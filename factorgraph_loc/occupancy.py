@@ -1,0 +1,97 @@
+"""Occupancy maps of ROS's map_server as walls: an image of cells and a YAML file that says what its greys mean."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import FileModel, inside, parse_model
+from factorgraph_loc.flat_yaml import read_flat_yaml
+from factors import se2
+from factors.se2 import Array
+
+Wall = tuple[float, float, float, float]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+TOLERANCE = 1.0  # cells that a wall may lie off the outline of the occupied cells
+MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
+
+
+class MapFile(FileModel):
+    """What map_server writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
+
+    image: str
+    resolution: Annotated[float, Field(gt=0.0, le=10.0, description="m per cell")]
+    origin: tuple[float, float, float]
+    occupied_thresh: Share = 0.65
+    free_thresh: Share = 0.196
+    negate: Literal[0, 1] = 0
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
+
+
+def read_walls(path: Path) -> tuple[Wall, ...]:
+    """The outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
+
+    They run through the middles of the outermost occupied cells, with corners left out as long as the line stays within a cell of
+    it. InputError names the file and what is wrong.
+    """
+    told = parse_model(MapFile, read_flat_yaml(path), path)
+    if told.free_thresh >= told.occupied_thresh:
+        raise bad_field(path, "free_thresh", told.free_thresh, f"less than occupied_thresh, {told.occupied_thresh:g}")
+    # maps made by a saver name their image without a folder, but nav stacks also write absolute paths
+    image = inside(path.parent, Path(told.image).name if Path(told.image).is_absolute() else told.image, path)
+    occupied = _occupied(image, told)
+    if not occupied.any():
+        raise InputError(
+            f"{image}: has no occupied cells, expected some above occupied_thresh {told.occupied_thresh:g}"
+        )
+    lines = _outlines(occupied)
+    if not len(lines):
+        raise InputError(f"{image}: has only single occupied cells, expected walls of several")
+    height = occupied.shape[0]
+    columns, rows = lines[:, 0::2] + 0.5, height - (lines[:, 1::2] + 0.5)
+    ends = np.stack((columns, rows), axis=-1).reshape(-1, 2) * told.resolution
+    placed: Array = se2.transform_from(np.array(told.origin), ends).reshape(-1, 4)
+    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in np.round(placed, 6).tolist())
+
+
+def _occupied(path: Path, told: MapFile) -> NDArray[np.bool_]:
+    """Which cells (rows, columns) are occupied; a transparent one is unknown."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            # colours count by the mean of their channels, as in map_server
+            channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: is not an image that can be read: {error}") from error
+    values = np.asarray(channels, dtype=np.uint8)
+    grey = values[:, :, :3].mean(axis=2)
+    if told.mode == "raw":  # the occupancy in percent, 255 where it is unknown
+        return np.asarray((grey <= 100.0) & (grey >= 100.0 * told.occupied_thresh))
+    occupancy = grey / 255.0 if told.negate else 1.0 - grey / 255.0
+    opaque = values[:, :, 3] > 0 if values.shape[2] == 4 else np.ones(grey.shape, dtype=bool)
+    return np.asarray((occupancy > told.occupied_thresh) & opaque)
+
+
+def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Segments (W, 4) of column, row, column, row."""
+    import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
+
+    contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    found: dict[tuple[int, int, int, int], None] = {}
+    for contour in contours:
+        if math.hypot(*np.ptp(contour[:, 0], axis=0).tolist()) < MIN_EXTENT:
+            continue
+        corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0].tolist()
+        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if start != end:  # a wall of one cell is followed there and back
+                found[(*min(start, end), *max(start, end))] = None
+    return np.array(list(found), dtype=np.int64).reshape(-1, 4)
