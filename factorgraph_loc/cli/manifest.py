@@ -20,8 +20,6 @@ def manifest(bag: BagPath) -> None:
 
     path, here = bag.resolve(), Path.cwd().resolve()
     below = path.is_relative_to(here)
-    if not below:
-        show.note(f"the manifest names {path.name} alone: put it into {path.parent}, or give --data-root {path.parent}")
     root = here if below else path.parent
     stem = path.with_suffix("") if path.is_file() else path
     beside = {
@@ -31,6 +29,8 @@ def manifest(bag: BagPath) -> None:
     }
     with open_bag(path) as opened:
         text = manifest_text(opened, propose(opened), path.relative_to(root).as_posix(), beside)
+    if not below:
+        show.note(f"the manifest names {path.name} alone: put it into {path.parent}, or give --data-root {path.parent}")
     typer.echo(text, nl=False)
 
 

@@ -31,8 +31,32 @@ NAMES: dict[str, tuple[str, ...]] = {
     "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
     "rssi": ("rssi", "peakrssi", "rssidbm", "signalstrength"),
     "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle", "phasedegrees", "phasedeg", "phaseradians", "phaserad"),
-    "frequency": ("frequency", "freq", "frequencyhz", "frequencykhz", "frequencymhz", "carrier", "channelfrequency"),
-    "stamp": ("firstseen", "firstseenus", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
+    "frequency": (
+        "frequency",
+        "freq",
+        "frequencyhz",
+        "frequencykhz",
+        "frequencymhz",
+        "carrier",
+        "channelfrequency",
+        "channelmhz",
+        "channelkhz",
+    ),
+    "stamp": (
+        "firstseen",
+        "firstseenus",
+        "firstseenms",
+        "firstseentimestamp",
+        "firstseentimestamputc",
+        "readtime",
+        "timestamp",
+    ),
+}
+# the end of a field's name tells its unit, the first that fits
+UNITS = {
+    "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
+    "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
+    "stamp": {"us": "us", "ms": "ms", "ns": "ns"},
 }
 
 
@@ -190,13 +214,20 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
         out.notes.append(f"{topic.name} does not tell antennas apart: all reads are taken as of one, named antenna")
-    if topic.type == ROUND:
-        settings["rounds"] = "message"
     settings |= _units(fields)
+    if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
+        settings["rounds"] = "message"
+        if topic.type != ROUND:
+            out.notes.append(
+                "rfid: each message is taken as one inventory round of its antenna, an empty one as a silent round"
+            )
     out.take("rfid", topic, **settings)
-    if topic.type != ROUND:
-        units = "phase_unit, frequency_unit and stamp_unit"
-        out.notes.append(f'rfid: look at {units}; rounds = "message" if each message is a round of its antenna')
+    if doubtful := [
+        f"{name}_unit" for name in UNITS if name in fields and f"{name}_unit" not in settings and topic.type != ROUND
+    ]:
+        out.notes.append(
+            f"rfid: what is not told by names is taken to be in rad, Hz and us: set {', '.join(doubtful)} if not so"
+        )
     _others(out, "rfid", [other for other, _ in found if other is not topic])
 
 
@@ -217,11 +248,11 @@ def read_fields(paths: Sequence[str]) -> dict[str, str]:
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
     """Units that the names of fields tell."""
     out = {}
-    if "deg" in _plain(fields.get("phase", "")):
-        out["phase_unit"] = "deg"
-    for unit in ("MHz", "kHz"):
-        if _plain(fields.get("frequency", "")).endswith(unit.lower()):
-            out["frequency_unit"] = unit
+    for name, ends in UNITS.items():
+        plain = _plain(fields.get(name, ""))
+        unit = next((unit for end, unit in ends.items() if plain.endswith(end)), None)
+        if unit is not None:
+            out[f"{name}_unit"] = unit
     return out
 
 

@@ -20,9 +20,9 @@ def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> 
     """The camera of a ``CameraInfo``, looking ahead from the robot's origin where tf_static does not say where it sits."""
     pose = frames.pose(info.frame, base)
     if pose is None:
-        notes.append(f"where {info.frame} sits on {base} is not told, the camera is taken to look ahead from there")
+        notes.append(f"tf_static does not tell where {info.frame} sits on {base}")
         return info.settings({}, notes)
-    notes.append("where the camera sits is told by tf_static")
+    notes.append(f"tf_static tells where {info.frame} sits on {base}")
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
     return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
@@ -31,14 +31,11 @@ def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> 
 def antennas_of(
     names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, notes: list[str]
 ) -> RfidSettings:
-    """Antennas whose frames are ``given``, or have their names; x of such a frame is the boresight."""
+    """Antennas whose frames are ``given``, or have their names; x of such a frame is the boresight. Others are at the origin."""
     poses = {name: frames.pose(given.get(name, name), base) for name in sorted(names)}
-    for is_told, text in (
-        (True, "where antennas {} sit is told by tf_static"),
-        (False, "where antennas {} sit is not told, they are taken to be at the origin of {}"),
-    ):
-        if which := [name for name, pose in poses.items() if (pose is not None) == is_told]:
-            notes.append(text.format(", ".join(which), base))
+    for verb, told in (("tells", True), ("does not tell", False)):
+        if which := [name for name, pose in poses.items() if (pose is not None) == told]:
+            notes.append(f"tf_static {verb} where antennas {', '.join(which)} sit on {base}")
     return RfidSettings(antennas={name: AntennaSettings() if p is None else _antenna(p) for name, p in poses.items()})
 
 

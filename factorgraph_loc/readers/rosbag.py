@@ -136,7 +136,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         start=gathered.start.pose(t0_ns) if gathered.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata={"clock": clock} | ({"robot in the bag": "; ".join(notes)} if notes else {}),
+        metadata={"clock": clock} | ({"robot": "; ".join(notes)} if notes else {}),
     )
 
 

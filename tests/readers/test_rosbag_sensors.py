@@ -284,8 +284,8 @@ def test_the_camera_of_the_bag(maker, read):
 def test_a_lens_with_more_terms_and_a_camera_without_a_place(maker, read):
     add_info(maker, **{"d": np.array((0.1, 0.0, 0.0, 0.0, 0.7))})
     add_image(maker, T0, np.zeros((480, 640)), "mono8")
-    told = read(maker, camera=CAMERA).metadata["robot in the bag"]
-    assert "where lens sits on base_link is not told" in told
+    told = read(maker, camera=CAMERA).metadata["robot"]
+    assert "tf_static does not tell where lens sits on base_link" in told
     assert "only k1, k2, p1, p2 are taken, not [0.7]" in told
 
 

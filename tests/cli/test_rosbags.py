@@ -1,0 +1,78 @@
+"""From a bag of a robot that nobody knows to a comparison, as docs/rosbags.md tells, and logs as bags."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.readers import load
+
+EXAMPLE = Path(__file__).parents[2] / "scripts" / "example_bag"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A bag with reads in a message type of its own, a rig and a map beside it."""
+    bag = tmp_path_factory.mktemp("recorded") / "drive.bag"
+    subprocess.run([sys.executable, EXAMPLE, bag, "--seconds", "15"], check=True, capture_output=True)
+    return bag
+
+
+def test_from_a_bag_to_a_comparison(recorded, fgloc, monkeypatch):
+    monkeypatch.chdir(recorded.parent)
+    told = fgloc("info", "drive.bag")
+    assert told.exit_code == 0
+    assert "shop_msgs/msg/TagReport" in told.stdout
+    assert "fgloc manifest drive.bag > run.toml" in told.stdout
+    proposed = fgloc("manifest", "drive.bag")
+    assert (proposed.exit_code, proposed.stderr) == (0, "")
+    Path("run.toml").write_text(proposed.stdout)
+    document = json.loads(fgloc("info", "run.toml", "--json").stdout)
+    assert (document["log"], document["rig"]["name"], document["world"]["tags"]) == ("drive", "cart", 40)
+    assert document["rfid"]["rounds"] == 240
+    compared = fgloc("compare", "run.toml", "-e", "dead_reckoning,smoother", "-o", "out", "--json")
+    assert compared.exit_code == 0
+    error = {row["estimator"]: row["final.position_rmse"] for row in json.loads(compared.stdout)["runs"]}
+    assert error["smoother"] < 0.3
+    assert error["smoother"] < error["dead_reckoning"]
+
+
+def test_topics_as_json(recorded, fgloc):
+    document = json.loads(fgloc("info", recorded, "--json").stdout)
+    uses = {topic["topic"]: (topic["use"], topic["messages"]) for topic in document["topics"]}
+    assert uses == {"/odom": ("odometry", 151), "/mocap/pose": ("reference", 151), "/rfid/tags": ("rfid", 240)}
+
+
+def test_a_manifest_of_a_bag_elsewhere(recorded, fgloc, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    proposed = fgloc("manifest", recorded)
+    assert f"put it into {recorded.parent}, or give --data-root {recorded.parent}" in proposed.stderr
+    assert 'path = "drive.bag"' in proposed.stdout
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
+def test_a_log_as_a_bag(short_log, fgloc, monkeypatch, tmp_path, suffix):
+    monkeypatch.chdir(tmp_path)
+    converted = fgloc("convert", short_log, f"short.{suffix}", "--json")
+    assert json.loads(converted.stdout)["files"] == [f"short.{suffix}", "short.rig.toml", "short.world.toml"]
+    Path("short.toml").write_text(fgloc("manifest", f"short.{suffix}").stdout)
+    (log,), (expected,) = load("short.toml"), load(str(short_log))
+    assert (log.rig, log.world) == (expected.rig, expected.world)
+    np.testing.assert_array_equal(log.streams["bearing_range"].range, expected.streams["bearing_range"].range)
+    again = fgloc("convert", short_log, f"short.{suffix}")
+    assert again.exit_code == 2
+    assert f"short.{suffix}: exists" in again.stderr
+
+
+def test_what_is_no_bag(fgloc, tmp_path):
+    (tmp_path / "drive.bag").write_text("nothing")
+    for command in ("info", "manifest", "run"):
+        found = fgloc(
+            command, tmp_path / "drive.bag", *(["-e", "ekf", "-o", tmp_path / "out"] if command == "run" else [])
+        )
+        assert found.exit_code == 2
+        assert found.stderr.startswith("error: ")
+        assert len(found.stderr.splitlines()) == 1

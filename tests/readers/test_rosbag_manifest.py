@@ -1,0 +1,114 @@
+"""The manifest that is proposed for a bag: which topic is taken for which sensor, and what a person is told to look at."""
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.readers.bag_file import open_bag
+from factorgraph_loc.readers.bag_manifest import manifest_text, propose, read_fields
+
+T0 = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def proposal(tmp_path, bag_maker):
+    """``proposal(fill)``: what is proposed for a bag that ``fill`` writes, and the manifest as it is parsed."""
+
+    def call(fill):
+        with bag_maker(tmp_path / "drive.bag") as made:
+            fill(made)
+        with open_bag(tmp_path / "drive.bag") as bag:
+            found = propose(bag)
+            return found, tomllib.loads(manifest_text(bag, found, "drive.bag", {})), manifest_text(bag, found, "d", {})
+
+    return call
+
+
+def pose_of(made, topic, kind="geometry_msgs/msg/PoseStamped"):
+    made.write(topic, T0, kind, header=made.header(T0), pose=made.pose(0.0, 0.0, 0.0))
+
+
+def test_odometry_and_truth_are_told_apart_by_their_names(proposal):
+    def fill(made):
+        made.odometry("/ground_truth/odom", T0, (0.0, 0.0, 0.0))
+        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
+        made.odometry("/wheel_odom", T0, (0.0, 0.0, 0.0))
+        pose_of(made, "/move_base/goal")
+
+    found, manifest, text = proposal(fill)
+    assert manifest["options"] == {"odometry": {"topic": "/odom"}, "reference": {"topic": "/ground_truth/odom"}}
+    assert "# odometry could also be /wheel_odom" in text
+    assert "#   /move_base/goal (geometry_msgs/msg/PoseStamped, 1 messages)" in text
+    assert found.uses == {"/odom": "odometry", "/ground_truth/odom": "reference"}
+
+
+def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):
+    def fill(made):
+        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
+        pose_of(made, "/robot_pose")
+
+    found, _, text = proposal(fill)
+    assert found.options["reference"] == {"topic": "/robot_pose"}
+    assert "# /robot_pose is taken as the reference: leave it out if it is an estimate, not the truth" in text
+
+
+def test_commands_are_taken_last(proposal):
+    def fill(made):
+        twist = made.twist(1.0, 0.0)
+        made.write("/cmd_vel", T0, "geometry_msgs/msg/Twist", linear=twist.linear, angular=twist.angular)
+
+    found, manifest, text = proposal(fill)
+    assert manifest["options"] == {"clock": "receive", "odometry": {"topic": "/cmd_vel"}}
+    assert "/cmd_vel holds what the robot was told to do" in text
+    assert "no rig is given" in text
+    assert found.uses == {"/cmd_vel": "odometry"}
+
+
+def test_reads_by_the_names_of_fields(proposal):
+    def fill(made):
+        made.reads("/rfid", T0, [("E2AA", 1, -60.0, 0.0, T0)])
+
+    found, _, text = proposal(fill)
+    rfid = found.options["rfid"]
+    assert rfid["fields"] == {
+        "epc": "reads[].epc",
+        "antenna": "reads[].antenna",
+        "rssi": "reads[].rssi",
+        "phase": "reads[].phase_degrees",
+        "stamp": "reads[].first_seen_us",
+    }
+    assert (rfid["phase_unit"], rfid["stamp_unit"]) == ("deg", "us")
+    assert "rounds" not in rfid
+    assert "no topic looks like odometry" in text
+
+
+@pytest.mark.parametrize(
+    ("paths", "expected"),
+    [
+        (
+            ["header.stamp", "tag_id", "antenna_port", "peak_rssi"],
+            {"epc": "tag_id", "antenna": "antenna_port", "rssi": "peak_rssi"},
+        ),
+        (["id", "x"], {}),
+        (["tags[].epc", "tags[].stamp", "port"], {"epc": "tags[].epc", "antenna": "port", "stamp": "tags[].stamp"}),
+        (
+            ["a.tagId", "a.rf_phase_angle", "a.channel_frequency"],
+            {"epc": "a.tagId", "phase": "a.rf_phase_angle", "frequency": "a.channel_frequency"},
+        ),
+    ],
+)
+def test_usual_names_of_fields(paths, expected):
+    assert read_fields(paths) == expected
+
+
+def test_images_and_what_tells_of_their_camera(proposal):
+    def fill(made):
+        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
+        for topic in ("/front/image_raw/compressed", "/front/depth/compressed"):
+            kind = "sensor_msgs/msg/CompressedImage"
+            made.write(topic, T0, kind, header=made.header(T0), format="jpeg", data=np.zeros(3, dtype=np.uint8))
+
+    found, _, text = proposal(fill)
+    assert found.options["camera"] == {"topic": "/front/image_raw/compressed"}
+    assert "no CameraInfo belongs to the images" in text
