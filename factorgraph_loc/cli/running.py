@@ -167,7 +167,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         ]
         show.table(("", *COLUMNS), rows)
     elif not _print_space(scores):
-        typer.echo("there is no reference to score against")
+        typer.echo("there is no reference to score against, or hardly any")
     if scores["aligned.position_rmse"] is not None:
         position, heading = (
             show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))

@@ -25,6 +25,7 @@ from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.se2 import Array
 
+FEWEST_SCORED = 10  # poses: figures of fewer tell nothing of a run
 RPE_DISTANCE = 1.0  # m
 CONFIDENCE = 0.95
 FREE_MAP = "unknown"  # of an estimator's setting ``landmarks``: their positions are estimated
@@ -95,7 +96,7 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where there is nothing to say.
 
     ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
-    a reference. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
+    a reference, or where it is there for fewer than :data:`FEWEST_SCORED` poses. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
     ``causal.space_*`` and ``final.space_*`` (see :func:`~factorgraph_loc.evaluation.space.accuracy`) are None but for estimators
     that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
@@ -109,6 +110,8 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     scores: dict[str, Any] = {}
     for kind, trajectory in (("causal", causal), ("final", final)):
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference)
+        if (figures["scored"] or 0) < FEWEST_SCORED:
+            figures = dict.fromkeys(_ACCURACY) | {"scored": figures["scored"]}
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     for kind, in_space in (("causal", result.causal_space), ("final", result.final_space)):
         figures = space.accuracy(in_space, log.reference3)

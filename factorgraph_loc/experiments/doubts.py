@@ -4,11 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate
+from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
+
+
+def without_neighbours(log: Log) -> tuple[str, ...]:
+    """A reference whose poses lie too far apart to score by."""
+    if log.reference is None or len(log.reference) < 2:
+        return ()
+    gap = float(np.median(np.diff(log.reference.t)))
+    if gap <= MAX_REFERENCE_GAP:
+        return ()
+    return (
+        f"{log.name}: poses of the reference lie {gap:.2f} s apart, expected at most {MAX_REFERENCE_GAP:g} s: "
+        "between them nothing is scored",
+    )
 
 
 def without_tags(log: Log, estimator: str, diagnostics: Diagnostics) -> tuple[str, ...]:

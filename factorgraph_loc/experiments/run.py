@@ -21,7 +21,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator
 from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.experiments.doubts import never_localized, without_points, without_tags
+from factorgraph_loc.experiments.doubts import never_localized, without_neighbours, without_points, without_tags
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, resolve_prior
 from factorgraph_loc.files import nearest
@@ -119,6 +119,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
             *log.warnings,
             *_doubts(log, sensors),
             *unread,
+            *without_neighbours(log),
             *prepared.warnings,
             *without_points(log, sensors, config.estimator, estimator, settings),
             *without_tags(log, config.estimator, estimator.diagnostics),

@@ -154,13 +154,13 @@ def log_of(t, truth):
 
 
 def test_scored_from_the_first_localized():
-    t = np.arange(5) * 0.1
-    poses = np.zeros((5, 3))
+    t = np.arange(14) * 0.1
+    poses = np.zeros((14, 3))
     poses[:2, 0] = 50.0
-    status = ("unlocalized", "ambiguous", "localized", "ambiguous", "localized")
-    scores = score(result_of(t, poses, status), log_of(t, np.zeros((5, 3))))
+    status = ("unlocalized", "ambiguous", "localized", "ambiguous", *("localized",) * 10)
+    scores = score(result_of(t, poses, status), log_of(t, np.zeros((14, 3))))
     assert scores["causal.position_max"] == 0.0
-    assert scores["final.scored"] == scores["causal.scored"] == 3
+    assert scores["final.scored"] == scores["causal.scored"] == 12
     assert scores["time_to_localized"] == pytest.approx(0.2)
 
 

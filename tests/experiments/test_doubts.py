@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import FeatureStream, SightingStream
 from factorgraph_loc.measurements import CameraFrame
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 
 NO_POINTS = "straight: the map has no points that a camera could find: give --world"
@@ -99,3 +101,14 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
     both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
     assert why(both, "bearing_range") == "no landmark of the map was seen"
     assert why(both, "bearing_range", "camera") == "its landmarks and points did not tell the place"
+
+
+def test_a_reference_of_a_few_poses_a_second_is_not_scored_by(log):
+    every = log.reference.t[0] + 0.2 * np.arange(round((log.reference.t[-1] - log.reference.t[0]) / 0.2))
+    sparse = replace(log, reference=Trajectory(every, log.reference.at(every)))
+    result = run(sparse, RunConfig("dead_reckoning", prior="0,0,0"))
+    assert any("poses of the reference lie 0.20 s apart" in warning for warning in result.warnings)
+    scores = score(result, sparse)
+    assert scores["causal.position_rmse"] is None
+    assert 0 < scores["causal.scored"] < FEWEST_SCORED
+    assert not any("of the reference lie" in warning for warning in run(log, RunConfig("dead_reckoning")).warnings)
