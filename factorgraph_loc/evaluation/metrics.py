@@ -96,7 +96,8 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where there is nothing to say.
 
     ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
-    a reference, or where it is there for fewer than :data:`FEWEST_SCORED` poses. ``causal.*`` is None if the run never was localized; ``final.*`` is then scored from its beginning.
+    a reference, or where it is there for fewer than :data:`FEWEST_SCORED` poses. ``causal.*`` is None if the run never was
+    localized; ``final.*`` is then scored from its beginning.
     ``causal.space_*`` and ``final.space_*`` (see :func:`~factorgraph_loc.evaluation.space.accuracy`) are None but for estimators
     that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
