@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import Colour, colours
@@ -154,7 +153,7 @@ def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour
     """A whole trajectory, at all times."""
     import rerun as rr  # noqa: PLC0415
 
-    lines = [_on_floor(part) for part in scene.segments(trajectory, MAX_REFERENCE_GAP)]
+    lines = [_on_floor(part) for part in scene.segments(trajectory)]
     if lines:
         recording.log(at, rr.LineStrips3D(lines, radii=LINE / 2.0, colors=colour), static=True)
 
@@ -212,9 +211,7 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         _pictures(recording, f"{at}/image", some)
         if log.world.points is not None and poses is not None:
             t = np.array([t for t, _ in some])
-            expected = [
-                _expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=MAX_REFERENCE_GAP)
-            ]
+            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=scene.GAP)]
             _pixels_over_time(recording, f"{at}/image/map", t, expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
     seen = list(scene.sightings(log))
@@ -284,7 +281,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     )
     centre, size = _extent(log, runs)
     eye = rrb.EyeControls3D(
-        position=(centre[0], centre[1] - 0.3 * size, 1.1 * size), look_target=(*centre, 0.0), eye_up=(0.0, 0.0, 1.0)
+        position=(centre[0], centre[1] - 0.2 * size, 0.8 * size), look_target=(*centre, 0.0), eye_up=(0.0, 0.0, 1.0)
     )
     plan = rrb.Spatial3DView(
         origin=WORLD,
@@ -303,8 +300,10 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     ]
     if any(run.events for run in runs):
         beside.append(rrb.TextLogView(origin=EVENTS, name="events"))
-    whole = rrb.Horizontal(plan, rrb.Vertical(*beside), column_shares=(2, 1)) if beside else plan
-    return rrb.Blueprint(whole, rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+    shares = [3 if isinstance(part, rrb.Spatial2DView) else 1 for part in beside]
+    column = rrb.Vertical(*beside, row_shares=shares)
+    whole = rrb.Horizontal(plan, column, column_shares=(2, 1)) if beside else plan
+    return rrb.Blueprint(whole, rrb.TimePanel(timeline=TIMELINE, state="collapsed"), collapse_panels=True)
 
 
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:

@@ -20,6 +20,7 @@ from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 LIT = 0.5  # s that a tag or landmark stays lit after it was read or seen
+GAP = 1.0  # s between poses, above which nothing is said of the way between them
 CORNERS = 32  # of an ellipse
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # sigmas at which a Gaussian of two dimensions holds 95 %
 JPEG_QUALITY = 90
@@ -143,7 +144,7 @@ def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
     return Lights(np.array(stamps), tuple(shown))
 
 
-def segments(trajectory: Trajectory, max_gap: float) -> list[Array]:
-    """The paths (K, 2) of a trajectory between gaps above ``max_gap`` seconds."""
-    breaks = [0, *(np.flatnonzero(np.diff(trajectory.t) > max_gap) + 1).tolist(), len(trajectory)]
+def segments(trajectory: Trajectory) -> list[Array]:
+    """The paths (K, 2) of a trajectory between gaps above :data:`GAP`."""
+    breaks = [0, *(np.flatnonzero(np.diff(trajectory.t) > GAP) + 1).tolist(), len(trajectory)]
     return [trajectory.poses[i:j, :2] for i, j in itertools.pairwise(breaks) if j - i > 1]

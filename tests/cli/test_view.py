@@ -1,0 +1,39 @@
+"""``fgloc view``: which log and which runs are meant."""
+
+import pytest
+
+pytest.importorskip("rerun")
+
+
+@pytest.fixture(scope="module")
+def run_folder(short_log, tmp_path_factory):
+    from factorgraph_loc.experiments.output import write_run  # noqa: PLC0415
+    from factorgraph_loc.experiments.run import RunConfig, run  # noqa: PLC0415
+    from factorgraph_loc.readers import load  # noqa: PLC0415
+
+    (log,) = load(str(short_log))
+    out = tmp_path_factory.mktemp("view") / "ekf"
+    write_run(run(log, RunConfig("ekf")), log, out)
+    return out
+
+
+@pytest.mark.parametrize("with_run", [False, True])
+def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run):
+    out = tmp_path / "view.rrd"
+    result = fgloc("view", *([run_folder] if with_run else []), short_log, "--rrd", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == f"wrote {out}: rerun {out} shows it\n"
+    assert out.read_bytes()[:4] == b"RRF2"
+
+
+def test_what_is_not_clear_is_asked_for(fgloc, short_log, run_folder, tmp_path):
+    def error(*args):
+        result = fgloc("view", *args, "--rrd", tmp_path / "view.rrd")
+        assert result.exit_code == 2
+        assert result.stderr.count("\n") == 1
+        return result.stderr
+
+    assert "is of the log short, which `fgloc datasets` does not list" in error(run_folder)
+    assert "are 2 logs, expected one log and folders of its results" in error(short_log, "plaza1")
+    assert "holds runs of short, expected some of the log plaza2" in error("plaza2", run_folder)
+    assert "is neither a file, nor a folder, nor a known data set" in error("nothing")

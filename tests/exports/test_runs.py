@@ -1,0 +1,56 @@
+"""Runs are read back as they were written."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
+
+
+def test_a_run_is_read_as_it_was(log, results):
+    ekf, dead = reversed(read_runs(find_runs(results), log))
+    again = run(log, RunConfig("ekf"))
+    assert (ekf.name, dead.name) == ("ekf", "dead_reckoning")
+    for trajectory, expected in ((ekf.causal, again.causal()), (ekf.final, again.final)):
+        assert np.allclose(trajectory.t, expected.t, atol=1e-9)
+        assert np.allclose(trajectory.poses, expected.poses, atol=1e-12)
+        assert np.allclose(trajectory.covariances, expected.covariances, atol=1e-12)
+    t, errors = ekf.series["error_position"]
+    truth = log.reference.at(t)
+    assert np.allclose(errors, np.hypot(*(ekf.causal.at(t) - truth)[:, :2].T), atol=1e-6)
+    assert ekf.events == ((1.25, "a jump"),)
+
+
+def test_one_run_or_all_of_a_comparison(results):
+    one = results / "runs" / "arc" / "ekf" / "seed0"
+    assert is_results(one)
+    assert [folder.estimator for folder in find_runs(one)] == ["ekf"]
+    assert [folder.estimator for folder in find_runs(results)] == ["dead_reckoning", "ekf"]
+
+
+def test_seeds_and_folders_tell_runs_of_one_estimator_apart(log, results, tmp_path):
+    one = results / "runs" / "arc" / "ekf" / "seed0"
+    shutil.copytree(one, tmp_path / "first")
+    shutil.copytree(one, tmp_path / "second")
+    folders = [*find_runs(tmp_path / "first"), *find_runs(tmp_path / "second")]
+    assert [r.name for r in read_runs(folders, log)] == ["ekf-seed0-first", "ekf-seed0-second"]
+    with pytest.raises(InputError, match="is named twice"):
+        read_runs([folders[0], folders[0]], log)
+
+
+def test_bad_folders(log, results, tmp_path):
+    assert not is_results(tmp_path)
+    with pytest.raises(InputError, match="holds no results, expected a folder that `fgloc run`"):
+        find_runs(tmp_path)
+    with pytest.raises(InputError, match="is a run of the log arc, expected one of hall"):
+        read_runs(find_runs(results), replace(log, name="hall"))
+    with pytest.raises(InputError, match="is it a run of another log arc"):
+        read_runs(find_runs(results), replace(log, t0_ns=0))
+    shutil.copytree(results / "runs" / "arc" / "ekf" / "seed0", tmp_path / "cut")
+    (tmp_path / "cut" / "estimates.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match="cut: cannot be read as results of a run"):
+        read_runs(find_runs(tmp_path / "cut"), log)

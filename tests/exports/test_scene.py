@@ -1,0 +1,82 @@
+"""What viewers draw: lights, ellipses, pictures."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.exports import scene
+from factorgraph_loc.log import ImageStream
+from factorgraph_loc.trajectory import Trajectory
+
+
+def test_tags_are_lit_from_when_the_antenna_had_them(log):
+    lights = scene.read_tags(log)
+    assert np.allclose(lights.t, [1.0, 1.5, 1.8, 2.0, 2.3, 2.5])
+    assert lights.names == (("A",), (), ("A",), ("A", "B"), ("B",), ())
+
+
+def test_a_log_without_reads_has_no_lights(log):
+    assert scene.read_tags(replace(log, streams={})).names == ()
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.sampled_from("abc")), max_size=20))
+def test_lights_are_those_of_the_last_half_second(seen):
+    lights = scene._lights([k / 8 for k, _ in seen], [name for _, name in seen])
+    assert np.all(np.diff(lights.t) > 0.0)
+    for k in range(45):
+        at = k / 8 + 1 / 16  # between the stamps
+        i = np.searchsorted(lights.t, at) - 1
+        lit = set(lights.names[i]) if i >= 0 else set()
+        assert lit == {name for start, name in seen if start / 8 <= at < start / 8 + scene.LIT}
+
+
+def test_an_ellipse_holds_95_percent():
+    covariance = np.array(((0.04, 0.03), (0.03, 0.09)))
+    (outline,) = scene.outlines(np.array([(1.0, 2.0)]), covariance[None])
+    offsets = outline - (1.0, 2.0)
+    distance = np.einsum("ki,ij,kj->k", offsets, np.linalg.inv(covariance), offsets)
+    assert np.allclose(distance, 5.991, atol=1e-3)  # of chi squared with two degrees of freedom
+    assert np.allclose(outline[0], outline[-1])
+
+
+def test_poses_without_a_covariance_have_no_ellipse():
+    covariances = np.array((np.eye(3), np.full((3, 3), np.nan)))
+    t, outlines = scene.ellipses(Trajectory(np.array((0.0, 1.0)), np.zeros((2, 3)), covariances))
+    assert t.tolist() == [0.0]
+    assert np.isfinite(outlines).all()
+    assert len(scene.ellipses(Trajectory(np.zeros(1), np.zeros((1, 3))))[0]) == 0
+
+
+def test_pictures_become_jpegs(log):
+    pictures = list(scene.images(log))
+    assert [t for t, _ in pictures] == [0.5, 1.5, 2.5]
+    for i, (_, content) in enumerate(pictures):
+        picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == (24, 32, 3)
+        assert abs(picture.astype(int) - 80 * i).max() <= 2
+    jpeg = log.streams["camera"].file[0].with_suffix(".jpg")
+    jpeg.write_bytes(pictures[1][1])
+    kept = replace(log, streams={"camera": ImageStream(np.zeros(1), [jpeg])})
+    assert next(scene.images(kept))[1] == pictures[1][1]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(None, "cannot be read"), (b"no picture", "is no image"), (b"", "is no image")]
+)
+def test_a_picture_that_cannot_be_read_is_named(log, tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "p.png").write_bytes(content)
+    bad = replace(log, streams={"camera": ImageStream(np.zeros(1), [tmp_path / "p.png"])})
+    with pytest.raises(InputError, match=f"p.png: {message}"):
+        list(scene.images(bad))
+
+
+def test_a_path_is_cut_at_gaps():
+    t = np.array((0.0, 0.1, 0.2, 5.0, 5.1, 9.0))
+    poses = np.column_stack((t, t, t))
+    assert [len(part) for part in scene.segments(Trajectory(t, poses))] == [3, 2]
