@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.log import BearingRangeStream, SightingStream
+from factorgraph_loc.markers import corner_names
 from factorgraph_loc.readers import checks, native, native_camera
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_fields import Fields, as_number, as_text
@@ -48,8 +49,8 @@ class LandmarkTopic(FileModel):
 
 
 class PixelTopic(FileModel):
-    """Identified points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, in
-    the order of the message."""
+    """Identified points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, as
+    :func:`factorgraph_loc.markers.corner_names` says."""
 
     topic: str
     fields: dict[PixelField, str] | None = None
@@ -135,8 +136,10 @@ class PixelsOfPoints:
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._corners:
             for found in item.message.detections:
-                for i, corner in enumerate(found.corners):
-                    self._names.append(f"{found.family}-{found.id}/{i}")
+                names = corner_names(f"{found.family}-{found.id}")
+                # apriltag begins at the lower left one and goes on to the lower right one
+                for name, corner in zip(reversed(names), found.corners, strict=True):
+                    self._names.append(name)
                     self._rows.append(item, t_ns, (corner.x, corner.y))
             return
         for values in self._fields.rows(item.message, item.row):

@@ -214,7 +214,8 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
         out.notes.append(f"{topic.name} does not tell antennas apart: all reads are taken as of one, named antenna")
-    settings |= _units(fields)
+    if units := _units(fields):
+        settings["units"] = units
     if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
         settings["rounds"] = "message"
         if topic.type != ROUND:
@@ -222,12 +223,9 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
                 "rfid: each message is taken as one inventory round of its antenna, an empty one as a silent round"
             )
     out.take("rfid", topic, **settings)
-    if doubtful := [
-        f"{name}_unit" for name in UNITS if name in fields and f"{name}_unit" not in settings and topic.type != ROUND
-    ]:
-        out.notes.append(
-            f"rfid: what is not told by names is taken to be in rad, Hz and us: set {', '.join(doubtful)} if not so"
-        )
+    doubtful = [name for name in UNITS if name in fields and name not in units and topic.type != ROUND]
+    if doubtful:
+        out.notes.append(f"rfid: {', '.join(doubtful)}: taken to be in rad, Hz and us, set units if not so")
     _others(out, "rfid", [other for other, _ in found if other is not topic])
 
 
@@ -252,7 +250,7 @@ def _units(fields: Mapping[str, str]) -> dict[str, str]:
         plain = _plain(fields.get(name, ""))
         unit = next((unit for end, unit in ends.items() if plain.endswith(end)), None)
         if unit is not None:
-            out[f"{name}_unit"] = unit
+            out[name] = unit
     return out
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.column_mapping import ANGLE, FREQUENCY, POWER, SECONDS, EpcCase, in_case
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.readers import native_rfid
@@ -17,26 +19,25 @@ from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.tables import NAMES, Table
 
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
-UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-FREQUENCY = {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6}
-SIGNALS = ("rssi", "phase", "frequency")
+SIGNALS = {"rssi": POWER, "phase": ANGLE, "frequency": FREQUENCY}
 
 
 class RfidTopic(FileModel):
-    """``fields``: where a message has the EPC, the antenna, and what else it tells. ``antenna``: the name of the only antenna,
-    where messages do not tell it. ``frames``: those of antennas in tf_static, where they are not their names. ``rounds``:
-    ``message`` where each message holds the reads of one inventory round, none if it read nothing; ``gaps`` where rounds are
-    found from pauses of ``round_gap`` seconds between reads."""
+    """``fields``: where a message has the EPC, the antenna, and what else it tells, and their ``units`` where these are not dBm,
+    rad, Hz and us. ``antenna``: the name of the only one, where messages do not tell it. ``antennas``: names in the rig of those of
+    the messages; ``frames``: their frames in tf_static, where these have other names. ``epc_case``: in which letters EPCs are
+    compared with the map. ``rounds``: ``message`` where each message holds the reads of one inventory round, none if it read
+    nothing; ``gaps`` where rounds are found from pauses of ``round_gap`` seconds between reads."""
 
     topic: str
     fields: dict[ReadField, str]
+    units: dict[Literal["rssi", "phase", "frequency", "stamp"], str | float] = Field(default_factory=dict)
     antenna: str | None = None
+    antennas: dict[str, str] = Field(default_factory=dict)
+    epc_case: EpcCase = "as written"
     frames: dict[str, str] = Field(default_factory=dict)
     rounds: Literal["gaps", "message"] = "gaps"
     round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
-    phase_unit: Literal["rad", "deg"] = "rad"
-    frequency_unit: Literal["Hz", "kHz", "MHz"] = "Hz"
-    stamp_unit: Literal["s", "ms", "us", "ns"] = "us"
     clock: Clock | None = None
 
 
@@ -51,6 +52,8 @@ class Reads:
         if ("antenna" in options.fields) == (options.antenna is not None):
             raise InputError(f"{self._source}: expected either fields.antenna, or antenna, the name of the only one")
         topic = bag.topic(options.topic)
+        self._scale = np.array([self._factor(name, units) for name, units in SIGNALS.items()])
+        self._stamp_unit = round(self._factor("stamp", {"us": 1e3} | {k: 10.0**n for k, n in SECONDS.items()}))
         self._fields = Fields(bag, topic, options.fields)
         # the antenna of a message that holds no reads
         self._listening = None
@@ -72,7 +75,7 @@ class Reads:
             self._rows.append(item.row)
             self._t_ns.append(self._stamp(told["stamp"], item.row) if "stamp" in told else t_ns)
             self._epc.append(self._name("epc", told["epc"], item.row))
-            self._antenna.append(self._options.antenna or self._name("antenna", told["antenna"], item.row))
+            self._antenna.append(self._options.antenna or self._antenna_of(told["antenna"], item.row))
             self._signals.append(tuple(as_number(told[name]) if name in told else np.nan for name in SIGNALS))
         if self._options.rounds == "message":
             self._end_rounds(item, t_ns, first)
@@ -83,7 +86,7 @@ class Reads:
         if not antennas and self._options.antenna:
             antennas = [self._options.antenna]
         elif not antennas and self._listening is not None:
-            antennas = [self._name("antenna", self._listening.rows(item.message, item.row)[0][0], item.row)]
+            antennas = [self._antenna_of(self._listening.rows(item.message, item.row)[0][0], item.row)]
         numbers = {name: len(self._end_ns) + i for i, name in enumerate(antennas)}
         self._number += [numbers[name] for name in self._antenna[first:]]
         self._end_ns += [max([t_ns, *self._t_ns[first:]])] * len(antennas)
@@ -97,26 +100,36 @@ class Reads:
             return native_rfid.read_rounds(table, None, self._options.round_gap, warnings)
         signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, self._end_ns))
-        return native_rfid.Rounds(table.t_ns, number, self._epc, signals, end_ns, self._round_antenna)
+        return native_rfid.Rounds(table.t_ns, number, table.names["epc"], signals, end_ns, self._round_antenna)
 
     def _table(self) -> Table:
         signals = np.array(self._signals, dtype=float).reshape(-1, len(SIGNALS))
-        scale = np.array((1.0, np.pi / 180.0, 1.0)) if self._options.phase_unit == "deg" else np.ones(3)
-        scale[2] = FREQUENCY[self._options.frequency_unit]
         return Table(
             path=Path(self._source),  # only named in messages
             rows=np.array(self._rows, dtype=np.int64),
             t_ns=np.array(self._t_ns, dtype=np.int64),
-            numbers=dict(zip(SIGNALS, (signals * scale).T, strict=True)),
-            names={"epc": self._epc, "antenna": self._antenna},
+            numbers=dict(zip(SIGNALS, (signals * self._scale).T, strict=True)),
+            names={"epc": in_case(self._epc, self._options.epc_case), "antenna": self._antenna},
         )
 
     def _stamp(self, value: Any, row: int) -> int:
         try:
-            return as_nanoseconds(value, UNITS[self._options.stamp_unit])
+            return as_nanoseconds(value, self._stamp_unit)
         except (ValueError, OverflowError):
-            expected = f"a time, or a number of {self._options.stamp_unit}"
-            raise bad_field(self._source, "stamp", value, expected, row=row) from None
+            raise bad_field(self._source, "stamp", value, "a time, or a number", row=row) from None
+
+    def _factor(self, field: Any, units: Mapping[str, float]) -> float:
+        """What a field is to be multiplied with, by the first of ``units`` if none is named."""
+        unit = self._options.units.get(field, next(iter(units)))
+        if not isinstance(unit, str):
+            return float(unit)
+        if unit not in units:
+            raise bad_field(self._source, f"units.{field}", unit, f"one of {', '.join(units)}, or a number")
+        return units[unit]
+
+    def _antenna_of(self, value: Any, row: int) -> str:
+        name = self._name("antenna", value, row)
+        return self._options.antennas.get(name, name)
 
     def _name(self, field: ReadField, value: Any, row: int) -> str:
         text = as_text(value)

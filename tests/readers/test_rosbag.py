@@ -18,7 +18,7 @@ FIELDS = {
 }
 OPTIONS = {
     "odometry": {"topic": "/odom"},
-    "rfid": {"topic": "/rfid", "fields": FIELDS, "phase_unit": "deg"},
+    "rfid": {"topic": "/rfid", "fields": FIELDS, "units": {"phase": "deg"}},
     "reference": {"topic": "/truth"},
 }
 KINDS = ["drive.bag", "mcap", "sqlite3"]
@@ -222,3 +222,11 @@ def test_an_unknown_compression(tmp_path, bag_maker, refuse):
 def test_no_bag_at_all(tmp_path, refuse):
     (tmp_path / "drive.txt").write_text("x")
     refuse(tmp_path / "drive.txt", "is no ROS bag, expected a file .bag, .mcap, .db3, or a folder with metadata.yaml")
+
+
+def test_names_and_units_of_the_messages_become_those_of_the_map(mcap, read, refuse):
+    rfid = {"topic": "/rfid", "fields": FIELDS, "antennas": {"1": "front"}, "epc_case": "lower"}
+    reads = read(mcap, rfid=rfid | {"units": {"phase": "deg", "rssi": 0.5}}).streams["rfid"]
+    assert (reads.epc, reads.antenna) == (["e2aa", "e2bb", "e2aa"], ["front", "front", "2"])
+    assert reads.rssi.tolist() == [-30.25, -30.5, -25.0]
+    refuse(mcap, "units.phase is 'degrees', expected one of rad, deg", rfid=rfid | {"units": {"phase": "degrees"}})

@@ -78,7 +78,7 @@ def test_reads_by_the_names_of_fields(proposal):
         "phase": "reads[].phase_degrees",
         "stamp": "reads[].first_seen_us",
     }
-    assert (rfid["phase_unit"], rfid["stamp_unit"]) == ("deg", "us")
+    assert rfid["units"] == {"phase": "deg", "stamp": "us"}
     assert "rounds" not in rfid
     assert "no topic looks like odometry" in text
 

@@ -388,6 +388,6 @@ def test_corners_of_tags(maker, read):
     kind = "apriltag_msgs/msg/AprilTagDetectionArray"
     maker.write("/tags", T0, kind, header=maker.header(T0), detections=[tag])
     seen = read(maker, sightings={"topic": "/tags"}).streams["sightings"]
-    assert seen.point == [f"tag36h11-5/{i}" for i in range(4)]
+    assert seen.point == [f"tag36h11-5/{i}" for i in (3, 2, 1, 0)]  # from the lower left
     assert seen.u.tolist() == [10.0, 11.0, 12.0, 13.0]
     assert seen.v.tolist() == [20.0, 21.0, 22.0, 23.0]
