@@ -15,6 +15,8 @@ from factorgraph_loc.rig import BearingRangeSettings, Rig
 
 READERS: dict[str, str] = {
     "native": "factorgraph_loc.readers.native",
+    "euroc": "factorgraph_loc.readers.euroc",
+    "kitti_odometry": "factorgraph_loc.readers.kitti_odometry",
     "mapped": "factorgraph_loc.readers.mapped",
     "mrclam": "factorgraph_loc.readers.mrclam",
     "plaza": "factorgraph_loc.readers.plaza",
@@ -22,6 +24,7 @@ READERS: dict[str, str] = {
     "rosbag": "factorgraph_loc.readers.rosbag",
     "sevenscenes": "factorgraph_loc.readers.sevenscenes",
     "starry_night": "factorgraph_loc.readers.starry_night",
+    "tum_rgbd": "factorgraph_loc.readers.tum_rgbd",
     "utias_woods": "factorgraph_loc.readers.utias_woods",
 }
 
