@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,32 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.points import PointMap
 from factors.se2 import Array
+
+# AprilTags as tagBITShDISTANCE, others by the side of their grid of bits and how many there are
+MarkerFamily = Literal[
+    "tag16h5",
+    "tag25h9",
+    "tag36h10",
+    "tag36h11",
+    "aruco_original",
+    "aruco_mip_36h12",
+    "4x4_50",
+    "4x4_100",
+    "4x4_250",
+    "4x4_1000",
+    "5x5_50",
+    "5x5_100",
+    "5x5_250",
+    "5x5_1000",
+    "6x6_50",
+    "6x6_100",
+    "6x6_250",
+    "6x6_1000",
+    "7x7_50",
+    "7x7_100",
+    "7x7_250",
+    "7x7_1000",
+]
 
 Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
 # right and up as seen from the front, in the order in which detectors of ArUco markers name them
@@ -39,6 +65,12 @@ class Marker(FileModel):
         """The corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
         turn = Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
         return np.asarray(turn.apply(self.size * CORNERS) + np.array((self.x, self.y, self.z)))
+
+
+class MarkerSettings(FileModel):
+    """Which markers are looked for in a log's images."""
+
+    family: MarkerFamily
 
 
 def corner_names(marker: str) -> list[str]:

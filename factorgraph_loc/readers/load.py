@@ -11,6 +11,7 @@ from typing import Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, nearest, parse_model, read_toml
 from factorgraph_loc.log import Log
+from factorgraph_loc.markers import MarkerSettings
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers import registry as readers
 from factorgraph_loc.readers.bag_file import is_bag
@@ -33,6 +34,7 @@ class _Source:
     rig: Rig | None = None
     world: World | None = None
     start: StartSettings | None = None
+    markers: MarkerSettings | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -129,6 +131,7 @@ def _from_manifest(file: Path, data_root: Path | None) -> _Source:
         rig=None if manifest.rig is None else read_rig(inside(file.parent, manifest.rig, file)),
         world=None if manifest.world is None else read_world(inside(file.parent, manifest.world, file)),
         start=manifest.start,
+        markers=manifest.markers,
         metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
     )
 
@@ -146,6 +149,10 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         start=source.start.pose(log.t0_ns) if source.start else log.start,
         metadata={**log.metadata, **source.metadata},
     )
+    if source.markers is not None:
+        from factorgraph_loc.vision.fiducials import with_markers  # noqa: PLC0415 - few logs need OpenCV to be read
+
+        log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)
     if log.rig.name == readers.DEFAULT_RIG.name:
         warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")

@@ -15,6 +15,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml
 from factorgraph_loc.log import StartPose
+from factorgraph_loc.markers import MarkerSettings
 from factorgraph_loc.shipped import manifests
 
 DATA_ROOT = "FGLOC_DATA"
@@ -39,7 +40,8 @@ class StartSettings(FileModel):
 
 class Manifest(FileModel):
     """What a manifest says. ``path`` and the files of ``checksums`` (sha256) are below the data root, ``rig`` and ``world``
-    below the manifest's folder. ``options`` go to the reader; one whose value is a list makes several logs."""
+    below the manifest's folder. ``options`` go to the reader; one whose value is a list makes several logs. ``markers`` are
+    looked for in the log's images."""
 
     title: str
     reader: str
@@ -50,6 +52,7 @@ class Manifest(FileModel):
     world: str | None = None
     options: Mapping[str, Any] = Field(default_factory=dict)
     start: StartSettings | None = None
+    markers: MarkerSettings | None = None
     checksums: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
 
 
