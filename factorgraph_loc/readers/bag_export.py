@@ -29,6 +29,7 @@ from factorgraph_loc.log import (
 )
 from factorgraph_loc.readers.bag_file import ROS1, SUFFIXES, require_rosbags
 from factorgraph_loc.readers.bag_messages import DEFINITIONS, INITIAL_POSE, LANDMARK, PIXEL, READ, ROUND
+from factorgraph_loc.readers.bag_poses import POINT
 from factorgraph_loc.readers.native import absolute
 from factorgraph_loc.readers.native_rfid import tables_of
 from factorgraph_loc.rig import write_rig
@@ -247,8 +248,11 @@ def _of_rounds(stream: RfidStream, t0_ns: int, build: _Builder) -> Iterator[Mess
 
 
 def _of_reference(reference: Trajectory, t0_ns: int, build: _Builder) -> Iterator[Message]:
-    rows = ({"pose": build.pose(*pose)} for pose in reference.poses.tolist())
     t_ns = absolute(reference.t, t0_ns).tolist()
+    if not reference.has_heading:
+        points = ({"point": build("geometry_msgs/msg/Point", x=x, y=y, z=0.0)} for x, y, _ in reference.poses.tolist())
+        return _stamped("/reference", POINT, t_ns, points, MAP, build)
+    rows = ({"pose": build.pose(*pose)} for pose in reference.poses.tolist())
     return _stamped("/reference", "geometry_msgs/msg/PoseStamped", t_ns, rows, MAP, build)
 
 

@@ -18,7 +18,7 @@ from factorgraph_loc.readers.bag_frames import STATIC
 from factorgraph_loc.readers.bag_landmarks import CORNERS, DETECTIONS
 from factorgraph_loc.readers.bag_messages import INITIAL_POSE, LANDMARK, PIXEL, ROUND
 from factorgraph_loc.readers.bag_motion import IMU, JOINTS, ODOMETRY, TWISTS
-from factorgraph_loc.readers.bag_poses import POSES
+from factorgraph_loc.readers.bag_poses import POINT, POSES
 
 TRUTH = re.compile(
     r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
@@ -146,7 +146,7 @@ def _motion(out: Proposal, topics: Sequence[Topic]) -> None:
 
 
 def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
-    poses = [topic for topic in topics if topic.type in POSES and topic.name not in out.uses]
+    poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     if named:
         out.take("reference", named[0])

@@ -18,6 +18,7 @@ from factorgraph_loc.readers.bag_rows import Rows
 from factorgraph_loc.trajectory import Integers, Trajectory
 from factors.se2 import Array
 
+POINT = "geometry_msgs/msg/PointStamped"
 WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSES: dict[str, Callable[[Any], Any]] = {
     "nav_msgs/msg/Odometry": attrgetter("pose.pose"),
@@ -47,15 +48,15 @@ class StartTopic(FileModel):
 
 
 class Poses:
-    """Gathers the poses of a topic."""
+    """Gathers the poses of a topic; points are poses whose heading means nothing."""
 
     def __init__(self, bag: Bag, name: str) -> None:
         topic = bag.topic(name)
-        if topic.type not in POSES:
-            raise InputError(
-                f"{bag.path}: topic {name} is of type {topic.type}, expected one of {', '.join(sorted(POSES))}"
-            )
-        self._pose = POSES[topic.type]
+        self._are_points = topic.type == POINT
+        if topic.type not in POSES and not self._are_points:
+            known = ", ".join(sorted({*POSES, POINT}))
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected one of {known}")
+        self._pose = POSES.get(topic.type, attrgetter("point"))
         # a transform says translation and rotation where a pose says position and orientation
         self._parts = (
             ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
@@ -63,7 +64,11 @@ class Poses:
         self.rows = Rows(f"{bag.path} {name}", 7)
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        self.rows.append(item, t_ns, seven(self._pose(item.message), *self._parts))
+        pose = self._pose(item.message)
+        if self._are_points:
+            self.rows.append(item, t_ns, (pose.x, pose.y, pose.z, 0.0, 0.0, 0.0, 1.0))
+        else:
+            self.rows.append(item, t_ns, seven(pose, *self._parts))
 
     def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
         """Stamps (N,) and planar poses (N, 3), of equal stamps the last; InputError names the message of what is wrong."""
@@ -74,7 +79,7 @@ class Poses:
 
     def trajectory(self, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
         t_ns, poses = self.in_order(warnings)
-        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading)
+        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading and not self._are_points)
 
 
 class Start:

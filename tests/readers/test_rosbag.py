@@ -1,5 +1,8 @@
 """Bags of all kinds, written by the tests: what is read, left out and refused."""
 
+import sqlite3
+import sys
+
 import numpy as np
 import pytest
 
@@ -230,3 +233,33 @@ def test_names_and_units_of_the_messages_become_those_of_the_map(mcap, read, ref
     assert (reads.epc, reads.antenna) == (["e2aa", "e2bb", "e2aa"], ["front", "front", "2"])
     assert reads.rssi.tolist() == [-30.25, -30.5, -25.0]
     refuse(mcap, "units.phase is 'degrees', expected one of rad, deg", rfid=rfid | {"units": {"phase": "degrees"}})
+
+
+def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
+    """Messages of ROS are known all the same, others cannot be read."""
+    with bag_maker(tmp_path / "drive", "sqlite3") as made:
+        fill(made)
+    with sqlite3.connect(tmp_path / "drive" / "drive.db3") as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    assert len(read(tmp_path / "drive", rfid=None).streams["odometry"].t) == len(POSES)
+    refuse(tmp_path / "drive", "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
+
+
+def test_without_the_library(mcap, refuse, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.interfaces", None)
+    refuse(mcap, "need the library rosbags: pip install 'factorgraph-loc[ros]'")
+
+
+def test_a_folder_whose_metadata_is_damaged(mcap, refuse):
+    (mcap / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 99}")
+    refuse(mcap, "drive: cannot be read as a bag: Rosbag2 version 99 not supported")
+
+
+def test_a_mapping_without_odometry(mcap, refuse):
+    refuse(mcap, "odometry is missing", odometry=None)
+
+
+def test_a_stamp_that_is_no_number(mcap, refuse):
+    fields = FIELDS | {"stamp": "header.frame_id"}
+    refuse(mcap, "drive /rfid:1: stamp is '', expected a time, or a number", rfid={"topic": "/rfid", "fields": fields})

@@ -1,6 +1,6 @@
 """A log becomes a bag and comes back: all of its measurements, whatever they are."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -178,3 +178,11 @@ def test_nothing_is_written_over(log, tmp_path):
     with pytest.raises(InputError, match=r"drive\.rig\.toml: exists"):
         write_bag(log, tmp_path / "drive.mcap")
     assert (tmp_path / "drive.rig.toml").read_text() == "mine"
+
+
+def test_a_reference_without_headings(log, tmp_path):
+    reference = replace(log.reference, has_heading=False)
+    write_bag(replace(log, reference=reference, streams={"odometry": log.streams["odometry"]}), tmp_path / "drive.mcap")
+    found = back(tmp_path / "drive.mcap").reference
+    assert not found.has_heading
+    np.testing.assert_array_equal(found.poses[:, :2], reference.poses[:, :2])

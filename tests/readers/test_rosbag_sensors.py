@@ -1,6 +1,7 @@
 """Each kind of message that a bag may hold, and what is wrong with it now and then."""
 
 import math
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -391,3 +392,20 @@ def test_corners_of_tags(maker, read):
     assert seen.point == [f"tag36h11-5/{i}" for i in (3, 2, 1, 0)]  # from the lower left
     assert seen.u.tolist() == [10.0, 11.0, 12.0, 13.0]
     assert seen.v.tolist() == [20.0, 21.0, 22.0, 23.0]
+
+
+def test_images_pass_through_memory_one_at_a_time(maker, read):
+    """A bag of 24 MB is read in a third of that: a message, its chunk, and what the library keeps of the chunks."""
+    data = np.zeros(400_000, dtype=np.uint8)
+    data[:3] = (0xFF, 0xD8, 0xFF)
+    for i in range(60):
+        header = maker.header(T0 + i * MS)
+        maker.write("/image", T0 + i * MS, "sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=data)
+    maker.writer.close()
+    maker.writer.close = lambda: None
+    tracemalloc.start()
+    images = read(maker, camera={"topic": "/image"}).streams["camera"]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(images.file) == 60
+    assert peak < 8e6
