@@ -7,7 +7,8 @@ three are :mod:`~factorgraph_loc.planning.policies`, the loop is :mod:`~factorgr
 here.
 
 They begin evenly over free space. A scan is weighed a share at a time, with resampling from a kernel density in between
-(progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4).
+(progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4). Their
+number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
+from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
@@ -38,10 +40,11 @@ OUTSIDE = -1.0  # log-weight per motion of a particle that is where no robot can
 KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
 LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
 ONE_PLACE = 1.0  # m: largest standard deviation of a place
+MORE = 5  # times as many particles while they are everywhere
 
 
 class ActiveMclSettings(FilterSettings):
-    """``particles``: their number."""
+    """``particles``: their number where the place is known; while it may be anywhere there are up to :data:`MORE` times as many."""
 
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
 
@@ -77,10 +80,11 @@ class ActiveMcl(Filter):
 
     def _seek(self, m: object) -> Cloud:
         """Evenly over free space and all headings."""
-        cells = np.floor((np.arange(self._count) + self._rng.random()) * len(self._space.centres) / self._count)
-        places = self._space.centres[cells.astype(np.int64)] + CELL * (self._rng.random((self._count, 2)) - 0.5)
+        count = MORE * self._count
+        cells = np.floor((np.arange(count) + self._rng.random()) * len(self._space.centres) / count)
+        places = self._space.centres[cells.astype(np.int64)] + CELL * (self._rng.random((count, 2)) - 0.5)
         # a sequence of low discrepancy, so that neighbours look everywhere (golden ratio)
-        shares = (np.arange(self._count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
+        shares = (np.arange(count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
         state = _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
         return self._weighed(state, m) if isinstance(m, RfidScan) else state
 
@@ -107,8 +111,9 @@ class ActiveMcl(Filter):
             share = largest_share(cloud.log_weights, log_likelihood, left, enough)
             cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * log_likelihood))
             left -= share
-            if effective_size(cloud.log_weights) < RESAMPLE_BELOW * self._count:
-                rows = systematic(cloud.weights, self._rng, self._count)
+            if effective_size(cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
+                rows = systematic(cloud.weights, self._rng, MORE * self._count)
+                rows = rows[kld.prefix(cloud.poses[rows], self._rng, self._count)]
                 cloud = _cloud(_drawn(cloud.poses, rows, self._rng))
         return cloud
 

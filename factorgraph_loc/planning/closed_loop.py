@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 import numpy as np
@@ -11,13 +11,14 @@ from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Belief, Estimator
+from factorgraph_loc.estimators.base import Belief, Estimator, Mode
 from factorgraph_loc.estimators.cloud import systematic
 from factorgraph_loc.files import nearest
 from factorgraph_loc.measurements import Measurement, RfidScan
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
-from factorgraph_loc.planning.paths import Path, primitives, waypoint_paths
+from factorgraph_loc.planning.fisher import Sensors
+from factorgraph_loc.planning.paths import Path, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -35,7 +36,8 @@ ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
 SHOWN = 300  # particles of a belief that are kept
 SPREAD = 2000  # poses that stand for a belief without particles
 WRONG = 3.0  # times the limits: an error that is no bad luck
-MODES, LIKELY, TAGS = 3, 0.1, 2  # places with at least so much weight from which ways lead to the nearest tags
+MODES, LIKELY = 3, 0.05  # places, at most, and their least weight, from which ways lead to others
+TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, and nearest of places that are spread over free space
 PAUSE = 1.0  # s that a robot waits that cannot go anywhere
 SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
 
@@ -60,7 +62,8 @@ def run_active(
     start = _start(world, space, settings, of_start)
     robot = SimulatedRobot(world, space, simulation.rig, simulation.rounds_per_second, start, settings, of_robot)
     setup = registry.Setup(simulation.rig, world, ("odometry", "rfid"), of_estimator)
-    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, of_policy)
+    rounds = simulation.rounds_per_second / settings.speed
+    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, rounds, of_policy)
     localized = loop.run()
     position, heading = loop.errors()
     return ActiveRun(
@@ -91,18 +94,20 @@ class _Loop:
         setup: registry.Setup,
         space: FreeSpace,
         settings: ActiveSettings,
+        rounds_per_metre: float,
         rng: np.random.Generator,
     ) -> None:
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
         self._robot, self._estimator, self._policy = robot, estimator, policy
-        self._space, self._settings, self._rng = space, settings, rng
+        self._space, self._settings, self._rounds_per_metre, self._rng = space, settings, rounds_per_metre, rng
         self._paths = primitives(settings.policy.horizon)
+        self._sensors = Sensors.of(setup.world, setup.rig)
         tags = tag_map(setup.world, setup.rig.survey).tags
         assert setup.rig.rfid is not None, "the settings have been checked"
         # where a robot is nearest to each tag
         nearest_cells = cKDTree(space.centres).query(tags.points[:, :2])[1]
-        self._places = space.centres[np.unique(nearest_cells)]
+        self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, SPREAD_OVER), PLACES))
         self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if len(tags.points) else None
 
     def run(self) -> bool:
@@ -114,7 +119,7 @@ class _Loop:
             before = robot.t
             if choice.path is not None:
                 metres = min(choice.metres, settings.max_metres - robot.metres)
-                done = self._take(robot.drive(choice.path.poses, metres))
+                done = self._take(robot.drive(choice.path.poses, metres), choice.while_silent)
             if robot.t == before:
                 done = self._take(robot.wait(PAUSE))
         return done
@@ -124,8 +129,9 @@ class _Loop:
         error = self._estimator.estimate().pose - self._robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
-    def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Whether the place is known, and truly, on the way of these reports."""
+    def _take(self, reports: Iterator[Measurement], while_silent: bool = False) -> bool:
+        """Whether the place is known, and truly, on the way of these reports, up to the first read where that is the end of it."""
+        enough = self._robot.metres + self._settings.policy.replan
         for report in reports:
             self._estimator.process(report)
             if isinstance(report, RfidScan) and self._is_sure():
@@ -134,6 +140,9 @@ class _Loop:
                     return True
                 beyond = max(position / self._settings.position_limit, heading / self._settings.heading_limit)
                 self.claimed_wrong |= beyond > WRONG
+            read = isinstance(report, RfidScan) and len(report.tags) > 0
+            if while_silent and read and self._robot.metres > enough:
+                break
         return False
 
     def _is_sure(self) -> bool:
@@ -148,9 +157,22 @@ class _Loop:
         belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         started = perf_counter()
-        proposed = [*self._paths, *self._ways_to_tags(belief)]
+        modes = tuple(m for m in belief.modes[:MODES] if m.weight >= LIKELY and np.all(np.isfinite(m.pose)))
+        proposed = [*self._paths, *self._far(modes)]
         paths, free = usable(proposed, self._robot.free_ahead(proposed), self._settings.sight)
-        situation = Situation(particles, weights, self._likelihood, self._space, paths, free, self._settings, self._rng)
+        situation = Situation(
+            particles,
+            weights,
+            self._likelihood,
+            self._space,
+            paths,
+            free,
+            self._settings,
+            self._rng,
+            modes,
+            self._sensors,
+            self._rounds_per_metre,
+        )
         choice = self._policy.choose(situation)
         elapsed = 1e3 * (perf_counter() - started)
         estimate = self._estimator.estimate()
@@ -170,14 +192,15 @@ class _Loop:
         )
         return choice
 
-    def _ways_to_tags(self, belief: Belief) -> list[Path]:
-        """From each place where the robot may well be to the tags that are nearest: what tells the places apart may be far away."""
+    def _far(self, modes: Sequence[Mode]) -> list[Path]:
+        """The shortest ways to places from each of those where the robot may well be: what tells them apart may be far away."""
         out: list[Path] = []
-        for mode in belief.modes[:MODES]:
-            if mode.weight >= LIKELY and np.all(np.isfinite(mode.pose)):
-                ways = waypoint_paths(self._space, mode.pose, self._places)
-                ways = [way for way in ways if way.length >= self._settings.policy.horizon]
-                out += sorted(ways, key=lambda way: way.length)[:TAGS]
+        policy = self._settings.policy
+        for mode in modes:
+            for places, count in self._targets:
+                out += waypoint_paths(
+                    self._space, mode.pose, places, nearest=count, beyond=policy.horizon, within=policy.far
+                )
         return out
 
     def _in_world(self, path: Path) -> Array:

@@ -35,8 +35,10 @@ POSITION = ("x", "y")
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a whole number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
 LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way
+LOOKS = 10  # at most: on a longer way they are farther apart
 ROUNDS_PER_METRE = 4.0  # of a robot with 2 rounds a second at 0.5 m/s
 SAMPLES, SCANS = 256, 48  # particles that are weighed, and those that scans are drawn from
+FEWEST = 10  # particles, of which each may stand for many
 SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
 WIDEST_HEADING = 0.8  # rad: no Gaussian in heading is wider
 
@@ -100,7 +102,7 @@ def expected_gain(
     tables = _tables(likelihood)
     chosen = _leading(dims)
     several = has_several_modes(particles, weights)
-    rows = systematic(weights, rng, min(samples, len(particles)))
+    rows = systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
     poses = np.ascontiguousarray(particles[rng.permutation(rows)], dtype=float)
     count = len(poses)
     scans = min(scans, count)
@@ -125,6 +127,9 @@ def expected_gain(
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
+        if several and noise is None:
+            # the same as at the end, as the way moves all alike, but for how the places lie in the histogram's cells
+            index = np.zeros_like(index)
         after[c] = _entropies(at, index, np.exp(log_weights), chosen, several)
     return np.asarray(before - after.mean(axis=1))
 
@@ -165,7 +170,7 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
 
 def _stations(path: Path) -> Places:
     """Places among the poses of a path of the start, of the looks, one in the middle of each :data:`LOOK`, and of the end."""
-    count = max(1, round(path.length / LOOK))
+    count = min(max(1, round(path.length / LOOK)), LOOKS)
     middles = (np.arange(count) + 0.5) * path.length / count
     looks = np.searchsorted(path.way, middles - 1e-9)
     return np.concatenate(([0], looks, [len(path.poses) - 1])).astype(np.int64)

@@ -70,20 +70,29 @@ def primitives(length: float) -> list[Path]:
     return out
 
 
-def waypoint_paths(space: FreeSpace, pose: Array, targets: Array) -> list[Path]:
+def waypoint_paths(
+    space: FreeSpace,
+    pose: Array,
+    targets: Array,
+    *,
+    nearest: int | None = None,
+    beyond: float = 0.0,
+    within: float = math.inf,
+) -> list[Path]:
     """The shortest paths through free space from ``pose`` (3,) to ``targets`` (K, 2) [m] in the world, by one search for all of
     them (Dijkstra, 1959), straightened. The robot turns in place towards where each begins, and in its corners.
 
     A pose that is too close to a wall starts from the free cell that is nearest; a target that is not in free space, or is where
-    the robot is, has no path.
+    the robot is, has no path. ``nearest``: to so many of the targets alone, of those that are at least ``beyond`` and at most
+    ``within`` [m] away on the grid.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
-    _, before = csgraph.dijkstra(space.graph, directed=False, indices=start, return_predecessors=True)
+    ends = ends[(ends >= 0) & (ends != start)]
+    ways, before = csgraph.dijkstra(space.graph, directed=False, indices=start, limit=within, return_predecessors=True)
+    ends = ends[(ways[ends] >= beyond) & np.isfinite(ways[ends])]
     out = []
-    for end in ends.tolist():
-        if end < 0 or end == start:
-            continue
+    for end in ends[np.argsort(ways[ends], kind="stable")[:nearest]].tolist():
         points = space.centres[chain(before, end)[::-1]]
         if space.cells(pose[None, :2])[0] >= 0:
             points[0] = pose[:2]
@@ -111,13 +120,14 @@ def free_length(space: FreeSpace, poses: Array, path: Path) -> Array:
     return np.asarray(path.way[free_steps(space, poses, [path])[0]])
 
 
-def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path]) -> NDArray[np.int64]:
-    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) reach; see :func:`free_length`."""
+def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
+    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) reach; see :func:`free_length`. ``between``: parts in
+    which the way from each pose to the next is looked at."""
     first = np.cumsum([0, *(len(path.poses) for path in paths)])
     along = np.concatenate([path.poses for path in paths]) if paths else np.empty((0, 3))
     out = np.empty((len(paths), len(poses)), dtype=np.int64)
     poses = np.ascontiguousarray(poses, dtype=float)
-    _free_steps(space.index, space.distance, space.origin, poses, along, first, out)
+    _free_steps(space.index, space.distance, space.origin, poses, along, first, between, out)
     return out
 
 
@@ -160,6 +170,7 @@ def _free_steps(
     poses: Array,
     along: Array,
     first: NDArray[np.int64],
+    between: int,
     out: NDArray[np.int64],
 ) -> None:
     nx, ny = index.shape
@@ -168,15 +179,23 @@ def _free_steps(
         for p in range(len(first) - 1):
             last, leaving, before = 0, True, -1.0
             for k in range(first[p], first[p + 1]):
-                x = poses[m, 0] + c * along[k, 0] - s * along[k, 1]
-                y = poses[m, 1] + s * along[k, 0] + c * along[k, 1]
-                i, j = math.floor((x - origin[0]) / CELL), math.floor((y - origin[1]) / CELL)
-                if i < 0 or j < 0 or i >= nx or j >= ny:
+                free, previous = True, max(k - 1, first[p])
+                for part in range(1, between + 1):
+                    share = 1.0 - part / between
+                    ax = along[k, 0] + share * (along[previous, 0] - along[k, 0])
+                    ay = along[k, 1] + share * (along[previous, 1] - along[k, 1])
+                    x, y = poses[m, 0] + c * ax - s * ay, poses[m, 1] + s * ax + c * ay
+                    i, j = math.floor((x - origin[0]) / CELL), math.floor((y - origin[1]) / CELL)
+                    if i < 0 or j < 0 or i >= nx or j >= ny:
+                        free = False
+                        break
+                    if index[i, j] >= 0:
+                        leaving = False
+                    elif not leaving or distance[i, j] < before:
+                        free = False
+                        break
+                    before = distance[i, j]
+                if not free:
                     break
-                if index[i, j] >= 0:
-                    leaving = False
-                elif not leaving or distance[i, j] < before:
-                    break
-                before = distance[i, j]
                 last = k - first[p]
             out[p, m] = last

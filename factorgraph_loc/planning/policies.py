@@ -17,9 +17,11 @@ from typing import Protocol
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Mode
 from factorgraph_loc.estimators.cloud import pose_moments
 from factorgraph_loc.files import nearest
-from factorgraph_loc.planning.information import expected_gain
+from factorgraph_loc.planning.fisher import Sensors, fisher_gain
+from factorgraph_loc.planning.information import ROUNDS_PER_METRE, expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.free_space import FreeSpace
@@ -27,10 +29,12 @@ from factors import se2
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
-# m: standard deviation of a belief in many places, and the gains [nats] that are as good as none, there and in one place
-LOST, NOTHING, ALMOST_NOTHING = 3.0, 0.3, 1e-3
-AHEAD = 1.0  # m that must be free
+NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation
+FEW = 0.6  # weight of few places, that ways may lead from
+OF_MODES = 48  # particles that stand for these
 COMMITTED = 0.5  # of a long way, before another is chosen
+FAR = "waypoint"  # kind of ways to places
+AHEAD = 1.0  # m that must be free
 BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
 NEAR = 3  # tags that tell a place
 
@@ -38,7 +42,9 @@ NEAR = 3  # tags that tell a place
 @dataclass(frozen=True)
 class Situation:
     """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), the map's tags by ``likelihood`` (None without
-    any), where walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees."""
+    any), where walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees.
+    ``modes``: the places that count. ``sensors``: what is seen on a way, for the expectation in closed form;
+    ``rounds_per_metre`` of each antenna."""
 
     particles: Array
     weights: Array
@@ -48,15 +54,20 @@ class Situation:
     free: Array
     settings: ActiveSettings
     rng: np.random.Generator
+    modes: tuple[Mode, ...] = ()
+    sensors: Sensors | None = None
+    rounds_per_metre: float = ROUNDS_PER_METRE
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, if they are compared."""
+    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, if they are compared.
+    ``while_silent``: only until a tag is read."""
 
     path: Path | None
     metres: float
     values: Array
+    while_silent: bool = False
 
 
 class Policy(Protocol):
@@ -76,20 +87,15 @@ class Information:
         s, settings = situation, situation.settings.policy
         if s.likelihood is None or not s.candidates:
             return self._otherwise.choose(s)
-        gains = expected_gain(
-            s.likelihood,
-            s.particles,
-            s.weights,
-            s.candidates,
-            s.rng,
-            dims=settings.dimensions,
-            samples=settings.samples,
-            space=s.space,
-        )
-        _, covariance = pose_moments(s.particles, s.weights)
-        lost = np.linalg.eigvalsh(covariance[:2, :2])[-1] > LOST**2
-        if np.max(gains) < (NOTHING if lost else ALMOST_NOTHING):
-            return self._otherwise.choose(s)
+        few = sum(mode.weight for mode in s.modes) > FEW
+        gains = np.zeros(len(s.candidates))
+        far = np.array([p.kind == FAR for p in s.candidates])
+        gains[~far] = self._near(s, [p for p in s.candidates if p.kind != FAR])
+        if few and len(s.modes) > 1 and far.any():
+            gains[far] = self._of_modes(s, [p for p in s.candidates if p.kind == FAR])
+        if np.max(gains) < NOTHING:
+            patrol = self._otherwise.choose(s)
+            return Choice(patrol.path, patrol.metres, patrol.values, while_silent=not few)
         rates = s.settings.speed, s.settings.turn_rate
         costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
         values = self._sign * gains - np.array(costs)
@@ -97,14 +103,52 @@ class Information:
         # who goes far away for something is on the way for long
         return Choice(best, max(settings.replan, COMMITTED * best.length), values)
 
+    @staticmethod
+    def _near(s: Situation, paths: Sequence[Path]) -> Array:
+        """Of all that the belief says."""
+        assert s.likelihood is not None, "there are tags"
+        settings = s.settings.policy
+        if settings.expectation == "fisher" and s.sensors is not None and not has_several_modes(s.particles, s.weights):
+            return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
+        return expected_gain(
+            s.likelihood,
+            s.particles,
+            s.weights,
+            paths,
+            s.rng,
+            dims=settings.dimensions,
+            samples=settings.samples,
+            space=s.space,
+            rounds_per_metre=s.rounds_per_metre,
+        )
+
+    @staticmethod
+    def _of_modes(s: Situation, paths: Sequence[Path]) -> Array:
+        """Of which place it is. Particles would spread on a long way, and run into walls that the robot will have turned from: it
+        plans anew before."""
+        assert s.likelihood is not None, "there are tags"
+        # which of equal places is the heavier is the luck of the particles
+        weights = np.sqrt([mode.weight for mode in s.modes])
+        return expected_gain(
+            s.likelihood,
+            np.array([mode.pose for mode in s.modes]),
+            weights / weights.sum(),
+            paths,
+            s.rng,
+            samples=OF_MODES,
+            space=s.space,
+            rounds_per_metre=s.rounds_per_metre,
+        )
+
 
 class Random:
-    """Any of the ways, to its end."""
+    """Any of the arcs and short straight runs, to its end."""
 
     def choose(self, situation: Situation) -> Choice:
-        if not situation.candidates:
+        arcs = [p for p in situation.candidates if p.kind == "arc"]
+        if not arcs:
             return Choice(None, 0.0, np.empty(0))
-        path = situation.candidates[int(situation.rng.integers(len(situation.candidates)))]
+        path = arcs[int(situation.rng.integers(len(arcs)))]
         return Choice(path, path.length, np.empty(0))
 
 
@@ -179,4 +223,4 @@ def _direction(path: Path) -> float:
 
 def _is_straight(path: Path) -> bool:
     x, y = path.poses[-1, :2]
-    return path.length > AHEAD - 1e-9 and math.hypot(x, y) > path.length - 1e-6
+    return path.kind == "arc" and path.length > AHEAD - 1e-9 and math.hypot(x, y) > path.length - 1e-6

@@ -21,6 +21,7 @@ from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
 PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
+BETWEEN = 5  # parts of the way from one pose of a path to the next
 
 
 class SimulatedRobot:
@@ -70,7 +71,8 @@ class SimulatedRobot:
 
     def free_ahead(self, paths: Sequence[Path]) -> Array:
         """How far [m] (C,) each of C ways can be gone, as far as the proximity sensor sees."""
-        steps = free_steps(self._space, self.pose[None], paths)[:, 0]
+        # as finely as it drives: the corner of a wall fits between two poses of a path
+        steps = free_steps(self._space, self.pose[None], paths, BETWEEN)[:, 0]
         way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
         return np.asarray(np.minimum(way, self._settings.sight))
 

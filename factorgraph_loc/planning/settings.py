@@ -15,16 +15,19 @@ Dimension = Literal["x", "y", "heading"]
 
 
 class PolicySettings(FileModel):
-    """How the next way is chosen. ``horizon`` [m]: length of the longest candidates. ``replan`` [m]: how far the robot goes before
-    it chooses anew. ``per_metre`` and ``per_second``: what a way costs, in nats. ``samples``: particles of the belief that the
-    expectation is taken over. ``dimensions``: whose entropy counts."""
+    """How the next way is chosen. ``horizon`` [m]: length of arcs and straight runs; ``far`` [m]: of the longest ways to places.
+    ``replan`` [m]: how far the robot goes before it chooses anew. ``per_metre`` and ``per_second``: what a way costs, in nats.
+    ``samples``: particles of the belief that the expectation is taken over. ``dimensions``: whose entropy counts.
+    ``expectation``: over scans that are drawn, or, of a belief in one place, by Fisher's information in closed form."""
 
     horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 3.0
+    far: Metres = 25.0
     replan: Metres = 1.0
-    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.1
+    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.02
+    expectation: Literal["sampled", "fisher"] = "sampled"
     per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
-    dimensions: Annotated[tuple[Dimension, ...], Field(min_length=1)] = ("x", "y")
+    dimensions: Annotated[tuple[Dimension, ...], Field(min_length=1)] = ("x", "y", "heading")
 
 
 class ActiveSettings(FileModel):

@@ -29,14 +29,22 @@ def made(seed: int = 0, name: str = "office"):
 def test_particles_begin_evenly_over_free_space_and_headings():
     estimator, _, space = made()
     cloud = estimator._seek(Tick(0.0))
-    assert len(cloud.poses) == 2000
-    assert np.allclose(cloud.weights, 1.0 / 2000)
+    assert len(cloud.poses) == 10_000
+    assert np.allclose(cloud.weights, 1.0 / 10_000)
     assert (space.cells(cloud.poses[:, :2]) >= 0).all()
-    # 2,000 in 20 stretches and 8 directions: 100 and 250 each, were they drawn at random within 30 and 45 (3 sigma)
+    # 10,000 in 20 stretches and 8 directions: 500 and 1,250 each, were they drawn at random within 65 and 99 (3 sigma)
     number = np.bincount((space.cells(cloud.poses[:, :2]) * 20) // len(space.centres), minlength=20)
-    assert np.abs(number - 100).max() <= 6
+    assert np.abs(number - 500).max() <= 6
     headings = np.bincount(((cloud.poses[:, 2] + math.pi) * 4.0 / math.pi).astype(int) % 8, minlength=8)
-    assert np.abs(headings - 250).max() <= 6
+    assert np.abs(headings - 1250).max() <= 6
+
+
+def test_fewer_particles_are_enough_once_the_place_is_known():
+    estimator, robot, _ = made()
+    for m in (*robot.begin(), *robot.wait(3.0)):
+        estimator.process(m)
+    assert estimator.estimate().status == "localized"
+    assert 2000 <= len(estimator.belief().particles) < 4000
 
 
 def test_stated_errors_fit_the_real_ones():

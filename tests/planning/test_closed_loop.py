@@ -48,6 +48,19 @@ def test_policies_stand_on_any_estimator(estimator: str) -> None:
     assert run.error_position < 0.3
 
 
+def test_information_in_closed_form_localizes_too() -> None:
+    settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
+    run = run_active(preset("office"), "information", "smoother", 1, settings)
+    assert run.localized
+    assert run.metres < 30.0
+
+
+def test_a_corner_between_two_poses_of_a_way_is_seen() -> None:
+    """A patrol that begins beside a corner does not try to go through it for ever."""
+    run = run_active(preset("symmetric"), "patrol", "active_mcl", 1110, ActiveSettings(max_metres=40.0, particles=200))
+    assert run.localized or run.metres > 39.0
+
+
 def test_runs_of_one_seed_share_world_and_start() -> None:
     one, other = office(), office("patrol")
     assert one.world == other.world
@@ -126,7 +139,7 @@ def test_a_horizon_of_zero_is_an_error(horizon: float) -> None:
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
     differ to find out, and to say nothing before."""
-    settings = ActiveSettings(start=(12.0, 12.0, 0.1), policy=PolicySettings(horizon=6.0, replan=2.0))
+    settings = ActiveSettings(start=(12.0, 12.0, 0.1))
     run = run_active(preset("symmetric"), "information", "active_mcl", 3, settings)
     assert run.localized
     assert not run.claimed_wrong

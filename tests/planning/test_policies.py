@@ -1,16 +1,22 @@
 """What policies choose."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.planning.paths import primitives
+from factorgraph_loc.estimators.base import Mode
+from factorgraph_loc.files import parse_model
+from factorgraph_loc.planning.fisher import Sensors
+from factorgraph_loc.planning.paths import primitives, waypoint_paths
 from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
-from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.free_space import free_space
+from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factorgraph_loc.world import World
 from factors.rfid_likelihood import RfidLikelihood, TagArray
 
@@ -88,6 +94,35 @@ def test_ways_end_where_the_sensor_sees_a_wall():
     assert len(kept) == len(paths) - 1 == len(left)
     assert kept[0].length == pytest.approx(1.5)
     assert kept[1].length == paths[2].length
+
+
+def test_of_two_places_a_far_one_that_tells_them_apart_is_chosen():
+    """Two equal places in an empty hall; a tag stands 15 m away from where one of them says."""
+    tags = np.array(((20.0, 35.0, 1.2),))
+    rng = np.random.default_rng(0)
+    middles = np.array(((20.0, 20.0, 0.0), (20.0, 5.0, 0.0)))
+    particles = middles[np.arange(500) % 2] + rng.standard_normal((500, 3)) * (0.1, 0.1, 0.02)
+    modes = tuple(Mode(0.5, m, np.diag((0.01, 0.01, 4e-4))) for m in middles)
+    ways = waypoint_paths(SPACE, middles[0], np.array(((20.0, 34.0), (20.0, 6.0), (34.0, 20.0))))
+    paths = (*primitives(3.0), *ways)
+    base = situation(paths, np.full(len(paths), 3.0), tags)
+    s = replace(base, particles=particles, modes=modes)
+    choice = make_policy("information").choose(s)
+    assert choice.path is ways[0]
+    assert choice.metres > 3.0
+    # of one place nothing is gained by going far
+    assert make_policy("information").choose(replace(s, modes=modes[:1])).path is not ways[0]
+
+
+def test_the_expectation_in_closed_form_goes_where_tags_are():
+    s = situation()
+    settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
+    world = World(tags={f"T{i}": {"x": x, "y": y, "z": z} for i, (x, y, z) in enumerate(TAGS.tolist())})
+    sensors = Sensors.of(world, parse_model(Rig, RACKHAM_RIG, "rig"))
+    choice = make_policy("information").choose(replace(s, settings=settings, sensors=sensors))
+    assert abs(direction(choice) - math.pi / 2.0) < 0.8
+    drawn = make_policy("information").choose(replace(s, sensors=sensors))
+    assert not np.allclose(drawn.values, choice.values, atol=1e-6)
 
 
 def test_random_takes_all_ways():
