@@ -14,6 +14,7 @@ from factorgraph_loc.cli import (
     active,
     calibrating,
     experimenting,
+    exporting,
     features,
     images,
     inspecting,
@@ -68,6 +69,7 @@ app.command()(manifest.manifest)
 app.command()(running.run)
 app.command()(running.compare)
 app.command()(viewing.view)
+app.command()(exporting.export)
 app.command()(calibrating.calibrate)
 app.command("map")(mapping.map_)
 app.command()(images.images)

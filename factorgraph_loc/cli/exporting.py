@@ -1,0 +1,78 @@
+"""``fgloc export``: results in the formats of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from factorgraph_loc.cli.options import DataRoot, LogOptions, Reader, ReaderOption, RigFile, WorldFile
+from factorgraph_loc.cli.viewing import What, load_results
+from factorgraph_loc.errors import InputError
+
+if TYPE_CHECKING:
+    from factorgraph_loc.exports.runs import StoredRun
+    from factorgraph_loc.log import Log
+    from factorgraph_loc.trajectory import Trajectory
+
+FORMATS = (".mcap", ".tum", ".kitti", ".g2o")
+
+
+def export(
+    what: What,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="What is written, by its suffix: .mcap (Foxglove), .tum, .kitti or .g2o.",
+        ),
+    ],
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+) -> None:
+    """Write runs for Foxglove, or one run's final trajectory, or the reference of a log, for other programs."""
+    if out.suffix not in FORMATS:
+        raise InputError(f"{out}: has the suffix {out.suffix!r}, expected one of {', '.join(FORMATS)}")
+    log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
+    also = ""
+    if out.suffix == ".mcap":
+        from factorgraph_loc.exports.foxglove import write_mcap
+
+        write_mcap(log, runs, out)
+    elif out.suffix == ".g2o":
+        from factorgraph_loc.exports.g2o import pose_graph, write_g2o
+
+        run = _only(runs, out)
+        sensors = run.folder.config.get("sensors", log.rig.sensors)
+        write_g2o(pose_graph(log, run.final, sensors, run.landmarks), out)
+    elif out.suffix == ".kitti":
+        from factorgraph_loc.exports.trajectories import write_kitti
+
+        also = f" and {write_kitti(_trajectory(log, runs, out), out)}"
+    else:
+        from factorgraph_loc.trajectory import write_tum
+
+        write_tum(_trajectory(log, runs, out), out, log.t0_ns)
+    typer.echo(f"wrote {out}{also}")
+
+
+def _only(runs: list[StoredRun], out: Path) -> StoredRun:
+    if len(runs) != 1:
+        found = f"there are {len(runs)} ({', '.join(run.name for run in runs)})" if runs else "there is none"
+        raise InputError(f"{out}: is of one run, and {found}, expected the folder of one")
+    return runs[0]
+
+
+def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
+    """The final trajectory of the run, or the reference where a log alone is given."""
+    if runs:
+        return _only(runs, out).final
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
+    return log.reference

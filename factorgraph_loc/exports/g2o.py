@@ -1,0 +1,138 @@
+"""The pose graph of a run as a g2o file, for other optimisers.
+
+R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, "g2o: a general framework for graph optimization", ICRA 2011, and
+the formats of its types ``slam2d``. What such a graph can say is in it: the motion between poses (``EDGE_SE2``), and landmarks
+whose range and bearing were measured at once (``EDGE_SE2_XY``). Ranges or bearings alone, reads of tags and pixels are not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Diagnostics, LearntPoint
+from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.files import write_text
+from factorgraph_loc.log import MOTION, BearingRangeStream, Log
+from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.trajectory import Trajectory
+from factors.bearing_range import located, sigmas
+from factors.odometry import Increment
+from factors.se2 import Array
+
+LEAST = 1e-12  # m^2 or rad^2: the least variance of an edge, as no information is infinite
+STEP = 1e-6  # m or rad, of numerical derivatives
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], seen from the pose ``index``."""
+
+    index: int
+    landmark: str
+    point: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """``t`` (N,) and ``poses`` (N, 3): where the robot is believed to have been; ``motions``: N - 1, from each pose to the next.
+    ``landmarks``: (2,) each, by name; ``known``: whether the map has them, and they are held fast."""
+
+    t: Array
+    poses: Array
+    motions: tuple[Increment, ...]
+    landmarks: Mapping[str, Array]
+    known: bool
+    sightings: tuple[Sighting, ...]
+
+
+def pose_graph(
+    log: Log, trajectory: Trajectory, sensors: Sequence[str], learnt: Mapping[str, LearntPoint] | None = None
+) -> PoseGraph:
+    """The pose graph of a log: poses at the stamps of ``trajectory`` and of the sightings between them.
+
+    ``sensors``: which of the log's streams are used. Landmarks are those of the map, or, where it has none, those ``learnt``.
+    InputError without two poses, or if the log does not say how the robot moved.
+    """
+    moving = [s for s in MOTION if s in sensors and s in log.streams]
+    if "odometry" not in moving:
+        raise InputError(
+            f"{log.name}: has no odometry among {', '.join(sensors)}, expected it for the edges of a pose graph"
+        )
+    landmarks = {name: np.array((mark.x, mark.y)) for name, mark in log.world.landmarks.items()}
+    if not landmarks:
+        landmarks = {name: point.position for name, point in (learnt or {}).items()}
+    seen = _seen(log, landmarks) if "bearing_range" in sensors and len(trajectory) else []
+    seen = [s for s in seen if trajectory.t[0] <= s[0] <= trajectory.t[-1]]
+    t = np.unique(np.concatenate((trajectory.t, [at for at, *_ in seen])))
+    if len(t) < 2:
+        raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
+    index = {at: i for i, at in enumerate(t.tolist())}
+    sightings = tuple(Sighting(index[at], name, point, covariance) for at, name, point, covariance in seen)
+    found = {name for _, name, _, _ in seen}
+    landmarks = {name: place for name, place in landmarks.items() if name in found}
+    return PoseGraph(t, trajectory.at(t), _motions(log, moving, t), landmarks, bool(log.world.landmarks), sightings)
+
+
+def write_g2o(graph: PoseGraph, path: Path) -> None:
+    """Write a g2o file. Poses are numbered from 0 on, then come the landmarks. Those of a map are fixed, else the first pose is."""
+    number = {name: len(graph.t) + i for i, name in enumerate(graph.landmarks)}
+    lines = [f"VERTEX_SE2 {i} {_numbers(pose)}" for i, pose in enumerate(graph.poses)]
+    lines += [f"VERTEX_XY {number[name]} {_numbers(place)}" for name, place in graph.landmarks.items()]
+    for i, motion in enumerate(graph.motions):
+        lines.append(f"EDGE_SE2 {i} {i + 1} {_numbers(motion.delta)} {_information(motion.covariance)}")
+    for s in graph.sightings:
+        lines.append(f"EDGE_SE2_XY {s.index} {number[s.landmark]} {_numbers(s.point)} {_information(s.covariance)}")
+    # last, as GTSAM reads no further
+    lines += [f"FIX {i}" for i in (number.values() if graph.known and number else (0,))]
+    try:
+        write_text(path, "\n".join(lines) + "\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _motions(log: Log, moving: Sequence[str], t: Array) -> tuple[Increment, ...]:
+    motion = Motion(log.rig, tuple(moving), Diagnostics())
+    motion.keep(math.inf)
+    for m in log.measurements(moving):
+        if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
+            motion.add(m)
+    states = [motion.state(at) for at in t.tolist()]
+    return tuple(motion.relative(a, b) for a, b in pairwise(states))
+
+
+def _seen(log: Log, landmarks: Mapping[str, Array]) -> list[tuple[float, str, Array, Array]]:
+    """Time, name, place in the robot's frame and its covariance, of the landmarks whose range and bearing were measured."""
+    stream, settings = log.streams.get("bearing_range"), log.rig.bearing_range
+    if not isinstance(stream, BearingRangeStream) or settings is None:
+        return []
+    model = settings.model()
+    whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
+    rows = [i for i in whole.tolist() if stream.landmark[i] in landmarks]
+    ranges, bearings = stream.range[rows], stream.bearing[rows]
+    points = located(model, ranges, bearings)
+    spreads = sigmas(model, ranges)
+    t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
+    by_range = (located(model, ranges + STEP, bearings) - points) / STEP
+    by_bearing = (located(model, ranges, bearings + STEP) - points) / STEP
+    jacobians = np.stack((by_range, by_bearing), axis=-1) * spreads[:, None, :]
+    covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
+    return [(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(f"{value:.12g}" for value in np.ravel(values).tolist())
+
+
+def _information(covariance: Array) -> str:
+    """The upper triangle, by rows, of the inverse of a covariance (D, D); a robot at rest moves without any error."""
+    variances, axes = np.linalg.eigh(covariance)
+    inverse = (axes / np.maximum(variances, LEAST)) @ axes.T
+    return _numbers(inverse[np.triu_indices(len(covariance))])

@@ -1,0 +1,72 @@
+"""``fgloc export``: files for other programs, by their suffix."""
+
+import gtsam
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from factorgraph_loc.experiments.output import write_run
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.readers import load
+from factorgraph_loc.trajectory import read_tum
+
+
+@pytest.fixture(scope="module")
+def comparison(short_log, tmp_path_factory):
+    (log,) = load(str(short_log))
+    out = tmp_path_factory.mktemp("export")
+    for name in ("dead_reckoning", "ekf"):
+        write_run(run(log, RunConfig(name)), log, out / "runs" / "short" / name / "seed0")
+    return out
+
+
+@pytest.fixture
+def ekf(comparison):
+    return comparison / "runs" / "short" / "ekf" / "seed0"
+
+
+def test_trajectories(fgloc, short_log, ekf, tmp_path):
+    result = fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.kitti")
+    assert result.stdout == f"wrote {tmp_path / 'ekf.kitti'} and {tmp_path / 'ekf.times.txt'}\n"
+    assert fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.tum").exit_code == 0
+    final = read_tum(ekf / "final.tum")
+    assert np.array_equal(read_tum(tmp_path / "ekf.tum").poses, final.poses)
+    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "ekf.kitti"))
+    assert np.allclose(kitti.positions_xyz[:, :2], final.poses[:, :2], atol=1e-8)
+
+
+def test_the_reference_of_a_log(fgloc, short_log, tmp_path):
+    assert fgloc("export", short_log, "-o", tmp_path / "truth.tum").exit_code == 0
+    (log,) = load(str(short_log))
+    assert np.allclose(read_tum(tmp_path / "truth.tum", log.t0_ns).poses[:, :2], log.reference.poses[:, :2], atol=1e-8)
+
+
+def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):
+    assert fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.g2o").exit_code == 0
+    factors, values = gtsam.readG2o(str(tmp_path / "ekf.g2o"), False)
+    assert factors.size() == values.size() - 1 == len(read_tum(ekf / "final.tum").t) - 1
+
+
+def test_all_runs_for_foxglove(fgloc, short_log, comparison, tmp_path):
+    pytest.importorskip("mcap")
+    assert fgloc("export", comparison, short_log, "-o", tmp_path / "short.mcap").exit_code == 0
+    assert (tmp_path / "short.mcap").read_bytes()[:5] == b"\x89MCAP"
+
+
+def test_bad_input(fgloc, short_log, comparison, ekf, tmp_path):
+    def error(*args):
+        result = fgloc("export", *args)
+        assert result.exit_code == 2
+        assert result.stderr.count("\n") == 1
+        return result.stderr
+
+    assert "has the suffix '.csv', expected one of .mcap, .tum, .kitti, .g2o" in error(ekf, short_log, "-o", "a.csv")
+    several = error(comparison, short_log, "-o", tmp_path / "a.tum")
+    assert "is of one run, and there are 2 (dead_reckoning, ekf), expected the folder of one" in several
+    assert "is of one run, and there is none" in error(short_log, "-o", tmp_path / "a.g2o")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for file in short_log.iterdir():
+        if file.stem != "reference":
+            (bare / file.name).write_bytes(file.read_bytes())
+    assert "has no reference to write" in error(bare, "-o", tmp_path / "a.tum")
