@@ -22,7 +22,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, parse_model
 from factorgraph_loc.log import ImageStream
 from factorgraph_loc.readers import checks
-from factorgraph_loc.readers.bag_clock import Clock
+from factorgraph_loc.readers.bag_clock import Clock, Stamper
+from factorgraph_loc.readers.bag_fields import as_nanoseconds
 from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.vision.feature_cache import cache_folder
@@ -33,8 +34,9 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 INDEX = "images.csv"
-COLUMNS = ("row", "stamp", "file")
+COLUMNS = ("row", "header", "received", "file")
 Pixels = NDArray[Any]
+_Row = tuple[int, int, int, str]  # number, stamp of the header [ns], receipt [ns], file
 
 # to channels in the order red, green, blue
 ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
@@ -65,19 +67,23 @@ class CameraTopic(FileModel):
 class Images:
     """Gathers the images of a topic. ``known``: they lie in the cache folder already, so that their messages need not be read."""
 
-    def __init__(self, bag: Bag, name: str, clock: Clock) -> None:
+    def __init__(self, bag: Bag, name: str, stamper: Stamper) -> None:
         topic = bag.topic(name)
         if topic.type not in {RAW, COMPRESSED}:
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {RAW} or {COMPRESSED}")
         self._source = f"{bag.path} {name}"
         self._compressed = topic.type == COMPRESSED
-        self._folder = cache_folder() / "bags" / _key(bag.path, name, clock)
-        self._rows: list[tuple[int, int, str]] = []
+        self._folder = cache_folder() / "bags" / _key(bag.path, name)
+        self._rows: list[_Row] = []
+        self._stamper = stamper
+        self._t_ns: list[int] = []
         self._temporary: Path | None = None
         if (self._folder / INDEX).is_file():
             self._rows = _read_index(self._folder)
-        self.known = bool(self._rows) and all((self._folder / file).is_file() for _, _, file in self._rows)
-        if not self.known:
+        self.known = bool(self._rows) and all((self._folder / file).is_file() for *_, file in self._rows)
+        if self.known:
+            self._t_ns = [stamper.heard(header, received) for _, header, received, _ in self._rows]
+        else:
             self._rows = []
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -94,7 +100,8 @@ class Images:
             content, suffix = netpbm(item.message, where)
         file = f"{item.row:06d}{suffix}"
         (self._temporary / file).write_bytes(content)
-        self._rows.append((item.row, t_ns, file))
+        self._rows.append((item.row, as_nanoseconds(item.message.header.stamp, 1), item.received, file))
+        self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
         """The images by their stamps; those that were written now take their place in the cache folder."""
@@ -104,9 +111,9 @@ class Images:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._temporary.replace(self._folder)
             self._temporary = None
-        rows, t_ns = (np.array([row[i] for row in self._rows], dtype=np.int64) for i in (0, 1))
+        rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
         keep = _last_of_each(self._source, rows, t_ns, warnings)
-        return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][2] for i in keep.tolist()])
+        return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
 
     def discard(self) -> None:
         """Leave nothing half-written behind."""
@@ -178,17 +185,20 @@ def _last_of_each(source: str, rows: Integers, t_ns: Integers, warnings: list[st
     return checks.sightings_in_order(source, rows, t_ns, ["image"] * len(rows), warnings)
 
 
-def _key(path: Path, topic: str, clock: Clock) -> str:
+def _key(path: Path, topic: str) -> str:
     """A name for the images of a topic, another one if the bag changes."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     facts = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-    return hashlib.sha256(repr((facts, topic, clock)).encode()).hexdigest()[:24]
+    return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
 
 
-def _read_index(folder: Path) -> list[tuple[int, int, str]]:
+def _read_index(folder: Path) -> list[_Row]:
     """What the index says; nothing if it is damaged."""
     try:
         with (folder / INDEX).open(newline="", encoding="utf-8") as file:
-            return [(int(row["row"]), int(row["stamp"]), str(row["file"])) for row in csv.DictReader(file)]
+            return [
+                (int(row["row"]), int(row["header"]), int(row["received"]), str(row["file"]))
+                for row in csv.DictReader(file)
+            ]
     except (OSError, ValueError, KeyError, TypeError):
         return []

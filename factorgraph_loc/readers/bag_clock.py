@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.readers.bag_fields import has_header
+from factorgraph_loc.readers.bag_fields import as_nanoseconds, has_header
 from factorgraph_loc.readers.bag_file import Bag, Stamped, Topic
 
 Clock = Literal["header", "receive"]
@@ -37,7 +37,10 @@ class Stamper:
 
     def choose(self, stamp: Any, received: int) -> int:
         """The one of a header's stamp and the time of receipt that counts."""
-        in_header = int(stamp.sec) * 10**9 + int(stamp.nanosec)
+        return self.heard(as_nanoseconds(stamp, 1), received)
+
+    def heard(self, in_header: int, received: int) -> int:
+        """The same of a stamp in nanoseconds."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self._use_header else received

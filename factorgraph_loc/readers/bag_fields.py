@@ -82,7 +82,7 @@ def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) ->
             path += "" if label == "BASE" and inner[0] in BYTES else LIST
         if label == "BASE" or inner in TIMES:
             out.append(path)
-        elif depth:
+        elif depth and inner in store.fielddefs:
             out += leaves(store, str(inner), f"{path}.", depth - 1)
     return out
 

@@ -111,12 +111,14 @@ class Bag:
                 try:
                     connection, received, raw = next(source)
                 except StopIteration:
-                    return
+                    break
                 name = connection.topic
                 rows[name] += 1
                 call, kind = decode[name]
                 message = call(raw, kind)
             yield Stamped(name, rows[name], received, message)
+        if missing := [name for name in topics if not rows[name]]:
+            raise InputError(f"{self.path}: topic {missing[0]} has no messages, though the bag's index says so")
 
 
 def is_bag(path: Path) -> bool:

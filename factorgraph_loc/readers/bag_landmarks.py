@@ -13,7 +13,7 @@ from factorgraph_loc.log import BearingRangeStream, SightingStream
 from factorgraph_loc.markers import corner_names
 from factorgraph_loc.readers import checks, native, native_camera
 from factorgraph_loc.readers.bag_clock import Clock
-from factorgraph_loc.readers.bag_fields import Fields, as_number, as_text
+from factorgraph_loc.readers.bag_fields import Fields, as_number, as_text, leaves
 from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_frames import StaticFrames
 from factorgraph_loc.readers.bag_rows import Rows
@@ -24,6 +24,8 @@ from factors.se2 import Array
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
 PixelField = Literal["landmark", "u", "v"]
 CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
+
+CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
 
 _POSE = "pose.position"
 # what detectors of markers say: the marker's name, and where it is in the camera's optical frame
@@ -126,6 +128,10 @@ class PixelsOfPoints:
             raise InputError(
                 f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {CORNERS}"
             )
+        if self._corners:
+            known = leaves(bag.store(topic.name), topic.type)
+            if lacking := [path for path in CORNER_FIELDS if path not in known]:
+                raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {', '.join(lacking)}")
         fields: dict[Any, str] = dict(options.fields or {})
         if fields and set(fields) != {"landmark", "u", "v"}:
             raise InputError(f"{bag.path} {topic.name}: fields are {', '.join(fields)}, expected landmark, u and v")

@@ -10,6 +10,7 @@ from typing import Any
 
 import tomli_w
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.readers.bag_camera import COMPRESSED, INFO, RAW
 from factorgraph_loc.readers.bag_clock import TF
 from factorgraph_loc.readers.bag_fields import LIST, has_header, leaves
@@ -204,7 +205,11 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
             ("sensor_msgs/", "nav_msgs/", "geometry_msgs/", "tf2_msgs/")
         ):
             continue
-        fields = read_fields(leaves(bag.store(topic.name), topic.type))
+        try:
+            fields = read_fields(leaves(bag.store(topic.name), topic.type))
+        except InputError as error:  # of a topic that is perhaps of no interest
+            out.notes.append(str(error))
+            continue
         if "epc" in fields:
             found.append((topic, fields))
     if not found:

@@ -127,7 +127,8 @@ def check_rotations(source: str, rows: Integers, table: Array) -> None:
     """InputError for a number of positions and quaternions (N, 7) that is not finite, and a quaternion that is no unit one."""
     for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
         checks.require_finite(source, rows, name, table[:, i])
-    length = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
+    with np.errstate(over="ignore"):
+        length = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
     bad = np.flatnonzero(np.abs(length - 1.0) > UNIT)
     if len(bad):
         i = int(bad[0])

@@ -16,7 +16,7 @@ from factorgraph_loc.readers import native_rfid
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_fields import LIST, Fields, as_nanoseconds, as_number, as_text
 from factorgraph_loc.readers.bag_file import Bag, Stamped
-from factorgraph_loc.readers.tables import NAMES, Table
+from factorgraph_loc.readers.tables import MAX_STAMP, NAMES, Table
 
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
 SIGNALS = {"rssi": POWER, "phase": ANGLE, "frequency": FREQUENCY}
@@ -114,7 +114,10 @@ class Reads:
 
     def _stamp(self, value: Any, row: int) -> int:
         try:
-            return as_nanoseconds(value, self._stamp_unit)
+            stamp = as_nanoseconds(value, self._stamp_unit)
+            if abs(stamp) > MAX_STAMP:
+                raise OverflowError
+            return stamp
         except (ValueError, OverflowError):
             raise bad_field(self._source, "stamp", value, "a time, or a number", row=row) from None
 

@@ -71,7 +71,12 @@ class Listeners:
         """Read the bag."""
         for item in self.bag.messages(list(self._of)):
             for stamper, gatherer in self._of[item.topic]:
-                gatherer.add(item, stamper.stamp(item))
+                try:
+                    gatherer.add(item, stamper.stamp(item))
+                except (AttributeError, TypeError) as error:
+                    kind = self.bag.topics[item.topic].type
+                    where = f"{self.bag.path} {item.topic}:{item.row}"
+                    raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {error}") from error
         for stamper in self.stampers:
             stamper.check()
 
@@ -161,14 +166,7 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
             listeners.stamper(options.sightings.topic, options.sightings.clock),
         )
     if options.camera:
-        out.camera = Images(bag, options.camera.topic, options.camera.clock or options.clock)
-        if not out.camera.known:
-            listeners.add(
-                options.camera.topic, out.camera, listeners.stamper(options.camera.topic, options.camera.clock)
-            )
-        if options.camera.info:
-            out.info = Info(bag, options.camera.info)
-            listeners.add(options.camera.info, out.info, listeners.stamper(options.camera.info, None), timed=False)
+        out.camera, out.info = _listen_to_camera(listeners, options.camera)
     if options.reference:
         topic = options.reference
         stamper = listeners.stamper(topic.topic, topic.clock)
@@ -183,6 +181,20 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
         out.start = Start(bag, options.start.topic)
         listeners.add(options.start.topic, out.start, listeners.stamper(options.start.topic, options.start.clock))
     return out
+
+
+def _listen_to_camera(listeners: Listeners, options: CameraTopic) -> tuple[Images, Info | None]:
+    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
+    images = Images(bag, options.topic, stamper)
+    if images.known:
+        listeners.stampers.append(stamper)
+    else:
+        listeners.add(options.topic, images, stamper)
+    info = None
+    if options.info:
+        info = Info(bag, options.info)
+        listeners.add(options.info, info, listeners.stamper(options.info, None), timed=False)
+    return images, info
 
 
 def _reference(

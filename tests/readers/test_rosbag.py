@@ -6,7 +6,11 @@ import sys
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import parse_model
+from factorgraph_loc.readers import load, rosbag
+from factorgraph_loc.readers.bag_file import open_bag
+from factorgraph_loc.readers.bag_manifest import propose
 from factors import se2
 
 T0 = 1_700_000_000_000_000_000
@@ -263,3 +267,48 @@ def test_a_mapping_without_odometry(mcap, refuse):
 def test_a_stamp_that_is_no_number(mcap, refuse):
     fields = FIELDS | {"stamp": "header.frame_id"}
     refuse(mcap, "drive /rfid:1: stamp is '', expected a time, or a number", rfid={"topic": "/rfid", "fields": fields})
+
+
+def test_damaged_bytes_never_surprise(bag, tmp_path):
+    """A bag with some bytes changed is read, or refused in one line; so is the manifest that is proposed for it."""
+    file = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix in {".mcap", ".db3"})
+    content, damaged = file.read_bytes(), tmp_path / f"damaged{file.suffix}"
+    options = parse_model(rosbag.Options, OPTIONS, "options")
+    rng = np.random.default_rng(7)
+    messages = []
+    for _ in range(25):
+        changed = bytearray(content)
+        for place in rng.integers(len(content), size=4).tolist():
+            changed[place] = int(rng.integers(256))
+        damaged.write_bytes(bytes(changed))
+        for read_damaged in (lambda: rosbag.read(damaged, options), lambda: proposed(damaged)):
+            try:
+                read_damaged()
+            except InputError as error:
+                messages.append(str(error))
+    assert messages
+    assert [message for message in messages if len(message.splitlines()) != 1] == []
+
+
+def proposed(path):
+    with open_bag(path) as opened:
+        return propose(opened)
+
+
+def test_a_topic_that_nobody_can_read_does_not_hide_the_others(tmp_path, bag_maker):
+    with bag_maker(tmp_path / "drive", "sqlite3") as made:
+        fill(made)
+    with sqlite3.connect(tmp_path / "drive" / "drive.db3") as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    found = proposed(tmp_path / "drive")
+    assert set(found.options) == {"odometry", "reference"}
+    assert any("/rfid is of type shop_msgs/msg/Reads, which the bag does not define" in note for note in found.notes)
+
+
+def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refuse):
+    with bag_maker(tmp_path / "drive") as made:
+        fill(made)
+    file = tmp_path / "drive" / "drive.mcap"
+    file.write_bytes(file.read_bytes().replace(b"Quaternion orientation", b"Quaternion orientatiom"))
+    refuse(file, "/odom:1: nav_msgs/msg/Odometry is not defined in the bag as ROS does", rfid=None)

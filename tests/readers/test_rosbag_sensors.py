@@ -187,7 +187,9 @@ def test_images_without_loss(maker, read, one):
         np.testing.assert_array_equal(image, expected)
     before = [file.stat().st_mtime_ns for file in images.file]
     options = {"odometry": {"topic": "/odom"}, "camera": {"topic": "/camera/image_raw"}}
-    again = one(maker.path, reader="rosbag", options=options).streams["camera"]
+    log = one(maker.path, reader="rosbag", options=options)
+    assert "/camera/image_raw 0.000 s" in log.metadata["clock"]  # is known without the messages
+    again = log.streams["camera"]
     assert (again.file, again.t.tolist()) == (images.file, images.t.tolist())
     assert [file.stat().st_mtime_ns for file in again.file] == before  # were not written again
     images.file[2].unlink()
@@ -409,3 +411,12 @@ def test_images_pass_through_memory_one_at_a_time(maker, read):
     tracemalloc.stop()
     assert len(images.file) == 60
     assert peak < 8e6
+
+
+def test_detections_of_tags_without_corners(maker, refuse):
+    lacking = TAGS.replace("Point[4] corners\n", "")
+    maker.store.register(get_types_from_msg(lacking, "apriltag_msgs/msg/AprilTagDetectionArray"))
+    tag = maker.make("apriltag_msgs/msg/AprilTagDetection", family="tag36h11", id=5)
+    kind = "apriltag_msgs/msg/AprilTagDetectionArray"
+    maker.write("/tags", T0, kind, header=maker.header(T0), detections=[tag])
+    refuse(maker, "lacks detections[].corners[].x, detections[].corners[].y", sightings={"topic": "/tags"})
