@@ -19,7 +19,7 @@ from factors.se2 import Array
 
 Wall = tuple[float, float, float, float]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-TOLERANCE = 1.0  # cells that a wall may lie off the outline of the occupied cells
+TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an aslant line is half a cell off them
 MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
 
 
@@ -38,8 +38,8 @@ class MapFile(FileModel):
 def read_walls(path: Path) -> tuple[Wall, ...]:
     """The outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
 
-    They run through the middles of the outermost occupied cells, with corners left out as long as the line stays within a cell of
-    it. InputError names the file and what is wrong.
+    They run through the middles of the outermost occupied cells, within :data:`TOLERANCE`; groups of less than :data:`MIN_EXTENT`
+    are left out. InputError names the file and what is wrong.
     """
     told = parse_model(MapFile, read_flat_yaml(path), path)
     if told.free_thresh >= told.occupied_thresh:

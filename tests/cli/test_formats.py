@@ -1,0 +1,66 @@
+"""What docs/formats.md tells to do with the files of other programs, step by step."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.readers import load
+from factorgraph_loc.world import read_world
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "formats.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    """The files of three programs, with the manifest and the map that the page shows."""
+    folder = tmp_path_factory.mktemp("example") / "hall"
+    subprocess.run([sys.executable, ROOT / "scripts" / "example_folder", folder], check=True, capture_output=True)
+    manifest, world = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)[:2]
+    (folder / "monday.toml").write_text(manifest)
+    (folder / "hall.world.toml").write_text(world)
+    return folder
+
+
+def test_the_tutorial(hall, fgloc, monkeypatch):
+    monkeypatch.chdir(hall)
+    first = fgloc("info", "monday.toml")
+    assert first.exit_code == 0
+    for line in re.search(r"```text\n(.*?)```", PAGE, re.DOTALL).group(1).splitlines():
+        assert line in first.stdout
+    assert "2105 reads of 39 tags of the map" in first.stdout
+    (offset,) = re.findall(r"```toml\n(clock_offset = .*?\n)```", PAGE)
+    text = Path("monday.toml").read_text()
+    Path("monday.toml").write_text(text.replace("[options.odometry]\n", f"[options.odometry]\n{offset}"))
+    second = fgloc("info", "monday.toml")
+    assert "do not overlap" not in second.stdout
+    assert "clocks agree" not in second.stdout
+    compared = fgloc("compare", "monday.toml", "-e", "dead_reckoning,smoother", "-o", "out", "--json")
+    assert compared.exit_code == 0
+    error = {row["estimator"]: row["final.position_rmse"] for row in json.loads(compared.stdout)["runs"]}
+    assert f"off by {error['smoother']:.2f} m, odometry alone by {error['dead_reckoning']:.1f} m" in PAGE.replace(
+        "\n", " "
+    )
+    assert fgloc("convert", "monday.toml", "copy").exit_code == 0
+    (log,), (copy,) = load("monday.toml"), load("copy")
+    assert copy.world == log.world
+    assert len(log.world.walls) > 20
+    for column in ("t", "age", "round"):
+        np.testing.assert_allclose(
+            getattr(copy.streams["rfid"], column), getattr(log.streams["rfid"], column), rtol=0, atol=2e-9
+        )
+    np.testing.assert_array_equal(copy.streams["odometry"].dx, log.streams["odometry"].dx)
+
+
+def test_the_markers_of_the_page_are_a_map(tmp_path):
+    family, markers = (block for block in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "[markers]" in block)
+    assert 'family = "tag36h11"' in family
+    (tmp_path / "a.world.toml").write_text(markers)
+    points = read_world(tmp_path / "a.world.toml").points
+    assert points.names[:4] == tuple(f"tag36h11-7/{i}" for i in range(4))
+    np.testing.assert_allclose(points.positions[4:, 2], 2.8, atol=1e-6)
