@@ -96,7 +96,7 @@ class Mapped:
         out = np.empty(len(self.cells.rows), dtype=np.int64)
         for i, text in enumerate(self.cells.columns[column]):
             try:
-                stamp = iso_nanoseconds(text) if unit == ISO else _decimal(text, SECONDS[str(unit)])
+                stamp = iso_nanoseconds(text) if unit == ISO else self._decimal(text, SECONDS[str(unit)])
                 if abs(stamp + shift) >= MAX_STAMP:
                     raise OverflowError
             except (ValueError, OverflowError, InvalidOperation):
@@ -104,6 +104,10 @@ class Mapped:
                 raise bad_field(self.path, column, text, expected, row=self.cells.rows[i]) from None
             out[i] = stamp + shift
         return out
+
+    def _decimal(self, text: str, power: int) -> int:
+        """A decimal number times ten to ``power``, rounded, without the errors of floating point."""
+        return round(Decimal(text.replace(self.mapping.decimal, ".")).scaleb(power))
 
     def _factor(self, field: str, units: Mapping[str, float]) -> float:
         unit = self.mapping.units.get(field, next(iter(units)))
@@ -158,11 +162,6 @@ def iso_nanoseconds(text: str) -> int:
         moment = moment.replace(tzinfo=UTC)
     digits = fraction.group(1) if fraction else ""
     return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
-
-
-def _decimal(text: str, power: int) -> int:
-    """A decimal number times ten to ``power``, rounded, without the errors of floating point."""
-    return round(Decimal(text.replace(",", ".")).scaleb(power))
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cells:

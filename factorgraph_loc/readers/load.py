@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from factorgraph_loc.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, nearest, parse_model, read_toml
 from factorgraph_loc.log import Log
@@ -21,6 +22,7 @@ from factorgraph_loc.shipped import manifests
 from factorgraph_loc.world import World, read_world
 
 RUN_FILE = "run.toml"
+TABLES = (".csv", *JSON_SUFFIXES)
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,8 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
             return _Source("native", path.parent)
         if path.suffix == ".toml":
             return _from_manifest(path, data_root)
+        if path.suffix.lower() in TABLES:
+            raise InputError(f"{log}: is a table: a manifest with the reader mapped says what its columns are")
         raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
     known = manifests()
     if log in known:

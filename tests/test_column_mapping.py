@@ -1,0 +1,117 @@
+"""Tables of other programs: stamps, numbers and columns as they stand there."""
+
+from datetime import UTC, datetime, timedelta, timezone
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.column_mapping import LENGTH, SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
+from factorgraph_loc.csv_cells import Cells
+from factorgraph_loc.errors import InputError
+
+STAMPS = st.integers(-(2**61), 2**61)
+
+
+def mapped(texts, **more):
+    """A column ``c`` that is mapped to ``t``."""
+    mapping = ColumnMapping(file="a.csv", columns={"t": "c"}, **more)
+    return Mapped(Cells(Path("a.csv"), range(2, len(texts) + 2), {"c": texts}), mapping, ("t",))
+
+
+@given(stamps=st.lists(STAMPS, min_size=1, max_size=5), unit=st.sampled_from(list(SECONDS)), mark=st.sampled_from(".,"))
+def test_stamps_are_exact_in_each_unit(stamps, unit, mark):
+    texts = [f"{Decimal(stamp).scaleb(-SECONDS[unit]):f}".replace(".", mark) for stamp in stamps]
+    assert mapped(texts, units={"t": unit}, decimal=mark).stamps("t").tolist() == stamps
+
+
+@given(stamp=st.integers(0, 4 * 10**18), minutes=st.integers(-14 * 60, 14 * 60), separator=st.sampled_from("T "))
+def test_dates_are_exact_in_each_zone(stamp, minutes, separator):
+    zone = timezone(timedelta(minutes=minutes))
+    moment = datetime.fromtimestamp(stamp // 10**9, UTC).astimezone(zone)
+    date, clock = moment.date(), moment.replace(tzinfo=None).time()
+    offset = f"{'-' if minutes < 0 else '+'}{abs(minutes) // 60:02d}:{abs(minutes) % 60:02d}"
+    assert iso_nanoseconds(f"{date}{separator}{clock}.{stamp % 10**9:09d}{offset}") == stamp
+
+
+@pytest.mark.parametrize("text", ["1,700", "1e30", "nan", "inf", "", "12:00", "0x10"])
+def test_what_is_no_stamp(text):
+    with pytest.raises(InputError, match=r"a\.csv:2: c is .*, expected a number of s"):
+        mapped([text], units={"t": "s"}).stamps("t")
+
+
+@pytest.mark.parametrize("text", ["1700000000", "2026-13-01T00:00:00", "4/9/2026", ""])
+def test_what_is_no_date(text):
+    with pytest.raises(InputError, match="expected a date and time"):
+        mapped([text], units={"t": "iso"}).stamps("t")
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Reads a file of this content by a mapping."""
+
+    def call(content, name="a.csv", optional=(), **mapping):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+        told = ColumnMapping(file=name, **mapping)
+        return read_mapped(tmp_path / name, told, (tuple(f for f in told.columns if f not in optional),), optional)
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("content", "more"),
+    [
+        ("x,y\n1,2\n3,4\n", {}),
+        ("\ufeffx , y\r\n1, 2\r\n\r\n3,4\r\n", {}),
+        ("# made by hand\n# x,y\n1,2\n# later\n3,4\n", {}),
+        ("// x, y\n1, 2\n3, 4", {}),
+        ('x,note,y\n1,"a, b",2\n3,,4\n', {}),
+        ("x;y\n1,0;2,0\n3;4\n", {"separator": ";", "decimal": ","}),
+        ("y\tx\n2\t1\n4\t3\n", {"separator": "\t"}),
+        ("x  y\n1   2\n  3 4\n", {"separator": " "}),
+    ],
+)
+def test_ways_to_write_a_table(read, content, more):
+    found = read(content, columns={"a": "x", "b": "y"}, **more)
+    np.testing.assert_array_equal(found.numbers("a", LENGTH), (1.0, 3.0))
+    np.testing.assert_array_equal(found.numbers("b", LENGTH), (2.0, 4.0))
+
+
+def test_columns_by_number_and_by_factor(read):
+    found = read("1,2\n3,4\n", columns={"a": "2"}, units={"a": 0.5}, header=False)
+    np.testing.assert_array_equal(found.numbers("a", LENGTH), (1.0, 2.0))
+    assert found.rows.tolist() == [1, 2]
+
+
+def test_optional_columns_may_be_missing(read):
+    found = read("x\n1\n", columns={"a": "x", "b": "y"}, optional=("b",))
+    assert found.fields == ("a",)
+
+
+def test_json_lines_of_several_kinds(read):
+    lines = '{"p": {"x": 1}}\n\n[{"p": {"x": 2, "y": null}}, {"other": 3}]\n{"p": {"x": 3, "y": "4"}}\n'
+    found = read(lines, "a.jsonl", optional=("b",), columns={"a": "p.x", "b": "p.y"})
+    assert found.passed == 1
+    assert found.rows.tolist() == [1, 3, 4]
+    np.testing.assert_array_equal(found.numbers("b", LENGTH), (np.nan, np.nan, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("content", "mapping", "fragments"),
+    [
+        ("x,x\n1,2\n", {"columns": {"a": "x"}}, ("a.csv:1", "'x' more than once")),
+        ("x\n1\n", {"columns": {"a": "3"}, "header": False}, ("a.csv:1", "no column '3', it has 1")),
+        ("x,y\n1,2\n3\n", {"columns": {"a": "x"}}, ("a.csv:3", "2 values: x,y")),
+        ('x,y\n1,"2\n', {"columns": {"a": "x"}}, ("a.csv:2", "is not CSV")),
+        ("# only this\n", {"columns": {"a": "x"}}, ("a.csv: holds no rows",)),
+    ],
+)
+def test_wrong_tables(read, content, mapping, fragments):
+    with pytest.raises(InputError) as caught:
+        read(content, **mapping)
+    assert "\n" not in str(caught.value)
+    for fragment in fragments:
+        assert fragment in str(caught.value)
