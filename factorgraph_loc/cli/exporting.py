@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_loc.cli.options import DataRoot, LogOptions, Reader, ReaderOption, RigFile, WorldFile
-from factorgraph_loc.cli.viewing import What, load_results
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
+from factorgraph_loc.cli.viewing import What, load_results, shown
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,12 +36,13 @@ def export(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    json: Json = False,
 ) -> None:
     """Write runs for Foxglove, or one run's final trajectory, or the reference of a log, for other programs."""
     if out.suffix not in FORMATS:
         raise InputError(f"{out}: has the suffix {out.suffix!r}, expected one of {', '.join(FORMATS)}")
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
-    also = ""
+    files = [out]
     if out.suffix == ".mcap":
         from factorgraph_loc.exports.foxglove import write_mcap
 
@@ -54,12 +56,15 @@ def export(
     elif out.suffix == ".kitti":
         from factorgraph_loc.exports.trajectories import write_kitti
 
-        also = f" and {write_kitti(_trajectory(log, runs, out), out)}"
+        files.append(write_kitti(_trajectory(log, runs, out), out))
     else:
         from factorgraph_loc.trajectory import write_tum
 
         write_tum(_trajectory(log, runs, out), out, log.t0_ns)
-    typer.echo(f"wrote {out}{also}")
+    if json:
+        show.document(shown(log, runs) | {"files": [str(file) for file in files]})
+    else:
+        typer.echo(f"wrote {' and '.join(map(str, files))}")
 
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:

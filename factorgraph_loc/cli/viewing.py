@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from factorgraph_loc.cli.options import DataRoot, LogOptions, Reader, ReaderOption, RigFile, WorldFile
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.shipped import manifests
 
@@ -34,6 +35,7 @@ def view(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    json: Json = False,
 ) -> None:
     """Look at a log and at runs of it along time, in Rerun."""
     from factorgraph_loc.exports import rerun_scene
@@ -41,9 +43,17 @@ def view(
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
     if rrd is None:
         rerun_scene.show(log, runs)
-        return
-    rerun_scene.write_rrd(log, runs, rrd)
-    typer.echo(f"wrote {rrd}: rerun {rrd} shows it")
+    else:
+        rerun_scene.write_rrd(log, runs, rrd)
+    if json:
+        show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
+    elif rrd is not None:
+        typer.echo(f"wrote {rrd}: rerun {rrd} shows it")
+
+
+def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
+    """What is shown or written, for ``--json``."""
+    return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 
 def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[StoredRun]]:

@@ -1,5 +1,7 @@
 """``fgloc export``: files for other programs, by their suffix."""
 
+import json
+
 import gtsam
 import numpy as np
 import pytest
@@ -28,7 +30,12 @@ def ekf(comparison):
 def test_trajectories(fgloc, short_log, ekf, tmp_path):
     result = fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.kitti")
     assert result.stdout == f"wrote {tmp_path / 'ekf.kitti'} and {tmp_path / 'ekf.times.txt'}\n"
-    assert fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.tum").exit_code == 0
+    result = fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.tum", "--json")
+    assert json.loads(result.stdout) == {
+        "log": "short",
+        "runs": {"ekf": str(ekf)},
+        "files": [str(tmp_path / "ekf.tum")],
+    }
     final = read_tum(ekf / "final.tum")
     assert np.array_equal(read_tum(tmp_path / "ekf.tum").poses, final.poses)
     kitti = file_interface.read_kitti_poses_file(str(tmp_path / "ekf.kitti"))
