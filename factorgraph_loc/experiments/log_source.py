@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import read_toml
+from factorgraph_loc.flat_yaml import read_flat_yaml
 from factorgraph_loc.shipped import manifests
 
 if TYPE_CHECKING:
     from factorgraph_loc.log import Log
 
 RUN_FILE = "run.toml"
+NAMING = {".toml": read_toml, ".yaml": read_flat_yaml, ".yml": read_flat_yaml}  # files that name others
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,9 @@ class RecordedSource:
             return
         from factorgraph_loc.readers.manifests import find_data_root  # noqa: PLC0415
 
-        root = find_data_root(None if self.data_root is None else Path(self.data_root), path)
+        beside = (path.parent / str(content["path"])).exists()  # one's own manifest, beside its log
+        given = None if self.data_root is None else Path(self.data_root)
+        root = path.parent if beside else find_data_root(given, path)
         names = list(content.get("checksums", {})) or [str(content["path"])]
         for name in names:
             yield from _of_folder(root / name) if (root / name).is_dir() else [(name, root / name)]
@@ -163,8 +167,8 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
             continue
         met.add(file)
         yield file.relative_to(Path(path).parent).as_posix(), file
-        if file.suffix == ".toml" and file.is_file():
-            named = (file.parent / text for text in _texts(read_toml(file)) if text and len(text) < 200)
+        if file.suffix in NAMING and file.is_file():
+            named = (file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text) < 200)
             waiting += [one for one in named if one.is_relative_to(Path(path).parent) and one.is_file()]
 
 
