@@ -26,6 +26,12 @@ class _State:
     covariance: Array  # body frame
 
 
+@dataclass(frozen=True)
+class _Record:
+    t: float
+    state: _State
+
+
 class DeadReckoning(Filter):
     """Composes the odometry, with the covariance that grows on the way; landmarks are counted as ignored."""
 
@@ -33,11 +39,12 @@ class DeadReckoning(Filter):
 
     def trajectory(self) -> Trajectory:
         """The same as the causal estimates: there is nothing to smooth."""
+        records: list[_Record] = self._records
         return at_ticks(
             self._ticks,
-            np.array([t for t, _ in self._records]),
-            np.array([s.pose for _, s in self._records]),
-            np.array([s.covariance for _, s in self._records]),
+            np.array([r.t for r in records]),
+            np.array([r.state.pose for r in records]),
+            np.array([r.state.covariance for r in records]),
         )
 
     def _start(self, prior: PosePrior) -> _State:
@@ -53,5 +60,5 @@ class DeadReckoning(Filter):
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance)
 
-    def _record(self) -> tuple[float, _State]:
-        return self._t, self._state
+    def _record(self) -> _Record:
+        return _Record(self._t, self._state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -100,6 +101,15 @@ class Filter(ABC):
     def learnt(self) -> Learnt:
         """Nothing, unless the filter says otherwise."""
         return Learnt()
+
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, but not what late measurements may still change."""
+        t = min(before, self._t - self._max_delay)
+        records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
+        ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
+        del self._records[:records], self._ticks[:ticks]
+        # checkpoints tell how many there were
+        self._events = deque((m, (*rest, r - records, k - ticks)) for m, (*rest, r, k) in self._events)
 
     @abstractmethod
     def trajectory(self) -> Trajectory:

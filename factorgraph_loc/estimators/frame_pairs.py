@@ -43,8 +43,9 @@ class FramePairs:
         if self._last is None:
             return None
         before = self._last.keyframe
-        there = before.index < len(keyframes) and keyframes[before.index] is before
-        return before if there and 0.0 < keyframe.t - before.t <= MAX_TIME else None
+        if not 0.0 < keyframe.t - before.t <= MAX_TIME:
+            return None
+        return before if before.index < len(keyframes) and keyframes[before.index] is before else None
 
     def take(
         self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None

@@ -22,6 +22,7 @@ from factorgraph_loc.estimators.base import (
     gaussian_belief,
 )
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt, between_keyframes
+from factorgraph_loc.estimators.kept import Kept
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.problem import Problem
@@ -69,8 +70,8 @@ class KeyframeGraph(ABC):
         self._departed: tuple[Values, Values] = {}, {}
         # all variables but the poses: estimate and covariance
         self._constants, self._spreads = self._constant_priors()
-        self._keyframes: list[Keyframe] = []
-        self._keyframe_times: list[float] = []
+        self._keyframes: Kept[Keyframe] = Kept()
+        self._keyframe_times: Kept[float] = Kept()
         self._ticks: list[TickAt] = []
         self._t = -math.inf
         self._prior: PosePrior | None = None
@@ -85,7 +86,7 @@ class KeyframeGraph(ABC):
         self._pose = np.array(prior.pose, dtype=float)
         self._covariance = se2.world_to_body(prior.pose, prior.covariance)
         first = Keyframe(0, prior.t, self._motion.state(prior.t), None)
-        self._keyframes, self._keyframe_times = [first], [prior.t]
+        self._keyframes, self._keyframe_times = Kept([first]), Kept([prior.t])
         self._begin(first)
 
     def process(self, measurement: Measurement) -> None:
@@ -174,7 +175,7 @@ class KeyframeGraph(ABC):
         return 0 <= keyframe < len(self._keyframes)
 
     def _keyframe_before(self, t: float) -> Keyframe:
-        return self._keyframes[bisect.bisect_right(self._keyframe_times, t) - 1]
+        return self._keyframes[bisect.bisect_right(self._keyframe_times, t, self._keyframe_times.first) - 1]
 
     def _since(self, keyframe: Keyframe, t: float) -> Increment:
         return self._recalibrated(self._motion.relative(keyframe.odometry, self._motion.state(t)))
@@ -258,8 +259,12 @@ class KeyframeGraph(ABC):
 
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""
-        steps = [self._recalibrated(k.from_previous) for k in self._keyframes if k.from_previous is not None]
-        ticks = [replace(tick, since=self._recalibrated(tick.since)) for tick in self._ticks]
+        _, *later = self._keyframes
+        steps = [self._recalibrated(k.from_previous) for k in later if k.from_previous is not None]
+        first = self._keyframes.first
+        ticks = [
+            replace(tick, keyframe=tick.keyframe - first, since=self._recalibrated(tick.since)) for tick in self._ticks
+        ]
         return between_keyframes(ticks, steps, poses, covariances)
 
 

@@ -13,6 +13,7 @@ Where the place is not known, at an unknown start or once it is refuted, particl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
@@ -107,6 +108,7 @@ class ParticleFilter(Filter):
             found = [(r.mean, r.covariance) for r in records]
         else:
             kept = [r for r in self._records if r.cloud is not None]
+            records = [r for r in records if r.t >= kept[0].t]
             if kept[-1] is not self._records[-1]:
                 kept.append(replace(self._records[-1], cloud=self._state))
             simulation = BackwardSimulation(
@@ -115,6 +117,11 @@ class ParticleFilter(Filter):
             found = [simulation.at(r) for r in records]
         poses = np.array([pose for pose, _ in found]).reshape(-1, 3)
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in found]).reshape(-1, 3, 3))
+
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, from the last cloud back that is kept for smoothing."""
+        clouds = [r.t for r in self._records if r.cloud is not None and r.t <= before]
+        super().forget(max(clouds, default=-math.inf) if self._smooth else before)
 
     def _start(self, prior: PosePrior) -> Cloud:
         self._scans.start(found=False)

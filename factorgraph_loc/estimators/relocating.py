@@ -203,7 +203,7 @@ class RelocatingGraph(MeasuringGraph):
 
     def _go_on(self, since: float) -> None:
         """Take back what was added since then, and add it once more at the place that was found."""
-        index = max(1, bisect.bisect_left(self._keyframe_times, since))
+        index = max(1, bisect.bisect_left(self._keyframe_times, since, self._keyframe_times.first))
         while not self._is_open(index - 1):
             index += 1
         t = max(since, self._keyframes[index - 1].t)

@@ -7,6 +7,7 @@ graph is also kept here, and the solver is rebuilt from it.
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -18,9 +19,11 @@ from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.kept import Kept
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window, read_all
+from factorgraph_loc.estimators.unknown_points import HORIZON
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point, is_pose
 from factors import se2
 from factors.odometry import between_factor
@@ -35,6 +38,7 @@ NOWHERE: Mapping[int, Array] = {}
 # Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
 JUMPED = 50.0
 ITERATIONS_AFTER_FAILURE = 10
+LOOKED_BACK = HORIZON + 1  # newest keyframes that are never forgotten: points that wait are looked for in them
 
 
 class SmootherSettings(GraphSettings):
@@ -66,22 +70,31 @@ class Smoother(RelocatingGraph):
         self._defers = known and (settings.lag is None or settings.lag >= 2.0 * SOLVE_INTERVAL)
         self._solved = -math.inf  # the time of the newest keyframe in the solver
         # of each keyframe: its causal estimate, and the final one where it has left the window
-        self._filtered: list[tuple[Array, Array]] = []
-        self._left: list[tuple[Array, Array]] = []
+        self._filtered: Kept[tuple[Array, Array]] = Kept()
+        self._left: Kept[tuple[Array, Array]] = Kept()
+
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, as far as it has left the window; a full history keeps all."""
+        t = min(before, self._t - self._settings.max_delay)
+        count = bisect.bisect_right(self._keyframe_times, t, self._keyframe_times.first) - 1
+        count = min(count, len(self._left), len(self._keyframes) - LOOKED_BACK)
+        for kept in (self._keyframes, self._keyframe_times, self._filtered, self._left):
+            kept.forget(count)
+        self._ticks = [tick for tick in self._ticks if tick.keyframe >= self._keyframes.first]
 
     def _final(self) -> tuple[Array, Array]:
         """Full history: the whole graph, solved to the end. With a window: each pose as it left the window."""
         if self._waiting.nodes:
             self._update([], {})
         if not self._settings.smooth:
-            estimates = self._filtered
+            estimates = list(self._filtered)
         elif isinstance(self._solver, FullHistory):
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
             return self._optimum(values | {key: self._solver.value(key) for key in self._constants})
         else:
             for key in self._constants:
                 self._constants[key], self._spreads[key] = self._marginal(key)
-            estimates = self._left + [self._marginal(k.key) for k in self._keyframes[len(self._left) :]]
+            estimates = [*self._left, *(self._marginal(k.key) for k in self._keyframes[len(self._left) :])]
         return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
 
     def _optimum(self, start: Values) -> tuple[Array, Array]:

@@ -130,6 +130,13 @@ class Switching:
         ticks = [t for t in self._ticks if times and t >= times[0]]
         return at_ticks(ticks, np.array(times), poses, covariances)
 
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, as far as both filters do not need it for late measurements."""
+        for part in (self._tags, self._vision):
+            part.forget(before)
+        self._ticks = [t for t in self._ticks if t >= before]
+        self._records = {t: record for t, record in self._records.items() if t >= before}
+
     def _hand_over(self, other: Filter) -> None:
         """Give the word to ``other``; without a known pose there is nothing to hand over."""
         if other is self._active:

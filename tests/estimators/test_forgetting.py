@@ -1,0 +1,96 @@
+"""Estimators that forget their past: what is left is what it would be with all of it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorgraph_loc.estimators.kept import Kept
+from factorgraph_loc.estimators.registry import Setup, create, settings_of
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.measurements import Odometry, Tick
+from factorgraph_loc.simulation import named_settings, simulate
+
+CASES = [
+    ("dead_reckoning", ("odometry",), {}),
+    ("ekf", ("odometry", "bearing_range"), {}),
+    ("particle_filter", ("odometry", "bearing_range"), {"particles": 300, "smooth": False}),
+    ("switching", ("odometry", "rfid", "bearing_range"), {"particles": 300}),
+    ("smoother", ("odometry", "bearing_range"), {"lag": 3.0}),
+    ("smoother", ("odometry", "rfid"), {"lag": 3.0, "smooth": False}),
+]
+
+
+@pytest.fixture(scope="module")
+def log():
+    changes = {"drive": {"duration": 60.0}, "world": {"tags": 12, "landmarks": 12}}
+    return simulate(named_settings("office", changes), 4)
+
+
+def driven(log, name, sensors, settings, forget):
+    """An estimator after a log with late measurements, which forgets what is older than ``forget`` seconds."""
+    estimator = create(name, Setup(log.rig, log.world, sensors, np.random.default_rng(1)), settings_of(name, settings))
+    prior, _ = resolve_prior(log, None)
+    estimator.initialize(prior)
+    held, causal = None, []
+    for i, m in enumerate(m for m in log.measurements(sensors) if m.t > prior.t):
+        estimator.process(m)
+        if held is not None and m.t > held.t + 0.3:
+            estimator.process(held)
+            held = None
+        elif held is None and i % 7 == 0 and not isinstance(m, Odometry):
+            held = m
+        if i % 5 == 0:
+            estimator.process(Tick(m.t))
+            causal.append(estimator.estimate().pose)
+            if forget is not None:
+                estimator.forget(m.t - forget)
+    return estimator, np.array(causal)
+
+
+@pytest.mark.parametrize(("name", "sensors", "settings"), CASES)
+def test_what_is_left_is_the_same(log, name, sensors, settings):
+    whole, estimates = driven(log, name, sensors, settings, None)
+    short, same = driven(log, name, sensors, settings, 0.0)
+    assert np.array_equal(same, estimates)
+    expected, left = whole.trajectory(), short.trajectory()
+    assert 0 < len(left) < len(expected)
+    assert left.t == pytest.approx(expected.t[-len(left) :], abs=0.0)
+    assert left.poses == pytest.approx(expected.poses[-len(left) :], abs=1e-9)
+    assert left.covariances == pytest.approx(expected.covariances[-len(left) :], abs=1e-9)
+
+
+def test_clouds_are_kept_as_far_as_smoothing_needs_them(log):
+    settings = {"particles": 300, "smoothing_interval": 5.0}
+    estimator, _ = driven(log, "particle_filter", ("odometry", "bearing_range"), settings, 2.0)
+    left = estimator.trajectory()
+    end = log.span()[1]
+    assert end - 13.0 < left.t[0] < end - 2.0
+    assert np.all(np.isfinite(left.poses))
+
+
+def test_a_full_history_forgets_nothing(log):
+    whole, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, None)
+    short, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, 1.0)
+    assert len(short.trajectory()) == len(whole.trajectory())
+
+
+@given(st.lists(st.integers(), max_size=12), st.integers(0, 15), st.integers(-14, 14), st.integers(-14, 14))
+def test_a_kept_list_keeps_its_numbers(items, before, start, stop):
+    kept, count = Kept(items), min(before, len(items))
+    kept.forget(before)
+    assert (len(kept), kept.first, list(kept)) == (len(items), count, items[count:])
+    plain = slice(*slice(start, stop).indices(len(items))[:2])
+    assert kept[start:stop] == items[max(count, plain.start) : max(count, plain.stop)]
+    for number in range(-len(items), len(items)):
+        if number % len(items) >= count:
+            assert kept[number] == items[number]
+        else:
+            with pytest.raises(IndexError):
+                kept[number]
+    kept.append(7)
+    kept += [8]
+    kept[-1] = 9
+    assert kept[len(items) :] == [7, 9]
+    del kept[len(items) :]
+    assert list(kept) == items[count:]
