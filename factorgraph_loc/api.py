@@ -31,7 +31,7 @@ from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
-from factorgraph_loc.readers import Dataset, describe, load, write_native
+from factorgraph_loc.readers import Dataset, describe, load, write_log, write_native
 from factorgraph_loc.readers.native import require_new
 from factorgraph_loc.rig import write_rig
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
@@ -83,8 +83,9 @@ def info(log: LogLike) -> Inspection:
 
 
 def convert(log: LogLike, out: str | Path, *, format: Literal["csv", "parquet"] = "csv") -> None:
-    """Write a log in the native format into a new folder; ``format`` of its tables: csv or parquet."""
-    write_native(_one(log), Path(out), format=format)
+    """Write a log in the native format into a new folder, with tables of ``format``, or, where ``out`` ends with .bag, .mcap or
+    .db3, as a ROS bag."""
+    write_log(_one(log), Path(out), format=format)
 
 
 def run(

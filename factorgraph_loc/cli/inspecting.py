@@ -95,21 +95,15 @@ def convert(
     json: Json = False,
 ) -> None:
     """Write a log in the native format, a folder of tables that any program can read, or as a ROS bag."""
-    from factorgraph_loc.readers import write_native
-    from factorgraph_loc.readers.bag_export import write_bag
-    from factorgraph_loc.readers.bag_file import SUFFIXES
+    from factorgraph_loc.readers import write_log
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
-    if out.suffix in SUFFIXES:
-        files = write_bag(loaded, out)
-        folder = out.parent
-    else:
-        write_native(loaded, out, format=format.value)
-        files, folder = list(out.iterdir()), out
+    files = write_log(loaded, out, format=format.value)
     if json:
-        show.document({"log": loaded.name, "folder": str(folder), "files": sorted(path.name for path in files)})
+        names = sorted(path.name for path in files)
+        show.document({"log": loaded.name, "folder": str(files[0].parent), "files": names})
     else:
         typer.echo(f"wrote {out}")
 

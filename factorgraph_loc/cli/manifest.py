@@ -13,10 +13,10 @@ from factorgraph_loc.cli.options import Json
 BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")]
 
 
-def manifest(bag: BagPath) -> None:
+def manifest(bag: BagPath, json: Json = False) -> None:
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file, and look through it."""
     from factorgraph_loc.readers.bag_file import open_bag
-    from factorgraph_loc.readers.bag_manifest import manifest_text, propose
+    from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, remarks
 
     path, here = bag.resolve(), Path.cwd().resolve()
     below = path.is_relative_to(here)
@@ -28,10 +28,15 @@ def manifest(bag: BagPath) -> None:
         if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file()
     }
     with open_bag(path) as opened:
-        text = manifest_text(opened, propose(opened), path.relative_to(root).as_posix(), beside)
+        proposal = propose(opened)
+        content = manifest_of(proposal, path.relative_to(root).as_posix(), beside)
+        told = remarks(opened, proposal, beside)
     if not below:
         show.note(f"the manifest names {path.name} alone: put it into {path.parent}, or give --data-root {path.parent}")
-    typer.echo(text, nl=False)
+    if json:
+        show.document({"manifest": content, "remarks": told})
+    else:
+        typer.echo(manifest_text(content, told), nl=False)
 
 
 def info_of_bag(bag: Path, json: Json) -> None:

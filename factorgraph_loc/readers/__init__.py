@@ -4,6 +4,7 @@ from factorgraph_loc.readers.load import load
 from factorgraph_loc.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
 from factorgraph_loc.readers.native import write_native
 from factorgraph_loc.readers.registry import READERS
+from factorgraph_loc.readers.write import write_log
 from factorgraph_loc.shipped import manifests
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "manifests",
     "read_manifest",
     "verify",
+    "write_log",
     "write_native",
 ]

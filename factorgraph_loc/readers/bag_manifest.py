@@ -91,33 +91,36 @@ def propose(bag: Bag) -> Proposal:
     return out
 
 
-def manifest_text(bag: Bag, proposal: Proposal, path: str, beside: Mapping[str, str]) -> str:
-    """The manifest as TOML, with the topics that it does not use as comments; ``beside``: names of rig and world that exist."""
-    head = {
+def manifest_of(proposal: Proposal, path: str, beside: Mapping[str, str]) -> dict[str, Any]:
+    """The manifest, which names the bag as ``path``; ``beside``: names of rig and world that exist."""
+    return {
         "title": f"What the bag {Path(path).name} holds",
         "reader": "rosbag",
         "path": path,
         **beside,
         "licence": "none stated",
         "origin": "your own recording",
+        "options": proposal.options,
     }
-    notes = list(proposal.notes)
+
+
+def remarks(bag: Bag, proposal: Proposal, beside: Mapping[str, str]) -> list[str]:
+    """What a person has to look at in a proposed manifest, and the topics that it does not use."""
+    out = list(proposal.notes)
     if "rig" not in beside:
-        notes.append('no rig is given: rig = "NAME.rig.toml", beside this file, says what the robot is like')
+        out.append('no rig is given: rig = "NAME.rig.toml", beside this file, says what the robot is like')
     if "world" not in beside:
-        notes.append('no map is given: world = "NAME.world.toml", beside this file, says where tags and landmarks are')
-    comments = [f"# {note}" for note in notes]
+        out.append('no map is given: world = "NAME.world.toml", beside this file, says where tags and landmarks are')
     unused = [topic for topic in bag.topics.values() if topic.name not in proposal.uses]
-    if unused:
-        comments += ["# not used:", *(f"#   {topic.name} ({topic.type}, {topic.count} messages)" for topic in unused)]
-    scalars = {key: value for key, value in proposal.options.items() if not isinstance(value, dict)}
-    tables = {key: value for key, value in proposal.options.items() if isinstance(value, dict)}
-    return (
-        tomli_w.dumps(head)
-        + "".join(f"{line}\n" for line in comments)
-        + "\n"
-        + tomli_w.dumps({"options": scalars | tables})
-    )
+    return out + [f"not used: {topic.name} ({topic.type}, {topic.count} messages)" for topic in unused]
+
+
+def manifest_text(manifest: Mapping[str, Any], told: Sequence[str]) -> str:
+    """A manifest as TOML, with what is ``told`` as comments."""
+    head = {key: value for key, value in manifest.items() if key != "options"}
+    options = dict(sorted(manifest["options"].items(), key=lambda item: isinstance(item[1], dict)))  # tables come last
+    comments = "".join(f"# {line}\n" for line in told)
+    return f"{tomli_w.dumps(head)}{comments}\n{tomli_w.dumps({'options': options})}"
 
 
 def _motion(out: Proposal, topics: Sequence[Topic]) -> None:

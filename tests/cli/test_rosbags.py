@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,22 @@ def test_from_a_bag_to_a_comparison(recorded, fgloc, monkeypatch):
     error = {row["estimator"]: row["final.position_rmse"] for row in json.loads(compared.stdout)["runs"]}
     assert error["smoother"] < 0.3
     assert error["smoother"] < error["dead_reckoning"]
+    pytest.importorskip("rerun", reason="needs the extra viewer")
+    assert fgloc("view", "out", "run.toml", "--rrd", "drive.rrd").exit_code == 0
+    assert Path("drive.rrd").stat().st_size > 10_000
 
 
 def test_topics_as_json(recorded, fgloc):
     document = json.loads(fgloc("info", recorded, "--json").stdout)
     uses = {topic["topic"]: (topic["use"], topic["messages"]) for topic in document["topics"]}
     assert uses == {"/odom": ("odometry", 151), "/mocap/pose": ("reference", 151), "/rfid/tags": ("rfid", 240)}
+
+
+def test_a_manifest_as_json(recorded, fgloc, monkeypatch):
+    monkeypatch.chdir(recorded.parent)
+    document = json.loads(fgloc("manifest", recorded, "--json").stdout)
+    assert document["manifest"] == tomllib.loads(fgloc("manifest", recorded).stdout)
+    assert document["remarks"][0].startswith("rfid: each message is taken as one inventory round")
 
 
 def test_a_manifest_of_a_bag_elsewhere(recorded, fgloc, monkeypatch, tmp_path):

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_idl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import parse_model
@@ -312,3 +313,24 @@ def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refus
     file = tmp_path / "drive" / "drive.mcap"
     file.write_bytes(file.read_bytes().replace(b"Quaternion orientation", b"Quaternion orientatiom"))
     refuse(file, "/odom:1: nav_msgs/msg/Odometry is not defined in the bag as ROS does", rfid=None)
+
+
+IDL = """\
+================================================================================
+IDL: shop_msgs/msg/Ping
+module shop_msgs { module msg { struct Ping { string epc; double power; }; }; };
+"""
+
+
+def test_definitions_in_idl(tmp_path, bag_maker, read):
+    """As some middlewares of ROS 2 record them."""
+    with bag_maker(tmp_path / "drive") as made:
+        fill(made)
+        made.store.register(get_types_from_idl(IDL.partition("shop_msgs/msg/Ping\n")[2]))
+        kind = "shop_msgs/msg/Ping"
+        connection = made.writer.add_connection("/ping", kind, msgdef=IDL, rihs01=made.store.hash_rihs01(kind))
+        message = made.make(kind, epc="E2CC", power=-55.0)
+        made.writer.write(connection, T0 + 50 * MS, made.store.serialize_cdr(message, kind))
+    rfid = {"topic": "/ping", "fields": {"epc": "epc", "rssi": "power"}, "antenna": "front"}
+    reads = read(tmp_path / "drive", rfid=rfid).streams["rfid"]
+    assert (reads.epc, reads.rssi.tolist(), reads.t.tolist()) == (["E2CC"], [-55.0], [0.05])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import manifest_text, propose, read_fields
+from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, read_fields, remarks
 
 T0 = 1_700_000_000_000_000_000
 
@@ -20,7 +20,8 @@ def proposal(tmp_path, bag_maker):
             fill(made)
         with open_bag(tmp_path / "drive.bag") as bag:
             found = propose(bag)
-            return found, tomllib.loads(manifest_text(bag, found, "drive.bag", {})), manifest_text(bag, found, "d", {})
+            text = manifest_text(manifest_of(found, "drive.bag", {}), remarks(bag, found, {}))
+            return found, tomllib.loads(text), text
 
     return call
 
@@ -39,7 +40,7 @@ def test_odometry_and_truth_are_told_apart_by_their_names(proposal):
     found, manifest, text = proposal(fill)
     assert manifest["options"] == {"odometry": {"topic": "/odom"}, "reference": {"topic": "/ground_truth/odom"}}
     assert "# odometry could also be /wheel_odom" in text
-    assert "#   /move_base/goal (geometry_msgs/msg/PoseStamped, 1 messages)" in text
+    assert "# not used: /move_base/goal (geometry_msgs/msg/PoseStamped, 1 messages)" in text
     assert found.uses == {"/odom": "odometry", "/ground_truth/odom": "reference"}
 
 
