@@ -26,9 +26,11 @@ if TYPE_CHECKING:
         simulate,
     )
     from factorgraph_loc.experiments.index import load_results
+    from factorgraph_loc.localizer import Localizer
 
 __version__ = "0.1.0"
 __all__ = [
+    "Localizer",
     "calibrate",
     "compare",
     "convert",
@@ -46,7 +48,7 @@ __all__ = [
 ]
 
 # by name: those that are not among the verbs; to read a table, nothing that estimates is needed
-_ELSEWHERE = {"load_results": "factorgraph_loc.experiments.index"}
+_ELSEWHERE = {"Localizer": "factorgraph_loc.localizer", "load_results": "factorgraph_loc.experiments.index"}
 
 
 def __getattr__(name: str) -> Any:

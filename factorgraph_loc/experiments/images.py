@@ -14,6 +14,8 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.log import FeatureStream, ImageStream, Log
 from factorgraph_loc.measurements import CameraFrame
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import World
 
 CAMERA = "camera"
 OF_CAMERA = (CAMERA, "sightings")  # sensors that mean nothing without a camera in the rig
@@ -40,9 +42,14 @@ def takes_pixels(estimator: str) -> bool:
 
 
 def frontend_of(log: Log) -> FrontendSettings:
+    """What is looked for in the images of a log."""
+    return frontend_for(log.rig, log.world)
+
+
+def frontend_for(rig: Rig, world: World) -> FrontendSettings:
     """What is looked for in images: what the map's points look like in them, else what the rig's camera says."""
-    settings = log.rig.camera.frontend if log.rig.camera is not None else FrontendSettings()
-    points = log.world.points
+    settings = rig.camera.frontend if rig.camera is not None else FrontendSettings()
+    points = world.points
     if points is None or not points.feature or points.feature == settings.feature:
         return settings
     return FrontendSettings.model_validate(settings.model_dump() | {"feature": points.feature})

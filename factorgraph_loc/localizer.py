@@ -1,0 +1,278 @@
+"""Where a robot is while it drives: measurements are pushed as they come, estimates are pulled when they are wanted."""
+
+from __future__ import annotations
+
+import copy
+import math
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.estimators.base import Belief, Diagnostics, Estimator, Learnt, PoseEstimate, PosePrior
+from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
+from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
+from factorgraph_loc.files import nearest
+from factorgraph_loc.measurements import Exteroceptive, IncrementOdometry, Odometry, Tick
+from factorgraph_loc.pushed import ALL_SENSORS, RfidRead, checked, numbers, scan_of, sensor_of
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+
+if TYPE_CHECKING:
+    from factorgraph_loc.vision.live import LiveFrontend
+
+LAG = 10.0  # s: the window of the smoother, where the settings do not say another
+HISTORY = 60.0  # s
+TIDY_INTERVAL = 5.0  # s of measurements between two times that the past is forgotten
+ROWS_KEPT = 1000  # of each list of diagnostics
+AHEAD = 3600.0  # s: a stamp that is so much newer than all others is of another clock
+
+
+class Localizer:
+    """An estimator that any number of threads push measurements into and pull estimates from.
+
+    ``rig`` and ``world``: robot and map. ``estimator``: its name; ``settings``: overrides of its settings. The smoother has a
+    fixed lag of 10 s unless ``settings`` say another; with ``lag = None`` it keeps all, as ``batch`` and ``space_batch`` do.
+    ``sensors``: those that may be used, by default the rig's; what is pushed of others is counted as ignored. ``history`` [s]: how
+    long the past is kept that :meth:`trajectory` tells; with that, memory is bounded. ``seed``: of the random generator.
+
+    Its life: :meth:`initialize`, then measurements and estimates in any order. :meth:`initialize` once more begins anew. There is
+    nothing to close. Stamps are seconds by any clock that all sensors share; the offsets that the rig knows are added here. One
+    lock guards the estimator: who pushes waits while another's measurement is taken in, so that nothing piles up.
+
+    The same measurements in the same order, and estimates pulled at the same times, give the same results. InputError if the
+    settings, sensors or ``history`` are wrong.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        world: World | None = None,
+        estimator: str = "smoother",
+        *,
+        settings: Mapping[str, Any] | None = None,
+        sensors: Sequence[str] | None = None,
+        history: float = HISTORY,
+        seed: int = 0,
+    ) -> None:
+        if not history > 0.0:
+            raise InputError(f"history is {history!r}, expected more than 0 s")
+        self._rig, self._world, self._name = rig, world or World(), estimator
+        default = {"lag": LAG} if estimator == "smoother" else {}
+        self._settings = registry.settings_of(estimator, default | dict(settings or {}))
+        self._sensors = _sensors(rig, sensors)
+        self._history, self._seed = history, seed
+        self._lock = threading.Lock()
+        self._image_lock = threading.Lock()
+        self._frontend: LiveFrontend | None = None
+        self._begin_anew(None, None)
+
+    def initialize(
+        self, pose: ArrayLike | None = None, covariance: ArrayLike | None = None, t: float | None = None
+    ) -> None:
+        """Begin, or begin anew, at a ``pose`` (3,), x, y [m] and heading [rad] in the world's frame; None: anywhere in the map.
+
+        ``covariance`` (3, 3) of the pose, by default that of 0.05 m and 0.05 rad. ``t`` [s]: when the robot is there, by default at
+        the first measurement. Odometry from before then is taken in, as its velocity holds on; other measurements are ignored.
+        InputError if these are no pose, or if the estimator cannot begin from an unknown one.
+        """
+        start = None if pose is None else _start(pose, covariance, t)
+        setup = registry.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
+        new = registry.create(self._name, setup, self._settings)
+        if start is None and not getattr(new, "supports_unknown_start", False):
+            raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
+        with self._lock:
+            self._begin_anew(new, start)
+
+    def push(self, measurement: Odometry | Exteroceptive) -> None:
+        """Take a measurement, in the order of arrival: one that is late goes in at its time if it is late by at most the
+        estimator's ``max_delay``, else it is counted and dropped.
+
+        InputError if it has a value that cannot be, such as NaN, or comes before :meth:`initialize`; if a stamp is an hour ahead
+        of all others; if increments of odometry go back in time, whose meaning depends on their order. It is not taken then, and
+        nothing else has changed. RunFailedError, and whatever else the estimator raises: it is lost, :meth:`initialize` it anew.
+        Tags, antennas and landmarks that rig and map lack are no errors: they are counted, see :meth:`diagnostics`.
+        """
+        own = checked(measurement)
+        with self._lock:
+            self._take(own)
+
+    def push_reads(self, t: float, antennas: Iterable[str], reads: Iterable[RfidRead] = ()) -> None:
+        """Take what was read in inventory rounds that ended at ``t``. ``antennas``: those that listened, also if they read nothing:
+        that tags were not read tells as much. InputError as of :meth:`push`."""
+        self.push(scan_of(t, antennas, reads))
+
+    def push_image(self, t: float, image: object) -> None:
+        """Take an image, an array (H, W) or (H, W, 3) BGR of the size that the rig's camera has.
+
+        Its features are looked for in the calling thread, while other measurements go on: it arrives late by the time that takes.
+        InputError as of :meth:`push`, or if it is no such image.
+        """
+        if self._rig.camera is None:
+            raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
+        if CAMERA not in self._sensors or not takes_pixels(self._name):
+            with self._lock:
+                self._begun(f"image at {t:.3f} s").diagnostics.ignore("images")
+            return
+        with self._image_lock:
+            if self._frontend is None:
+                # imported here, as without images no OpenCV is needed
+                from factorgraph_loc.vision.live import LiveFrontend  # noqa: PLC0415
+
+                self._frontend = LiveFrontend(frontend_for(self._rig, self._world), self._rig.camera.model())
+            frame = self._frontend.frame(t, image)
+        self.push(frame)
+
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The pose at the newest stamp of all measurements, or at ``t`` if that is later still, where the odometry leads.
+
+        Before there is anything to tell it is ``unlocalized``, and not a number. RunFailedError if the estimator has failed.
+        """
+        with self._lock:
+            return self._estimate(t)
+
+    def belief(self) -> Belief:
+        """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them."""
+        with self._lock:
+            self._estimate(None)
+            return Belief(()) if self._estimator is None else copy.deepcopy(self._estimator.belief())
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the past, with what came later, at the times that an estimate was pulled: of the last ``history``
+        seconds, or somewhat more."""
+        with self._lock:
+            if self._estimator is None or not self._started:
+                return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+            return self._estimator.trajectory()
+
+    def learnt(self) -> Learnt:
+        """What is estimated beside the pose: constants of the sensors, landmarks, points."""
+        with self._lock:
+            return Learnt() if self._estimator is None else copy.deepcopy(self._estimator.learnt())
+
+    def diagnostics(self) -> Diagnostics:
+        """What was ignored, rejected or too late, by reason, since the beginning; the last innovations, residuals and events."""
+        with self._lock:
+            return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
+
+    def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None) -> None:
+        self._estimator = estimator
+        self._prior = prior  # its time is NaN until the first measurement tells it
+        self._started = False
+        self._newest = self._newest_increment = self._tidied = -math.inf
+        self._last: PoseEstimate | None = None  # nothing has changed since
+
+    def _begun(self, what: str) -> Estimator:
+        if self._estimator is None:
+            raise InputError(f"{what} came before initialize(), expected that first")
+        return self._estimator
+
+    def _take(self, m: Odometry | Exteroceptive) -> None:
+        estimator = self._begun(f"{type(m).__name__} at {m.t:.3f} s")
+        sensor = sensor_of(m)
+        if sensor not in self._sensors:
+            estimator.diagnostics.ignore(f"{sensor} is not among the sensors")
+            return
+        m = replace(m, t=m.t + self._rig.time_offset(sensor))
+        self._check_stamp(m)
+        if self._prior is not None and math.isnan(self._prior.t):
+            self._prior = replace(self._prior, t=m.t)
+        self._newest, self._last = max(self._newest, m.t), None
+        if isinstance(m, Odometry):
+            self._start_by(m.t, inclusive=False)
+        elif not self._start_by(m.t, inclusive=True):
+            estimator.diagnostics.ignore("before the start")
+            return
+        estimator.process(m)
+        self._tidy(estimator)
+
+    def _check_stamp(self, m: Odometry | Exteroceptive) -> None:
+        where = f"{type(m).__name__} at {m.t:.3f} s"
+        if math.isfinite(self._newest) and m.t > self._newest + AHEAD:
+            raise InputError(
+                f"{where}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
+                f"after a pause"
+            )
+        if isinstance(m, IncrementOdometry):
+            if m.t <= self._newest_increment:
+                raise InputError(
+                    f"{where}: follows one at {self._newest_increment:.3f} s, expected increments in order of time"
+                )
+            self._newest_increment = m.t
+
+    def _start_by(self, t: float, *, inclusive: bool) -> bool:
+        """Whether the estimator has begun by ``t``: odometry of the very start comes before that."""
+        if not self._started and self._estimator is not None:
+            if self._prior is None:
+                self._started = True
+            elif t > self._prior.t or (inclusive and t == self._prior.t):
+                self._estimator.initialize(self._prior)
+                self._started = True
+        return self._started and (self._prior is None or t >= self._prior.t)
+
+    def _estimate(self, t: float | None) -> PoseEstimate:
+        if t is not None and not math.isfinite(t):
+            raise InputError(f"t is {t!r}, expected a finite number of seconds")
+        at = self._newest if t is None else max(self._newest, t)
+        if self._last is not None and self._last.t == at:
+            return copy.deepcopy(self._last)
+        if self._estimator is None or not math.isfinite(self._newest) or not self._start_by(at, inclusive=True):
+            return PoseEstimate(math.nan, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        if at > self._newest + AHEAD:
+            raise InputError(
+                f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected their clock"
+            )
+        self._estimator.process(Tick(at))
+        self._newest = at
+        found = self._estimator.estimate()
+        if found.status != "unlocalized" and not np.all(np.isfinite(found.pose)):
+            raise RunFailedError(f"{self._name}: the estimate at {at:.3f} s is not finite; initialize() it anew")
+        self._tidy(self._estimator)
+        # the estimator may use its arrays again
+        self._last = copy.deepcopy(replace(found, t=at))
+        return copy.deepcopy(self._last)
+
+    def _tidy(self, estimator: Estimator) -> None:
+        """Forget what lies too far back, every few seconds."""
+        if self._newest < self._tidied + TIDY_INTERVAL:
+            return
+        self._tidied = self._newest
+        forget = getattr(estimator, "forget", None)
+        if forget is not None and self._started:
+            forget(self._newest - self._history)
+        found = estimator.diagnostics
+        for innovations in found.nis.values():
+            del innovations[:-ROWS_KEPT]
+        for residuals in found.residuals.values():
+            del residuals[:-ROWS_KEPT]
+        del found.events[:-ROWS_KEPT]
+
+
+def _sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
+    """The sensors that may be used: without those that need a camera if there is none."""
+    if asked is None:
+        asked = rig.sensors
+    for name in asked:
+        if name not in ALL_SENSORS:
+            raise InputError(f"no sensor is called {name!r}{nearest(name, list(ALL_SENSORS))}")
+    return tuple(name for name in asked if rig.camera is not None or not name.startswith((CAMERA, "sightings")))
+
+
+def _start(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
+    """The Gaussian to begin from; its time is NaN where none is given."""
+    if covariance is None:
+        covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA)))
+    mean, spread = numbers("initialize()", "pose", pose), numbers("initialize()", "covariance", covariance)
+    if mean.shape != (3,) or not np.all(np.isfinite(mean)):
+        raise InputError(f"pose is {mean.tolist()}, expected finite x, y [m] and heading [rad]")
+    if spread.shape != (3, 3) or not np.allclose(spread, spread.T) or not np.all(np.linalg.eigvalsh(spread) > 0.0):
+        raise InputError(f"covariance is {spread.tolist()}, expected (3, 3), symmetric and positive definite")
+    if t is not None and not math.isfinite(t):
+        raise InputError(f"t is {t!r}, expected a finite number of seconds")
+    return PosePrior(math.nan if t is None else float(t), mean, spread)

@@ -1,0 +1,386 @@
+"""Live localization: the same as a run of a log, whoever pushes; bounded in memory; and what is wrong is said."""
+
+import gc
+import math
+import threading
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.measurements import (
+    BearingRange,
+    CameraFrame,
+    IncrementOdometry,
+    PixelSightings,
+    RfidScan,
+    Tick,
+    Twist,
+    VelocityOdometry,
+    YawRate,
+)
+from factorgraph_loc.pushed import RfidRead
+from factorgraph_loc.rig import Rig
+from factors import se2
+
+SENSORS = ("odometry", "rfid", "bearing_range")
+
+
+@pytest.fixture(scope="module")
+def log():
+    """A drive through an office in which each tag of the map is read."""
+    changes = {"drive": {"duration": 30.0}, "world": {"tags": 12, "landmarks": 6}}
+    log = fgloc.simulate("office", 3, changes=changes)
+    read = set(log.streams["rfid"].epc)
+    tags = {epc: tag for epc, tag in log.world.tags.items() if epc in read}
+    return replace(log, world=log.world.model_copy(update={"tags": tags}))
+
+
+def started(log, name="smoother", prior=None, **options):
+    localizer = fgloc.Localizer(log.rig, log.world, name, **options)
+    start, _ = resolve_prior(log, prior)
+    if start is None:
+        localizer.initialize()
+    else:
+        localizer.initialize(start.pose, start.covariance, start.t)
+    return localizer
+
+
+@pytest.mark.parametrize(
+    ("name", "sensors", "settings", "prior"),
+    [
+        ("smoother", ("odometry", "rfid"), {"lag": 8.0}, None),
+        ("smoother", ("odometry", "bearing_range"), {"lag": 5.0}, None),
+        ("smoother", ("odometry", "rfid"), {}, "unknown"),
+        ("ekf", ("odometry", "bearing_range"), {}, None),
+        ("particle_filter", ("odometry", "rfid"), {"particles": 500}, None),
+        ("switching", SENSORS, {"particles": 500}, None),
+        ("batch", ("odometry", "bearing_range"), {}, None),
+    ],
+)
+def test_estimates_are_those_of_a_run(log, name, sensors, settings, prior):
+    lag = {"lag": 10.0} if name == "smoother" else {}
+    expected = run(log, RunConfig(name, lag | settings, sensors, prior))
+    localizer = started(log, name, prior, settings=settings, sensors=sensors)
+    ticks, found = iter([*expected.t, math.inf]), []
+    tick = next(ticks)
+    for m in log.measurements(sensors):
+        while tick < m.t:
+            found.append(localizer.estimate(tick))
+            tick = next(ticks)
+        localizer.push(m)
+    while tick < math.inf:
+        found.append(localizer.estimate(tick))
+        tick = next(ticks)
+    assert [e.t for e in found] == expected.t.tolist()
+    assert tuple(e.status for e in found) == expected.status
+    assert np.array_equal([e.pose for e in found], expected.poses, equal_nan=True)
+    assert np.array_equal([e.covariance for e in found], expected.covariances, equal_nan=True)
+    assert np.array_equal(localizer.trajectory().poses, expected.final.poses)
+
+
+def test_many_threads_push_while_others_pull(log):
+    localizer = started(log, sensors=SENSORS, settings={"max_delay": 2.0})
+    reference, failed, pulled = log.reference, [], []
+    done = threading.Event()
+    # who is ahead waits for the others, as sensors would by themselves
+    steps = np.arange(0.0, log.span()[1] + 0.5, 0.5)
+    barrier = threading.Barrier(len(SENSORS), timeout=60.0)
+
+    def push(sensor):
+        try:
+            rows = iter([*log.streams[sensor].measurements(0.0), None])
+            m = next(rows)
+            for end in steps:
+                barrier.wait()
+                while m is not None and m.t <= end:
+                    localizer.push(m)
+                    m = next(rows)
+        except Exception as error:  # told below, in the thread of the test
+            failed.append(error)
+            barrier.abort()
+
+    def pull():
+        try:
+            while not done.is_set():
+                pulled.append(localizer.estimate())
+                localizer.belief()
+                localizer.diagnostics()
+                done.wait(0.002)
+        except Exception as error:
+            failed.append(error)
+
+    pushers = [threading.Thread(target=push, args=(sensor,)) for sensor in SENSORS]
+    pullers = [threading.Thread(target=pull) for _ in range(2)]
+    for thread in (*pushers, *pullers):
+        thread.start()
+    for thread in pushers:
+        thread.join(60.0)
+    done.set()
+    for thread in pullers:
+        thread.join(60.0)
+    assert not failed
+    assert len(pulled) > 20
+    last = localizer.estimate()
+    assert localizer.diagnostics().late == {}
+    truth = reference.poses[np.searchsorted(reference.t, last.t) - 1]
+    assert np.hypot(*(last.pose - truth)[:2]) < 0.3
+    # a puller's estimates never go back in time, but those of two of them are mixed here
+    assert all(np.isfinite(e.pose).all() for e in pulled if e.status != "unlocalized")
+
+
+@pytest.mark.parametrize(
+    ("name", "sensors", "settings"),
+    [
+        ("smoother", ("odometry", "bearing_range"), {"lag": 3.0}),
+        ("ekf", ("odometry", "bearing_range"), {}),
+        ("particle_filter", ("odometry", "bearing_range"), {"particles": 50}),
+    ],
+)
+def test_memory_does_not_grow_with_the_drive(log, monkeypatch, name, sensors, settings):
+    """Sixty rounds of a circle, 20 s each: as much is kept after the last one as after the twentieth."""
+    monkeypatch.setattr("factorgraph_loc.localizer.ROWS_KEPT", 50)
+    localizer = fgloc.Localizer(log.rig, log.world, name, sensors=sensors, settings=settings, history=10.0)
+    pose, landmarks = np.array((2.0, 2.0, 0.0)), tuple(log.world.landmarks)[:3]
+    places = np.array([log.world.position(landmark) for landmark in landmarks])
+    step = np.array((0.5, 0.0, 2.0 * math.pi / 20.0))
+    localizer.initialize(pose, t=0.0)
+    kept = []
+    tracemalloc.start()
+    try:
+        for t in range(1, 1201):
+            pose = se2.compose(pose, step)
+            localizer.push(IncrementOdometry(t, *step))
+            off = places - pose[:2]
+            bearing = se2.wrap(np.arctan2(off[:, 1], off[:, 0]) - pose[2])
+            localizer.push(BearingRange(t, landmarks, np.hypot(*off.T), bearing))
+            localizer.estimate()
+            if t % 400 == 0:
+                gc.collect()
+                kept.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert kept[-1] < 1.25 * kept[0]
+    assert 10 <= len(localizer.trajectory()) < 100
+    assert np.hypot(*(localizer.estimate().pose - pose)[:2]) < 0.3
+
+
+def test_what_is_late_is_put_in_or_counted(log):
+    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
+    localizer.initialize((2.0, 2.0, 0.0), t=0.0)
+    for i in range(21):
+        localizer.push(IncrementOdometry(0.1 * i, 0.05, 0.0, 0.0))
+        if i % 5 == 0:
+            localizer.estimate()
+    before = localizer.estimate()
+    name, landmark = next(iter(log.world.landmarks.items()))
+    distance, bearing = np.array((math.hypot(landmark.x - 2.75, landmark.y - 2.0) - 0.1,)), np.array((math.nan,))
+    localizer.push(BearingRange(1.6, (name,), distance, bearing))
+    after = localizer.estimate()
+    assert after.t == before.t
+    assert not np.array_equal(after.pose, before.pose)
+    localizer.push(BearingRange(1.4, (name,), distance, bearing))
+    assert localizer.diagnostics().late == {"bearing_range": 1}
+    assert np.array_equal(localizer.estimate().pose, after.pose)
+
+
+def test_its_life(log):
+    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
+    assert localizer.estimate().status == "unlocalized"
+    assert math.isnan(localizer.estimate(3.0).t)
+    assert len(localizer.trajectory()) == 0
+    with pytest.raises(
+        InputError, match=r"^VelocityOdometry at 1.000 s came before initialize\(\), expected that first$"
+    ):
+        localizer.push(VelocityOdometry(1.0, 0.1, 0.0))
+    localizer.initialize((1.0, 2.0, 0.5))
+    assert localizer.estimate().status == "unlocalized"
+    localizer.push(IncrementOdometry(100.0, 0.0, 0.0, 0.0))
+    assert localizer.estimate().pose == pytest.approx((1.0, 2.0, 0.5))
+    assert localizer.estimate().covariance[0, 0] == pytest.approx(0.05**2)
+    localizer.push(IncrementOdometry(101.0, 1.0, 0.0, 0.0))
+    assert localizer.estimate().t == 101.0
+    assert localizer.estimate().pose[:2] == pytest.approx((1.0 + math.cos(0.5), 2.0 + math.sin(0.5)), abs=0.02)
+    localizer.initialize((5.0, 5.0, 0.0), np.diag((0.01, 0.01, 0.01)), 50.0)
+    localizer.push(IncrementOdometry(49.0, 0.5, 0.0, 0.0))
+    localizer.push(BearingRange(49.5, ("l0",), np.array((1.0,)), np.array((0.0,))))
+    assert localizer.estimate().status == "unlocalized"
+    localizer.push(IncrementOdometry(50.0, 0.5, 0.0, 0.0))
+    assert localizer.estimate().pose == pytest.approx((5.0, 5.0, 0.0))
+    assert localizer.diagnostics().ignored["before the start"] == 1
+
+
+def test_a_pull_changes_nothing_that_was_given_out(log):
+    localizer = started(log, "ekf")
+    localizer.push(IncrementOdometry(0.5, 0.1, 0.0, 0.0))
+    given = localizer.estimate()
+    given.pose[:] = 99.0
+    localizer.diagnostics().ignored["mine"] = 1
+    assert np.all(localizer.estimate().pose < 90.0)
+    assert "mine" not in localizer.diagnostics().ignored
+
+
+def test_a_measurement_is_copied(log):
+    sensors, buffer = ("odometry", "bearing_range"), np.array((2.0, 3.0))
+    localizer = started(log, sensors=sensors)
+    names = tuple(log.world.landmarks)[:2]
+    for t in (1.0, 1.5):
+        localizer.push(IncrementOdometry(t, 0.1, 0.0, 0.0))
+        localizer.push(BearingRange(t, names, buffer, np.array((0.1, 0.2))))
+    before = localizer.trajectory().poses
+    buffer[:] = np.nan
+    assert np.array_equal(localizer.trajectory().poses, before)
+
+
+def test_foreign_tags_antennas_and_sensors_are_counted(log):
+    localizer = started(log, sensors=("odometry", "rfid"))
+    antenna = next(iter(log.rig.rfid.all_antennas()))
+    localizer.push(IncrementOdometry(0.2, 0.0, 0.0, 0.0))
+    localizer.push_reads(0.3, [antenna], [RfidRead(antenna, "a passer-by's badge", t=0.25, rssi=-60.0)])
+    localizer.push_reads(0.4, ["on another robot"])
+    localizer.push(YawRate(0.5, 0.1))
+    ignored = localizer.diagnostics().ignored
+    assert ignored["tag not in the map"] == 1
+    assert ignored["antenna that the rig lacks"] == 1
+    assert ignored["imu is not among the sensors"] == 1
+
+
+ONE = np.ones(1)
+BAD = [
+    (VelocityOdometry(1.0, math.nan, 0.0), r"VelocityOdometry at 1.000 s: v is nan, expected a finite number"),
+    (VelocityOdometry(math.nan, 0.0, 0.0), r"VelocityOdometry: t is nan, expected a finite number of seconds"),
+    (VelocityOdometry("1", 0.0, 0.0), r"VelocityOdometry: t is '1', expected a finite number of seconds"),
+    (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
+    (IncrementOdometry(1.0, 0.0, math.inf, 0.0), r"dy is inf, expected a finite number"),
+    (Twist(1.0, np.zeros(2), np.zeros(3)), r"Twist at 1.000 s: v has shape \(2,\), expected \(3,\)"),
+    (BearingRange(1.0, ("a",), -ONE, ONE), r"range is -1.0, expected more than 0, NaN where not measured"),
+    (BearingRange(1.0, ("a", "b"), ONE, ONE), r"range has shape \(1,\), expected \(2,\)"),
+    (BearingRange(1.0, "ab", ONE, ONE), r"landmarks is 'ab', expected names"),
+    (PixelSightings(1.0, ("a",), np.array(((math.nan, 1.0),))), r"pixels is nan, expected a finite number"),
+    (
+        RfidScan(1.0, ("a",), np.array([1]), ("e",), ONE, ONE, ONE, ONE),
+        r"antenna is \[1\], expected places in its 1 ant",
+    ),
+    (
+        RfidScan(1.0, ("a",), np.array([0]), ("e",), -ONE, ONE, ONE, ONE),
+        r"age is -1.0, expected a read that is not after",
+    ),
+    (RfidScan(1.0, ("a",), ONE, ("e",), ONE, ONE, ONE, ONE), r"antenna is array\(\[1.\]\), expected 1 whole numbers"),
+    (
+        CameraFrame(1.0, "orb", np.zeros((2, 2)), ONE, np.zeros((2, 3)), np.arange(2)),
+        r"sizes has shape \(1,\), expected \(2,\)",
+    ),
+    (
+        CameraFrame(1.0, "orb", np.zeros((1, 2)), ONE, np.zeros((2, 3)), np.arange(1)),
+        r"descriptors has shape \(2, 3\)",
+    ),
+    (Tick(1.0), r"^Tick is no measurement, expected one of VelocityOdometry, "),
+    (None, r"^NoneType is no measurement"),
+]
+
+
+@pytest.mark.parametrize(("measurement", "message"), BAD)
+def test_what_cannot_be_is_refused_and_changes_nothing(log, measurement, message):
+    localizer = started(log, "ekf")
+    localizer.push(IncrementOdometry(0.5, 0.1, 0.0, 0.0))
+    before = localizer.estimate()
+    with pytest.raises(InputError, match=message) as error:
+        localizer.push(measurement)
+    assert "\n" not in str(error.value)
+    assert np.array_equal(localizer.estimate().pose, before.pose)
+
+
+def test_clocks_that_go_back_or_are_others_are_refused(log):
+    localizer = started(log, "ekf")
+    localizer.push(IncrementOdometry(5.0, 0.1, 0.0, 0.0))
+    with pytest.raises(
+        InputError, match=r"IncrementOdometry at 4.900 s: follows one at 5.000 s, expected increments in order"
+    ):
+        localizer.push(IncrementOdometry(4.9, 0.1, 0.0, 0.0))
+    with pytest.raises(InputError, match=r"IncrementOdometry at 1700000000.000 s: is 1699999995 s ahead of all others"):
+        localizer.push(IncrementOdometry(1.7e9, 0.1, 0.0, 0.0))
+    with pytest.raises(InputError, match=r"t is 1700000000.000 s, 1699999995 s ahead of all measurements"):
+        localizer.estimate(1.7e9)
+    with pytest.raises(InputError, match="t is nan"):
+        localizer.estimate(math.nan)
+    localizer.push(IncrementOdometry(5.1, 0.1, 0.0, 0.0))
+    assert localizer.estimate().t == 5.1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"pose": (1.0, 2.0)}, r"pose is \[1.0, 2.0\], expected finite x, y \[m\] and heading"),
+        ({"pose": (1.0, math.nan, 0.0)}, "expected finite x, y"),
+        ({"pose": "here"}, r"initialize\(\): pose is 'here', expected numbers"),
+        (
+            {"pose": (0, 0, 0), "covariance": np.diag((1.0, 0.0, 1.0))},
+            r"expected \(3, 3\), symmetric and positive definite",
+        ),
+        ({"pose": (0, 0, 0), "t": math.inf}, "t is inf, expected a finite number"),
+        ({}, "ekf cannot start from an unknown pose with this rig and map, expected a pose"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(log, given, message):
+    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
+    with pytest.raises(InputError, match=message):
+        localizer.initialize(**given)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"estimator": "smother"}, "no estimator is called 'smother': did you mean smoother?"),
+        ({"settings": {"lagg": 3.0}}, "settings of smoother"),
+        ({"sensors": ("odometry", "rfidd")}, "no sensor is called 'rfidd': did you mean rfid?"),
+        ({"history": 0.0}, "history is 0.0, expected more than 0 s"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(options, message):
+    with pytest.raises(InputError, match=message.replace("?", r"\?")):
+        fgloc.Localizer(Rig(), **options)
+
+
+def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):
+    localizer = started(log)
+    with pytest.raises(InputError, match="antenna is 'left', expected one that listened: front, back"):
+        localizer.push_reads(1.0, ["front", "back"], [RfidRead("left", "e1")])
+
+
+def test_reads_are_those_of_a_scan(log):
+    antenna, tag = next(iter(log.rig.rfid.all_antennas())), next(iter(log.world.tags))
+    nan = np.full(1, np.nan)
+    one, other = (started(log, sensors=("odometry", "rfid")) for _ in range(2))
+    for localizer in (one, other):
+        localizer.push(IncrementOdometry(0.1, 0.0, 0.0, 0.0))
+    one.push_reads(0.5, [antenna], [RfidRead(antenna, tag, t=0.4)])
+    other.push(RfidScan(0.5, (antenna,), np.zeros(1, dtype=np.int64), (tag,), np.array((0.5 - 0.4,)), nan, nan, nan))
+    assert np.array_equal(one.estimate().pose, other.estimate().pose)
+
+
+def test_offsets_of_the_clocks_are_added(log):
+    rig = log.rig.model_copy(update={"bearing_range": log.rig.bearing_range.model_copy(update={"time_offset": -0.2})})
+    shifted, plain = started(replace(log, rig=rig), "ekf"), started(log, "ekf")
+    seen = next(iter(log.streams["bearing_range"].measurements(0.0)))
+    for localizer, t in ((shifted, 2.2), (plain, 2.0)):
+        localizer.push(IncrementOdometry(1.9, 0.1, 0.0, 0.1))
+        localizer.push(replace(seen, t=t))
+    assert shifted.estimate().t == pytest.approx(2.0)
+    assert shifted.estimate().pose == pytest.approx(plain.estimate().pose)
+
+
+def test_images_need_a_camera():
+    localizer = fgloc.Localizer(Rig(name="blind"))
+    with pytest.raises(InputError, match=r"image at 1.000 s: the rig blind has no \[camera\]"):
+        localizer.push_image(1.0, np.zeros((48, 64), dtype=np.uint8))
+
+
+def test_images_are_ignored_by_who_takes_none(log):
+    localizer = started(log, "dead_reckoning", sensors=("odometry", "camera"))
+    localizer.push_image(1.0, np.zeros((48, 64), dtype=np.uint8))
+    assert localizer.diagnostics().ignored == {"images": 1}
