@@ -95,11 +95,11 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
             raise InputError(f"{log}: does not exist")
         return _Source(reader, path, None if reader == "native" else _name(path))
     if path.is_dir() and (path / RUN_FILE).is_file():
-        return _Source("native", path)
+        path /= RUN_FILE
     if is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        if path.name == RUN_FILE and "reader" not in read_toml(path):
+        if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have that name too
             return _Source("native", path.parent)
         if path.suffix == ".toml":
             return _from_manifest(path, data_root)

@@ -136,6 +136,7 @@ def test_a_manifest_beside_the_bag(tmp_path):
     (log,) = load(str(tmp_path / "run.toml"))
     assert log.name == "drive"
     assert log.streams["odometry"].v.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert load(str(tmp_path))[0].name == "drive"
 
 
 def test_a_topic_that_is_missing(mcap, refuse):
