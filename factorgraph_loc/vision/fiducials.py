@@ -1,8 +1,8 @@
 """Fiducial markers in images, found by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
 fiducial markers under occlusion", Pattern Recognition 2014; for AprilTags their dictionaries, Olson, ICRA 2011).
 
-Each corner of a marker is a point with a name, so that nothing but the reprojection of points is needed to use it. On rendered
-markers of 40 to 90 px corners lie 0.17 px (root mean square of a coordinate) from the truth, most of that towards the middle.
+Each corner of a marker is a point with a name, so that nothing but the reprojection of points is needed to use it. Where exactly
+it is, is found by :mod:`factorgraph_loc.vision.marker_corners`.
 """
 
 from __future__ import annotations
@@ -22,20 +22,28 @@ from factorgraph_loc.markers import MarkerFamily, corner_names
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.frontend import code_version
 from factorgraph_loc.vision.images import Image, read_image
+from factorgraph_loc.vision.marker_corners import refined_corners
 from factors.se2 import Array
 
+CODE = ("fiducials.py", "marker_corners.py", "images.py")  # what is found depends on
 Marked = list[tuple[int, list[list[float]]]]  # numbers of markers, and the pixels of their corners
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
     """The numbers of the markers in an image, and their corners (4, 2) [px]: upper left, upper right, lower right, lower left of
     the marker as it is printed. Of a number that is there twice neither is given."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    corners, numbers, _ = _detector(family).detectMarkers(grey)
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    detector = _detector(family)
+    corners, numbers, _ = detector.detectMarkers(grey)
+    bits = detector.getDictionary().markerSize + 2
     found = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
     count = Counter(found)
     pairs = zip(found, corners, strict=True)
-    return [(number, np.asarray(seen, dtype=float).reshape(4, 2)) for number, seen in pairs if count[number] == 1]
+    return [
+        (number, refined_corners(grey, np.asarray(seen, dtype=float).reshape(4, 2), bits))
+        for number, seen in pairs
+        if count[number] == 1
+    ]
 
 
 def with_markers(log: Log, family: MarkerFamily) -> Log:
@@ -81,7 +89,7 @@ def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
         content = file.read_bytes()
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from error
-    about = f"markers {family} {code_version(('fiducials.py', 'images.py'))} "
+    about = f"markers {family} {code_version(CODE)} "
     key = hashlib.sha256(about.encode() + content).hexdigest()
     stored = kept.read(key)
     if stored is not None:
@@ -94,5 +102,5 @@ def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
 def _detector(family: MarkerFamily) -> cv2.aruco.ArucoDetector:
     name = f"DICT_{family.upper()}" if not family.startswith("tag") else f"DICT_APRILTAG_{family[3:].upper()}"
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)), parameters)

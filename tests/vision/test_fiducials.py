@@ -38,21 +38,34 @@ def shrunk(canvas, rng):
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_corners_are_found_within_a_fraction_of_a_pixel(family):
+@pytest.mark.parametrize(("sides", "error"), [((20.0, 30.0), 0.2), ((45.0, 90.0), 0.03)])
+def test_corners_are_found_within_a_fraction_of_a_pixel(family, sides, error):
     rng = np.random.default_rng(1)
     errors = []
-    for number in range(8):
-        turn = rng.uniform(-np.pi, np.pi)
+    for number in range(20):
+        turn, half = rng.uniform(-np.pi, np.pi), rng.uniform(*sides) / 2.0
         axes = np.array(((np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))))
-        square = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1))) @ axes * rng.uniform(20, 40)
-        corners = square + rng.uniform((90, 80), (230, 160)) + rng.uniform(-3, 3, (4, 2))
+        square = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1))) @ axes + rng.uniform(-0.12, 0.12, (4, 2))
+        corners = half * square + rng.uniform((90, 80), (230, 160))
         canvas = np.full((240 * SCALE, 320 * SCALE), 180, np.uint8)
         draw(canvas, family, number, corners)
-        ((found, pixels),) = find_markers(shrunk(canvas, rng), family)
-        assert found == number
-        errors.append(pixels - corners)
-    assert np.sqrt(np.mean(np.square(errors))) < 0.3
-    np.testing.assert_allclose(np.mean(errors, axis=(0, 1)), 0.0, atol=0.1)  # no shift by half a pixel
+        image = shrunk(canvas, rng)
+        found = find_markers(cv2.GaussianBlur(image, (0, 0), 0.8) if number % 2 else image, family)
+        assert [name for name, _ in found] in ([number], [])
+        errors += [pixels - corners for _, pixels in found]
+    assert len(errors) >= 18  # one of a white that is hardly brighter than what is around it may be missed
+    assert np.sqrt(np.mean(np.square(errors))) < error
+    np.testing.assert_allclose(np.mean(errors, axis=(0, 1)), 0.0, atol=error / 3.0)  # no shift by half a pixel
+
+
+def test_a_pencil_across_an_edge_does_not_move_the_corners():
+    canvas = np.full((240 * SCALE, 320 * SCALE), 180, np.uint8)
+    corners = np.array(((100, 60), (180, 60), (180, 140), (100, 140)))
+    draw(canvas, "tag36h11", 5, corners)
+    image = shrunk(canvas, np.random.default_rng(0))
+    image[98:104, 176:200] = 90  # a pencil across an edge
+    ((_, found),) = find_markers(image, "tag36h11")
+    np.testing.assert_allclose(found, corners, atol=0.3)
 
 
 def test_a_number_that_is_there_twice_tells_nothing():
