@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +14,11 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.shipped import manifests
 
 if TYPE_CHECKING:
+    from factorgraph_loc.exports.particles import Particles
     from factorgraph_loc.exports.runs import StoredRun
     from factorgraph_loc.log import Log
+
+SAME = 1e-6  # m between the positions of a run and of the same run made again
 
 What = Annotated[
     list[str],
@@ -30,6 +34,9 @@ def view(
     rrd: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer in place of opening it.")
     ] = None,
+    particles: Annotated[
+        bool, typer.Option("--particles", help="Make runs of particles again, to show these too.")
+    ] = False,
     reader: Reader = None,
     reader_option: ReaderOption = None,
     data_root: DataRoot = None,
@@ -41,14 +48,35 @@ def view(
     from factorgraph_loc.exports import rerun_scene
 
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
+    clouds = _particles(log, runs) if particles else {}
     if rrd is None:
-        rerun_scene.show(log, runs)
+        rerun_scene.show(log, runs, clouds)
     else:
-        rerun_scene.write_rrd(log, runs, rrd)
+        rerun_scene.write_rrd(log, runs, rrd, clouds)
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
         typer.echo(f"wrote {rrd}: rerun {rrd} shows it")
+
+
+def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
+    """The particles of those runs that have some, by name."""
+    from factorgraph_loc.exports.particles import particles_of
+
+    found = {}
+    for run in runs:
+        with show.progress(run.name, counted=False) as report:
+            cloud = particles_of(run, log, partial(report, total=1.0))
+        if cloud is not None:
+            found[run.name] = cloud
+            if cloud.difference > SAME:
+                show.note(
+                    f"warning: {run.folder.path}: made again, it differs by up to {cloud.difference:.2g} m, so its particles are "
+                    "others: was it made with another rig, map or version?"
+                )
+    if not found:
+        show.note("warning: no run has particles, as only a particle_filter and switching do")
+    return found
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:

@@ -52,7 +52,12 @@ class RunConfig:
     seed: int = 0
 
 
-def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = None) -> RunResult:
+def run(
+    log: Log,
+    config: RunConfig,
+    progress: Callable[[float], None] | None = None,
+    watch: Callable[[float, Estimator], None] | None = None,
+) -> RunResult:
     """Run an estimator on a log.
 
     The grid of ticks has 10 Hz and starts at the prior's time. A tick comes after all measurements that arrived up to its time;
@@ -60,6 +65,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     its velocity holds on; other measurements older than the prior are counted as ignored. With an unknown start the grid begins at
     the first measurement, and the final trajectory, empty if nothing told the pose, where the estimator began to believe
     something. ``progress`` is given the share done; where features of images are looked for first, that is its first half.
+    ``watch`` is given the time and the estimator after each tick, to look at what it believes.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
     Whatever the estimator itself raises is passed on.
@@ -84,7 +90,7 @@ def run(log: Log, config: RunConfig, progress: Callable[[float], None] | None = 
     report = progress or (lambda _: None)
     prepared = prepare(log, sensors, config.estimator, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
-    loop = _Loop(estimator, prepared.log, sensors, prior, lambda share: report(before + (1.0 - before) * share))
+    loop = _Loop(estimator, prepared.log, sensors, prior, lambda share: report(before + (1.0 - before) * share), watch)
     loop.run()
     started = perf_counter()
     final = estimator.trajectory()
@@ -140,7 +146,9 @@ class _Loop:
         sensors: tuple[str, ...],
         prior: PosePrior | None,
         progress: Callable[[float], None],
+        watch: Callable[[float, Estimator], None] | None,
     ) -> None:
+        self._watch = watch
         self._estimator = estimator
         self._log = log
         self._sensors = sensors
@@ -230,6 +238,8 @@ class _Loop:
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
         )
+        if self._watch is not None:
+            self._watch(t, self._estimator)
 
 
 def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:

@@ -12,12 +12,14 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
+from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import Colour, colours
 from factorgraph_loc.files import replacing
@@ -40,8 +42,10 @@ BATCH = 16  # pictures that are sent at once
 NEAREST = 300  # points of the map that are drawn into an image
 
 
-def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
-    """Write a file that ``rerun FILE`` opens.
+def write_rrd(
+    log: Log, runs: Sequence[StoredRun], path: Path, particles: Mapping[str, Particles] = MappingProxyType({})
+) -> None:
+    """Write a file that ``rerun FILE`` opens. ``particles``: those of runs, by the runs' names.
 
     InputError where ``rerun-sdk`` is not installed, or an image cannot be read.
     """
@@ -49,20 +53,20 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
     try:
         with replacing(path) as temporary:
             recording.save(temporary, _blueprint(log, runs))
-            _record(recording, log, runs)
+            _record(recording, log, runs, particles)
             recording.flush()
             recording.disconnect()
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def show(log: Log, runs: Sequence[StoredRun]) -> None:
+def show(log: Log, runs: Sequence[StoredRun], particles: Mapping[str, Particles] = MappingProxyType({})) -> None:
     """Open the viewer, or use one that is open; InputError as of :func:`write_rrd`, and without a display."""
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
     recording = _recording()
     recording.spawn(default_blueprint=_blueprint(log, runs))
-    _record(recording, log, runs)
+    _record(recording, log, runs, particles)
     recording.flush()
 
 
@@ -74,7 +78,9 @@ def _recording() -> rr.RecordingStream:
     return rr.RecordingStream("fgloc")
 
 
-def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
+def _record(
+    recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun], particles: Mapping[str, Particles]
+) -> None:
     import rerun as rr  # noqa: PLC0415
 
     recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -84,6 +90,8 @@ def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
     for run, colour in zip(runs, colours(), strict=False):
         _run(recording, run, colour)
+        if run.name in particles:
+            _particles(recording, f"{WORLD}/{run.name}/particles", particles[run.name], colour)
     _camera(recording, log, runs)
 
 
@@ -147,6 +155,16 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
     if run.events:
         when, texts = zip(*run.events, strict=True)
         recording.send_columns(f"{EVENTS}/{run.name}", _times(np.array(when)), rr.TextLog.columns(text=texts))
+
+
+def _particles(recording: rr.RecordingStream, at: str, particles: Particles, colour: Colour) -> None:
+    import rerun as rr  # noqa: PLC0415
+
+    if any(map(len, particles.poses)):
+        positions = _on_floor(np.concatenate(particles.poses)[:, :2])
+        columns = rr.Points3D.columns(positions=positions).partition([len(poses) for poses in particles.poses])
+        recording.send_columns(at, _times(particles.t), columns)
+        recording.log(at, rr.Points3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
