@@ -67,8 +67,9 @@ class RecordedSource:
         path = Path(self.log)
         if self.log in manifests():
             path = manifests()[self.log]
-        if path.name == RUN_FILE:
-            path = path.parent
+        run = path / RUN_FILE if path.is_dir() else path
+        if run.name == RUN_FILE and run.is_file():  # of a native log, unless it is a manifest
+            path = run if "reader" in read_toml(run) else run.parent
         if path.is_dir():
             yield from _of_folder(path)
             return

@@ -96,7 +96,7 @@ def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
         return _Source(reader, path, None if reader == "native" else _name(path))
     if path.is_dir() and (path / RUN_FILE).is_file():
         path /= RUN_FILE
-    if is_bag(path):
+    if path.exists() and is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
         if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have that name too
@@ -124,7 +124,8 @@ def _from_manifest(file: Path, data_root: Path | None) -> _Source:
     if manifest.path is not None:
         path = inside(file.parent, manifest.path, file)  # one's own manifest, beside its log
         if not path.exists():
-            path = inside(find_data_root(data_root, file), manifest.path, file)
+            missing = file if file in manifests().values() else f"{file}: {manifest.path} is not beside it; else it"
+            path = inside(find_data_root(data_root, missing), manifest.path, file)
         if not path.exists():
             raise InputError(f"{file}: its data {path} does not exist")
     return _Source(

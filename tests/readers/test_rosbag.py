@@ -126,6 +126,7 @@ def test_the_time_of_receipt_may_count(mcap, read):
 
 def test_a_bag_without_a_manifest_says_what_to_do(bag, refused):
     refused(bag, "is a ROS bag", "fgloc manifest")
+    refused(bag.parent / "gone.bag", "is neither a file, nor a folder")
 
 
 @pytest.mark.usefixtures("mcap")
