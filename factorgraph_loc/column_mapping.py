@@ -175,7 +175,9 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cell
         header = [str(i) for i in range(1, len(first) + 1)]
     else:
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
-        header = named if set(needed) <= set(named) else first
+        # a comment of as many names as there are columns is the header, unless the first row has the names
+        in_comment = set(needed) <= set(named) or (len(named) == len(first) and not set(needed) <= set(first))
+        header = named if in_comment else first
     _require_columns(path, needed, header, first_row)
     rows, table = [], []
     body = parsed if header is first else _chained((first_row, first), parsed)

@@ -124,7 +124,7 @@ def _from_manifest(file: Path, data_root: Path | None) -> _Source:
     if manifest.path is not None:
         path = inside(file.parent, manifest.path, file)  # one's own manifest, beside its log
         if not path.exists():
-            missing = file if file in manifests().values() else f"{file}: {manifest.path} is not beside it; else it"
+            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
             path = inside(find_data_root(data_root, missing), manifest.path, file)
         if not path.exists():
             raise InputError(f"{file}: its data {path} does not exist")

@@ -325,3 +325,9 @@ def test_a_reference_of_another_time_is_told(hall, one):
     truth = hall.parent / "run" / "truth.csv"
     truth.write_text(TRUTH.replace("\n1,", "\n100001,").replace("\n2,", "\n100002,"))
     assert any("do not overlap" in line and "clock_offset" in line for line in one(hall).warnings)
+
+
+def test_a_folder_that_is_not_beside_its_manifest(hall, refused, monkeypatch):
+    monkeypatch.delenv("FGLOC_DATA", raising=False)
+    hall.write_text(MANIFEST.replace('"run"', '"rnu"'))
+    refused(hall, "hall.toml (which has no rnu beside it): needs the data folder")
