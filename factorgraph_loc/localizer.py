@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Estimator, Learnt, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import (
+    Belief,
+    Diagnostics,
+    Estimator,
+    ForgettingEstimator,
+    Learnt,
+    PoseEstimate,
+    PosePrior,
+)
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files import nearest
@@ -243,9 +251,8 @@ class Localizer:
         if self._newest < self._tidied + TIDY_INTERVAL:
             return
         self._tidied = self._newest
-        forget = getattr(estimator, "forget", None)
-        if forget is not None and self._started:
-            forget(self._newest - self._history)
+        if isinstance(estimator, ForgettingEstimator) and self._started:
+            estimator.forget(self._newest - self._history)
         found = estimator.diagnostics
         for innovations in found.nis.values():
             del innovations[:-ROWS_KEPT]

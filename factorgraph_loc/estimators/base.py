@@ -151,6 +151,14 @@ class SpaceEstimator(Protocol):
         """:meth:`Estimator.trajectory` in space, with covariances (N, 6, 6)."""
 
 
+@runtime_checkable
+class ForgettingEstimator(Protocol):
+    """An estimator that can run for as long as one likes."""
+
+    def forget(self, before: float) -> None:
+        """Drop what only the trajectory before that time needs, as far as late measurements cannot change it any more."""
+
+
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
     """The belief of an estimator that has one Gaussian."""
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))
