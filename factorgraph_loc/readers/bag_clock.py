@@ -26,7 +26,7 @@ class Stamper:
         self._before = has_header(bag, topic)
         self.has_header = self._before or topic.type in TF
         self._where = f"{bag.path}: topic {topic.name}"
-        self._use_header = self.has_header and clock == "header"
+        self.uses_header = self.has_header and clock == "header"
         self._delays = array("q")
         self._any_set = False
 
@@ -43,11 +43,11 @@ class Stamper:
         """The same of a stamp in nanoseconds."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
-        return in_header if self._use_header else received
+        return in_header if self.uses_header else received
 
     def check(self) -> None:
         """InputError if the headers should have told the time, but all say 0."""
-        if self._use_header and len(self._delays) > 1 and not self._any_set:
+        if self.uses_header and len(self._delays) > 1 and not self._any_set:
             raise InputError(f'{self._where}: the stamps of all headers are 0: set clock = "receive" in the manifest')
 
     def delay(self) -> float | None:
@@ -67,13 +67,13 @@ def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
         line += "; received after the header's stamp (median): "
         line += ", ".join(f"{name} {delay:.3f} s" for name, delay in sorted(delays.items()))
     warnings = []
-    compared = dict(delays)
-    if clock == "header":  # beside headers, stamps of receipt are of a clock with delay 0
-        compared |= dict.fromkeys(bare, 0.0)
-    if compared and max(compared.values()) - min(compared.values()) > APART:
-        low, high = min(compared, key=compared.__getitem__), max(compared, key=compared.__getitem__)
+    # of a recorder that stamps everything the delay is 0
+    compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
+    known = {name: delay for name, delay in compared.items() if delay is not None}
+    if known and max(known.values()) - min(known.values()) > APART:
+        low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
         warnings.append(
-            f"the clocks of {low} and {high} differ by {compared[high] - compared[low]:.3f} s: "
+            f"the clocks of {low} and {high} differ by {known[high] - known[low]:.3f} s: "
             "choose clock in the manifest, or set time_offset in the rig"
         )
     return line, warnings

@@ -200,6 +200,9 @@ def test_clocks_that_differ_are_told(tmp_path, bag_maker, read):
             made.reads("/rfid", t, [("E2AA", 1, -60.0, 0.0, t)], delay=3200 * MS)
     (warning,) = (w for w in read(tmp_path / "drive", reference=None).warnings if "clocks" in w)
     assert warning.startswith("the clocks of /odom and /rfid differ by 3.198 s")
+    received = read(tmp_path / "drive", reference=None, clock="receive")
+    assert not [w for w in received.warnings if "clocks" in w]
+    assert "/rfid 3.200 s" in received.metadata["clock"]
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.02, 0.3, 0.6, 0.95, 0.999])

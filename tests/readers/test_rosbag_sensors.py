@@ -158,6 +158,21 @@ def test_wheels_that_are_not_there(maker, refuse, refused):
     refused(maker.path, "odometry.wheels is missing", reader="rosbag", options=options)
 
 
+def test_wheels_that_tell_their_speed_alone(maker, refuse):
+    maker.write(
+        "/joints",
+        T0,
+        "sensor_msgs/msg/JointState",
+        header=maker.header(T0),
+        name=["l", "r"],
+        position=np.zeros(0),
+        velocity=np.ones(2),
+        effort=np.zeros(0),
+    )
+    options = {"topic": "/joints", "wheels": WHEELS}
+    refuse(maker, "/joints:1: has 0 numbers of position for 2 joints", "odometry.use", odometry=options)
+
+
 def test_the_gyro(maker, read):
     for i in range(COUNT):
         t = T0 + 100 * MS * i
