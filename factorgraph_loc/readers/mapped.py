@@ -19,7 +19,7 @@ from factorgraph_loc.readers.mapped_poses import (
     read_odometry,
     read_reference,
 )
-from factorgraph_loc.readers.mapped_rfid import RfidFile, read_inventories, read_reads, texts_of
+from factorgraph_loc.readers.mapped_rfid import RfidFile, read_all_reads, read_inventories, texts_of
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.native_rfid import Rounds, read_rounds
 from factorgraph_loc.readers.registry import DEFAULT_RIG
@@ -128,7 +128,7 @@ def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | Non
         if options.inventories is not None:
             raise InputError(f"{folder}: [options] has inventories without rfid")
         return None
-    reads = read_reads(inside(folder, told.file, folder), told, warnings)
+    reads = read_all_reads(folder, told, warnings)
     inventories = None
     if options.inventories is not None:
         mapping = options.inventories

@@ -22,7 +22,7 @@ from factorgraph_loc.column_mapping import (
     read_mapped,
 )
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.readers.native_rfid import check_reads
 from factorgraph_loc.readers.tables import NAMES, Table
 from factorgraph_loc.trajectory import Integers
@@ -113,6 +113,26 @@ class RfidFile(ColumnMapping):
         if "channels" not in content:
             columns.pop("channel", None)
         return {**content, "columns": columns, "units": units}
+
+
+def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Table:
+    """The reads of the file below ``folder``, or of all files whose names fit where it holds ``*``, as readers begin new ones."""
+    if "*" not in options.file:
+        return read_reads(inside(folder, options.file, folder), options, warnings)
+    inside(folder, options.file.replace("*", "x"), folder)
+    files = sorted(file for file in folder.glob(options.file) if file.is_file())
+    if not files:
+        raise InputError(f"{folder}: rfid.file is {options.file!r}, expected the names of files that are there")
+    tables = [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files]
+    return _in_time(
+        Table(
+            folder / options.file,
+            np.concatenate([table.rows for table in tables]),
+            np.concatenate([table.t_ns for table in tables]),
+            {name: np.concatenate([table.numbers[name] for table in tables]) for name in SIGNALS},
+            {name: [text for table in tables for text in table.names[name]] for name in ("epc", "antenna")},
+        )
+    )
 
 
 def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:

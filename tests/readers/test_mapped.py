@@ -331,3 +331,22 @@ def test_a_folder_that_is_not_beside_its_manifest(hall, refused, monkeypatch):
     monkeypatch.delenv("FGLOC_DATA", raising=False)
     hall.write_text(MANIFEST.replace('"run"', '"rnu"'))
     refused(hall, "hall.toml (which has no rnu beside it): needs the data folder")
+
+
+def test_reads_in_several_files(hall, one, refused):
+    folder = hall.parent / "run"
+    expected = one(hall).streams["rfid"]
+    head, first, last = READS.partition("1970-01-01T01:00:02")
+    (folder / "reads.csv").unlink()
+    (folder / "reads-b.csv").write_text(head)
+    (folder / "reads-a.csv").write_text("".join(READS.splitlines(keepends=True)[:2]) + first + last)
+    hall.write_text(MANIFEST.replace("reads.csv", "reads-*.csv"))
+    found = one(hall).streams["rfid"]
+    assert found.epc == expected.epc
+    np.testing.assert_array_equal(found.t, expected.t)
+    (folder / "reads-c.csv").write_text(READS + "soon,e2001,,1,-60,866.3,r,1,0,\n")
+    refused(hall, "reads-c.csv:6", "soon")
+    hall.write_text(MANIFEST.replace("reads.csv", "log-*.csv"))
+    refused(hall, "log-*.csv", "files that are there")
+    hall.write_text(MANIFEST.replace("reads.csv", "../*.csv"))
+    refused(hall, "leaves its folder")
