@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 
 from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, ColumnMapping, read_mapped
 from factorgraph_loc.errors import InputError
@@ -19,7 +20,7 @@ from factorgraph_loc.readers.mapped_poses import (
     read_odometry,
     read_reference,
 )
-from factorgraph_loc.readers.mapped_rfid import RfidFile, read_all_reads, read_inventories, texts_of
+from factorgraph_loc.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories, texts_of
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.native_rfid import Rounds, read_rounds
 from factorgraph_loc.readers.registry import DEFAULT_RIG
@@ -52,11 +53,13 @@ class InventoryFile(SensorFile):
 
 
 class Options(FileModel):
-    """Which file below the folder is which sensor, and the reference. The folder is the manifest's ``path``."""
+    """Which file below the folder is which sensor, and the reference. The folder is the manifest's ``path``. ``readers``: files of
+    several RFID readers by any names, in place of ``rfid``."""
 
     odometry: OdometryFile | None = None
     imu: SensorFile | None = None
     rfid: RfidFile | None = None
+    readers: dict[str, RfidFile] = Field(default_factory=dict)
     inventories: InventoryFile | None = None
     bearing_range: SensorFile | None = None
     camera: ImageFile | None = None
@@ -123,19 +126,25 @@ def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) ->
 
 
 def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | None:
-    told = options.rfid
-    if told is None:
+    files = [options.rfid] if options.rfid else list(options.readers.values())
+    if options.rfid and options.readers:
+        raise InputError(f"{folder}: [options] has rfid and readers, expected one of them")
+    if not files:
         if options.inventories is not None:
             raise InputError(f"{folder}: [options] has inventories without rfid")
         return None
-    reads = read_all_reads(folder, told, warnings)
+    tables = [read_all_reads(folder, told, warnings) for told in files]
+    reads = tables[0] if len(tables) == 1 else joined(folder, tables)
+    gaps = {told.round_gap for told in files if told.round_gap is not None}
     inventories = None
-    if options.inventories is not None:
-        mapping = options.inventories
-        if told.round_gap is not None:
-            raise InputError(f"{folder}: rfid.round_gap means nothing beside inventories, which tell the rounds")
-        inventories = read_inventories(
-            inside(folder, mapping.file, folder), mapping, mapping.clock_offset, told.antennas
+    if (mapping := options.inventories) is not None:
+        if gaps:
+            raise InputError(f"{folder}: round_gap means nothing beside inventories, which tell the rounds")
+        antennas = {name: given for told in files for name, given in told.antennas.items()}
+        path = inside(folder, mapping.file, folder)
+        inventories = read_inventories(path, mapping, mapping.clock_offset, antennas)
+    if len(gaps) > 1:
+        raise InputError(
+            f"{folder}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
         )
-    gap = native.ROUND_GAP if told.round_gap is None else told.round_gap
-    return read_rounds(reads, inventories, gap, warnings)
+    return read_rounds(reads, inventories, gaps.pop() if gaps else native.ROUND_GAP, warnings)

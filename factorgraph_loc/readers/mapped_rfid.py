@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -123,10 +123,17 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
     files = sorted(file for file in folder.glob(options.file) if file.is_file())
     if not files:
         raise InputError(f"{folder}: rfid.file is {options.file!r}, expected the names of files that are there")
-    tables = [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files]
+    return joined(
+        folder / options.file,
+        [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files],
+    )
+
+
+def joined(path: Path, tables: Sequence[Table]) -> Table:
+    """All reads of several tables in the order of time, as of ``path``."""
     return _in_time(
         Table(
-            folder / options.file,
+            path,
             np.concatenate([table.rows for table in tables]),
             np.concatenate([table.t_ns for table in tables]),
             {name: np.concatenate([table.numbers[name] for table in tables]) for name in SIGNALS},

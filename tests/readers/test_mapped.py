@@ -350,3 +350,43 @@ def test_reads_in_several_files(hall, one, refused):
     refused(hall, "log-*.csv", "files that are there")
     hall.write_text(MANIFEST.replace("reads.csv", "../*.csv"))
     refused(hall, "leaves its folder")
+
+
+READERS = "\n".join(
+    f"""
+[options.readers.{name}]
+file = "{name}.txt"
+antenna = "{name}"
+separator = " "
+header = false
+columns = {{ t = "8", epc = "2", frequency = "4", phase = "5", rssi = "6" }}
+units = {{ t = "us", frequency = "MHz", phase = "deg" }}
+"""
+    for name in ("first", "second", "third")
+)
+
+
+def test_three_readers_of_a_recorded_robot(data_root, tmp_path, one):
+    """The same reads as the reader that was written for this data set gives within its span, to the last digit."""
+    (tmp_path / "aisle.toml").write_text(
+        MANIFEST.partition("[options")[0].replace('"run"', '"rfid_aisle/run13"')
+        + '[options.odometry]\nfile = "reference_pose.txt"\nseparator = " "\nheader = false\nunits = { t = "s" }\n'
+        + 'columns = { t = "4", x = "1", y = "2", heading = "3" }\n'
+        + READERS
+    )
+    log = one(tmp_path / "aisle.toml", data_root=data_root)
+    expected = one("rfid-aisle-run13", data_root=data_root)
+    theirs, ours = expected.streams["rfid"], log.streams["rfid"]
+    shift = (log.t0_ns - expected.t0_ns) / 1e9
+    begin = np.searchsorted(ours.t + shift, theirs.t[0] - 1e-6)
+    part = slice(begin, begin + len(theirs.t))
+    np.testing.assert_allclose(ours.t[part] + shift, theirs.t, rtol=0, atol=2e-7)
+    assert ours.epc[part] == theirs.epc
+    assert ours.antenna[part] == theirs.antenna
+    for column in ("age", "rssi", "phase", "frequency"):
+        np.testing.assert_allclose(getattr(ours, column)[part], getattr(theirs, column), rtol=0, atol=1e-6)
+
+
+def test_readers_and_a_single_one_do_not_go_together(hall, refused):
+    hall.write_text(MANIFEST + READERS)
+    refused(hall, "has rfid and readers")
