@@ -53,8 +53,8 @@ def read_track(estimates: bytes) -> Track:
     """The trajectories of an ``estimates.parquet``; see :meth:`~factorgraph_loc.experiments.store.Store.track`."""
     table = pl.read_parquet(io.BytesIO(estimates))
     t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
-    causal = _trajectory(table.filter((pl.col("kind") == "causal") & _from_localized(table)), t0_ns)
-    final = _trajectory(table.filter(pl.col("kind") == "final"), t0_ns)
+    causal = trajectory_of(table.filter((pl.col("kind") == "causal") & _from_localized(table)), t0_ns)
+    final = trajectory_of(table.filter(pl.col("kind") == "final"), t0_ns)
     return Track(causal if len(causal) else None, final, np.empty(0))
 
 
@@ -63,7 +63,8 @@ def _from_localized(table: pl.DataFrame) -> pl.Expr:
     return pl.col("t_ns") >= (found.min() if len(found) else np.iinfo(np.int64).max)
 
 
-def _trajectory(table: pl.DataFrame, t0_ns: int) -> Trajectory:
+def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:
+    """The poses in rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
     covariances = np.empty((len(table), 3, 3))
     for name, (i, j) in COVARIANCES.items():
         covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()

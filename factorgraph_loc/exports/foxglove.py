@@ -21,14 +21,13 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.foxglove_schemas import OTHERS, SCHEMAS
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import Colour, colours
+from factorgraph_loc.exports.scene import DARK, LIT, SEEN, Colour, colours
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 WORLD = "world"
-REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)  # RGB
 MARK, THIN = 0.12, 0.02  # m: the diameter of a tag or landmark, the thickness of a line
 LETTERS = 0.15  # m
 STRIP, LIST = 0, 2  # of a line: connected, or pairs of points
@@ -116,7 +115,7 @@ def _streams(log: Log, runs: Sequence[StoredRun], start: float) -> Iterator[Iter
     for run, colour in zip(runs, colours(), strict=False):
         at = f"/{run.name}"
         yield iter([_path(at, run.final, start), _learnt(run, colour, start)])
-        yield _poses(at, run.causal)
+        yield _poses(at, run.played())
         yield _transforms(run)
         yield _ellipses(run, colour)
         yield _estimates(run)
@@ -154,7 +153,7 @@ def _places(trajectory: Trajectory) -> list[dict[str, Any]]:
 
 
 def _transforms(run: StoredRun) -> Iterator[Message]:
-    for t, pose in zip(run.causal.t.tolist(), run.causal.poses.tolist(), strict=True):
+    for t, pose in zip(run.played().t.tolist(), run.played().poses.tolist(), strict=True):
         place = _pose(*pose)
         content = {"translation": place["position"], "rotation": place["orientation"]}
         frames = {"parent_frame_id": WORLD, "child_frame_id": run.name}
@@ -162,7 +161,7 @@ def _transforms(run: StoredRun) -> Iterator[Message]:
 
 
 def _ellipses(run: StoredRun, colour: Colour) -> Iterator[Message]:
-    t, outlines = scene.ellipses(run.causal)
+    t, outlines = scene.ellipses(run.played())
     for at, outline in zip(t.tolist(), outlines, strict=True):
         entity = _entity("ellipse", lines=[_line(outline, colour, STRIP)])
         yield Message(at, f"/{run.name}/ellipse", "foxglove.SceneUpdate", _update([entity]))
@@ -170,9 +169,10 @@ def _ellipses(run: StoredRun, colour: Colour) -> Iterator[Message]:
 
 def _estimates(run: StoredRun) -> Iterator[Message]:
     known = {name: dict(zip(t.tolist(), values.tolist(), strict=True)) for name, (t, values) in run.series.items()}
-    covariances = run.causal.covariances
-    for i, t in enumerate(run.causal.t.tolist()):
-        content = dict(zip(("x", "y", "heading"), run.causal.poses[i].tolist(), strict=True))
+    trajectory = run.played()
+    covariances = trajectory.covariances
+    for i, t in enumerate(trajectory.t.tolist()):
+        content = dict(zip(("x", "y", "heading"), trajectory.poses[i].tolist(), strict=True))
         if covariances is not None and np.isfinite(covariances[i]).all():
             c = covariances[i]
             content["covariance"] = c.ravel().tolist()

@@ -21,7 +21,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import Colour, colours
+from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, SEEN, Colour, colours
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 TIMELINE = "log_time"
 WORLD, PLOTS, EVENTS = "/world", "/plots", "/events"
-REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)  # RGB
 LINE, POINT = 0.02, 0.06  # m: radii
 ARROW = 0.6  # m
 FRUSTUM = 0.4  # m from the camera to its image
@@ -134,8 +133,8 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
     at = f"{WORLD}/{run.name}"
     _path(recording, f"{at}/final", run.final, colour)
     _trail(recording, f"{at}/causal", run.causal, colour)
-    _robot(recording, f"{at}/robot", run.causal if len(run.causal) else run.final, colour)
-    t, outlines = scene.ellipses(run.causal)
+    _robot(recording, f"{at}/robot", run.played(), colour)
+    t, outlines = scene.ellipses(run.played())
     _lines_over_time(recording, f"{at}/ellipse", t, outlines, colour)
     if run.landmarks:
         centres = np.array([point.position for point in run.landmarks.values()])
@@ -279,12 +278,12 @@ def _has_pictures(log: Log) -> bool:
 
 def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
     """The poses of the robot whose camera is drawn: of the first run that has some, else the reference."""
-    found = [t for run in runs for t in (run.causal, run.final) if len(t)]
+    found = [run.played() for run in runs if len(run.played())]
     return found[0] if found else log.reference
 
 
 def _camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
-    drawn = [run.name for run in runs if len(run.causal) or len(run.final)]
+    drawn = [run.name for run in runs if len(run.played())]
     name = drawn[0] if drawn else "reference"
     return f"{WORLD}/{name}/robot/camera" if drawn or log.reference is not None else "/camera"
 

@@ -13,7 +13,8 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import LearntPoint
-from factorgraph_loc.experiments.output import COVARIANCES, FILES
+from factorgraph_loc.experiments.output import FILES
+from factorgraph_loc.experiments.stored_run import trajectory_of
 from factorgraph_loc.files import read_text, read_toml
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
@@ -45,8 +46,8 @@ class StoredRun:
     """A run as it was written; times in seconds from the start of its log.
 
     ``causal``: the estimates from the first localized one on; ``final``: the best estimate of the whole past; both may be empty.
-    ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) of the causal
-    estimates. ``landmarks``: those that the estimator learnt. ``events``: time and text.
+    ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) of the estimates
+    that :meth:`played` gives. ``landmarks``: those that the estimator learnt. ``events``: time and text.
     """
 
     name: str
@@ -56,6 +57,10 @@ class StoredRun:
     series: dict[str, tuple[Array, Array]]
     landmarks: dict[str, LearntPoint]
     events: tuple[tuple[float, str], ...]
+
+    def played(self) -> Trajectory:
+        """What is shown along time: the causal estimates, or the final ones of an estimator that has no others."""
+        return self.causal if len(self.causal) else self.final
 
 
 def is_results(path: Path) -> bool:
@@ -103,9 +108,9 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         run = StoredRun(
             name,
             folder,
-            _trajectory(causal),
-            _trajectory(final),
-            {key: _series(causal, key) for key in SERIES},
+            trajectory_of(causal, log.t0_ns),
+            trajectory_of(final, log.t0_ns),
+            {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
             _landmarks(folder.path / "learnt.json"),
             _events(folder.path / "events.csv", log.t0_ns),
         )
@@ -137,16 +142,9 @@ def _config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def _trajectory(table: pl.DataFrame) -> Trajectory:
-    covariances = np.empty((len(table), 3, 3))
-    for name, (i, j) in COVARIANCES.items():
-        covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return Trajectory(table["t"].to_numpy(), table.select("x", "y", "heading").to_numpy(), covariances)
-
-
-def _series(table: pl.DataFrame, key: str) -> tuple[Array, Array]:
+def _series(table: pl.DataFrame, key: str, t0_ns: int) -> tuple[Array, Array]:
     known = table.filter(pl.col(key).is_not_null())
-    return known["t"].to_numpy(), known[key].to_numpy()
+    return (known["t_ns"].to_numpy() - t0_ns) / 1e9, known[key].to_numpy()
 
 
 def _landmarks(path: Path) -> dict[str, LearntPoint]:

@@ -19,12 +19,13 @@ from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
-LIT = 0.5  # s that a tag or landmark stays lit after it was read or seen
+LIT_FOR = 0.5  # s that a tag or landmark stays lit after it was read or seen
 GAP = 1.0  # s between poses, above which nothing is said of the way between them
 CORNERS = 32  # of an ellipse
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # sigmas at which a Gaussian of two dimensions holds 95 %
 JPEG_QUALITY = 90
 Colour = tuple[int, int, int]  # red, green, blue of 255
+REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
 _CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
@@ -45,7 +46,7 @@ def colours() -> Iterator[Colour]:
 
 
 def read_tags(log: Log) -> Lights:
-    """The tags that are read, each for :data:`LIT` seconds from when the antenna had it."""
+    """The tags that are read, each for :data:`LIT_FOR` seconds from when the antenna had it."""
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         return _lights((), ())
@@ -55,7 +56,7 @@ def read_tags(log: Log) -> Lights:
 
 
 def seen_landmarks(log: Log) -> Lights:
-    """The landmarks whose range or bearing is measured, each for :data:`LIT` seconds."""
+    """The landmarks whose range or bearing is measured, each for :data:`LIT_FOR` seconds."""
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream):
         return _lights((), ())
@@ -125,9 +126,9 @@ def _jpeg(file: Path) -> bytes:
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
-    """Each name is lit from each of its times on, for :data:`LIT` seconds."""
+    """Each name is lit from each of its times on, for :data:`LIT_FOR` seconds."""
     switches = sorted(
-        s for start, name in zip(t, names, strict=True) for s in ((start, 1, name), (start + LIT, -1, name))
+        s for start, name in zip(t, names, strict=True) for s in ((start, 1, name), (start + LIT_FOR, -1, name))
     )
     lit: dict[str, int] = {}
     stamps: list[float] = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
 
@@ -54,3 +55,13 @@ def test_bad_folders(log, results, tmp_path):
     (tmp_path / "cut" / "estimates.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match="cut: cannot be read as results of a run"):
         read_runs(find_runs(tmp_path / "cut"), log)
+
+
+def test_of_an_estimator_without_causal_estimates_the_final_ones_are_played(log, tmp_path):
+    write_run(run(log, RunConfig("batch")), log, tmp_path / "batch")
+    (batch,) = read_runs(find_runs(tmp_path / "batch"), log)
+    assert len(batch.causal) == 0
+    assert batch.played() is batch.final
+    t, errors = batch.series["error_position"]
+    assert np.array_equal(t, batch.final.t)
+    assert errors.max() < 0.05

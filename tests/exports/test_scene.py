@@ -32,7 +32,7 @@ def test_lights_are_those_of_the_last_half_second(seen):
         at = k / 8 + 1 / 16  # between the stamps
         i = np.searchsorted(lights.t, at) - 1
         lit = set(lights.names[i]) if i >= 0 else set()
-        assert lit == {name for start, name in seen if start / 8 <= at < start / 8 + scene.LIT}
+        assert lit == {name for start, name in seen if start / 8 <= at < start / 8 + scene.LIT_FOR}
 
 
 def test_an_ellipse_holds_95_percent():
