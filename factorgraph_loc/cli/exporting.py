@@ -56,7 +56,8 @@ def export(
     elif out.suffix == ".kitti":
         from factorgraph_loc.exports.trajectories import write_kitti
 
-        files.append(write_kitti(_trajectory(log, runs, out), out))
+        in_space = log.reference3 if not runs and log.reference is None else None
+        files.append(write_kitti(in_space or _trajectory(log, runs, out), out))
     else:
         from factorgraph_loc.trajectory import write_tum
 
@@ -79,5 +80,7 @@ def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
     if runs:
         return _only(runs, out).final
     if log.reference is None:
+        if log.reference3 is not None:
+            raise InputError(f"{log.name}: has its reference in space, which goes into .kitti only")
         raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
     return log.reference

@@ -7,38 +7,35 @@ is sent in columns: what is logged piece by piece with ``set_time(duration=...)`
 
 from __future__ import annotations
 
-import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.particles import Particles
+from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, has_pictures, record_camera, times
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, SEEN, Colour, colours
+from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
-from factors import reprojection
+from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-TIMELINE = "log_time"
-WORLD, PLOTS, EVENTS = "/world", "/plots", "/events"
+PLOTS, EVENTS = "/plots", "/events"
 LINE, POINT = 0.02, 0.06  # m: radii
 ARROW = 0.6  # m
-FRUSTUM = 0.4  # m from the camera to its image
-BATCH = 16  # pictures that are sent at once
-NEAREST = 300  # points of the map that are drawn into an image
 
 
 def write_rrd(
@@ -87,11 +84,13 @@ def _record(
     if log.reference is not None:
         _path(recording, f"{WORLD}/reference/path", log.reference, REFERENCE)
         _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
+    elif log.reference3 is not None:
+        _in_space(recording, f"{WORLD}/reference", log.reference3)
     for run, colour in zip(runs, colours(), strict=False):
         _run(recording, run, colour)
         if run.name in particles:
             _particles(recording, f"{WORLD}/{run.name}/particles", particles[run.name], colour)
-    _camera(recording, log, runs)
+    record_camera(recording, log, runs)
 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
@@ -120,8 +119,8 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
     if any(lit):
         flat = [name for names in lit for name in names]
         columns = rr.Points3D.columns(positions=np.array([positions[name] for name in flat]), labels=flat)
-        times = _times(lights.t)
-        recording.send_columns(f"{WORLD}/{what}/lit", times, columns.partition([len(names) for names in lit]))
+        columns = columns.partition([len(names) for names in lit])
+        recording.send_columns(f"{WORLD}/{what}/lit", times(lights.t), columns)
         look = rr.Points3D.from_fields(radii=2.0 * POINT, colors=LIT, show_labels=True)
         recording.log(f"{WORLD}/{what}/lit", look, static=True)
 
@@ -150,10 +149,10 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
         if len(stamps):
             plot = f"{PLOTS}/{name}/{run.name}"
             recording.log(plot, rr.SeriesLines(colors=colour, names=run.name), static=True)
-            recording.send_columns(plot, _times(stamps), rr.Scalars.columns(scalars=values))
+            recording.send_columns(plot, times(stamps), rr.Scalars.columns(scalars=values))
     if run.events:
         when, texts = zip(*run.events, strict=True)
-        recording.send_columns(f"{EVENTS}/{run.name}", _times(np.array(when)), rr.TextLog.columns(text=texts))
+        recording.send_columns(f"{EVENTS}/{run.name}", times(np.array(when)), rr.TextLog.columns(text=texts))
 
 
 def _particles(recording: rr.RecordingStream, at: str, particles: Particles, colour: Colour) -> None:
@@ -162,7 +161,7 @@ def _particles(recording: rr.RecordingStream, at: str, particles: Particles, col
     if any(map(len, particles.poses)):
         positions = _on_floor(np.concatenate(particles.poses)[:, :2])
         columns = rr.Points3D.columns(positions=positions).partition([len(poses) for poses in particles.poses])
-        recording.send_columns(at, _times(particles.t), columns)
+        recording.send_columns(at, times(particles.t), columns)
         recording.log(at, rr.Points3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
@@ -186,7 +185,7 @@ def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Ar
     import rerun as rr  # noqa: PLC0415
 
     if len(t):
-        recording.send_columns(at, _times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
+        recording.send_columns(at, times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
         recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
@@ -199,93 +198,23 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
     half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))
     turns = np.column_stack((np.zeros((len(half), 2)), np.sin(half), np.cos(half)))
     poses = rr.Transform3D.columns(translation=_on_floor(trajectory.poses[:, :2]), quaternion=turns)
-    recording.send_columns(at, _times(trajectory.t), poses)
+    recording.send_columns(at, times(trajectory.t), poses)
     recording.log(f"{at}/place", rr.Points3D([(0.0, 0.0, 0.0)], radii=2.0 * POINT, colors=colour), static=True)
     if trajectory.has_heading:
         arrow = rr.Arrows3D(vectors=[(ARROW, 0.0, 0.0)], radii=LINE, colors=colour)
         recording.log(f"{at}/heading", arrow, static=True)
 
 
-def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
-    """What the camera saw, as a picture before the first robot; identified points in it, and where the map's points should be."""
+def _in_space(recording: rr.RecordingStream, at: str, trajectory: Trajectory3) -> None:
+    """The way of a robot that is not on a floor, and where it was."""
     import rerun as rr  # noqa: PLC0415
 
-    settings = log.rig.camera
-    if settings is None or not _has_pictures(log):
-        return
-    model, at, poses = settings.model(), _camera_path(log, runs), _carrier(log, runs)
-    if poses is not None:
-        place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
-        recording.log(at, place, static=True)
-    lens = rr.Pinhole(
-        image_from_camera=model.matrix(),
-        resolution=(model.width, model.height),
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=FRUSTUM,
+    recording.log(
+        f"{at}/path", rr.LineStrips3D([trajectory.positions], radii=LINE / 2.0, colors=REFERENCE), static=True
     )
-    recording.log(at, lens, static=True)
-    for some in _batches(scene.images(log)):
-        _pictures(recording, f"{at}/image", some)
-        if log.world.points is not None and poses is not None:
-            t = np.array([t for t, _ in some])
-            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=scene.GAP)]
-            _pixels_over_time(recording, f"{at}/image/map", t, expected)
-            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
-    seen = list(scene.sightings(log))
-    if seen:
-        labels = [name for _, names, _ in seen for name in names]
-        t = np.array([t for t, _, _ in seen])
-        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in seen], labels)
-        look = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
-        recording.log(f"{at}/image/landmarks", look, static=True)
-
-
-def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
-    while some := list(itertools.islice(pictures, BATCH)):
-        yield some
-
-
-def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
-    import rerun as rr  # noqa: PLC0415
-
-    t, contents = zip(*pictures, strict=True)
-    columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
-    recording.send_columns(at, _times(np.array(t)), columns)
-
-
-def _pixels_over_time(
-    recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
-) -> None:
-    """The points (K, 2) in each picture; the viewer counts pixels from the corner of the first, not from its centre."""
-    import rerun as rr  # noqa: PLC0415
-
-    columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
-    recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
-
-
-def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """The pixels (K, 2) of the nearest ``points`` (P, 3) that are in the picture from ``pose`` (3,), if that is known."""
-    if not np.isfinite(pose).all():
-        return np.empty((0, 2))
-    pixels, depths = reprojection.predict(model, pose, points)
-    visible = np.flatnonzero((depths > 0.0) & model.contains(pixels))
-    return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
-
-
-def _has_pictures(log: Log) -> bool:
-    return "camera" in log.streams or "sightings" in log.streams
-
-
-def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
-    """The poses of the robot whose camera is drawn: of the first run that has some, else the reference."""
-    found = [run.played() for run in runs if len(run.played())]
-    return found[0] if found else log.reference
-
-
-def _camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
-    drawn = [run.name for run in runs if len(run.played())]
-    name = drawn[0] if drawn else "reference"
-    return f"{WORLD}/{name}/robot/camera" if drawn or log.reference is not None else "/camera"
+    turns = Rotation.from_matrix(trajectory.rotations).as_quat()
+    poses = rr.Transform3D.columns(translation=trajectory.positions, quaternion=turns)
+    recording.send_columns(f"{at}/robot", times(trajectory.t), poses)
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
@@ -307,8 +236,8 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
         eye_controls=eye,
     )
     beside: list[rrb.View] = []
-    if log.rig.camera is not None and _has_pictures(log):
-        beside.append(rrb.Spatial2DView(origin=_camera_path(log, runs), name="camera"))
+    if log.rig.camera is not None and has_pictures(log):
+        beside.append(rrb.Spatial2DView(origin=camera_path(log, runs), name="camera"))
     titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
     beside += [
         rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title)
@@ -329,17 +258,13 @@ def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
     parts += [p[None, :2] for p in (*scene.tag_positions(log).values(), *scene.landmark_positions(log).values())]
     if log.reference is not None:
         parts.append(log.reference.poses[:, :2])
+    if log.reference3 is not None:
+        parts.append(log.reference3.positions[:, :2])
     points = np.concatenate(parts)
     if not len(points):
         return np.zeros(2), 10.0
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2.0, max(float((high - low).max()), 1.0)
-
-
-def _times(t: Array) -> list[rr.TimeColumn]:
-    import rerun as rr  # noqa: PLC0415
-
-    return [rr.TimeColumn(TIMELINE, duration=t)]
 
 
 def _on_floor(points: Array) -> Array:

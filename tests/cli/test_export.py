@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
+from factorgraph_loc.cli.options import LogOptions
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import Log, TwistStream
 from factorgraph_loc.readers import load
+from factorgraph_loc.rig import Rig, TwistSettings
 from factorgraph_loc.trajectory import read_tum
+from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.world import World
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +53,18 @@ def test_the_reference_of_a_log(fgloc, short_log, tmp_path):
     assert np.allclose(read_tum(tmp_path / "truth.tum", log.t0_ns).poses[:, :2], log.reference.poses[:, :2], atol=1e-8)
 
 
+def test_a_reference_in_space(fgloc, tmp_path, monkeypatch):
+    t = np.array((0.0, 1.0))
+    space = Trajectory3(t, np.array(((0.0, 0.0, 1.0), (1.0, 2.0, 3.0))), np.tile(np.eye(3), (2, 1, 1)))
+    twist = TwistStream(t, np.zeros((2, 3)), np.zeros((2, 3)))
+    rig = Rig(sensors=("twist",), twist=TwistSettings(shift=(0.1, 0.1, 0.1), turn=(0.1, 0.1, 0.1)))
+    log = Log("carried", rig, World(), {"twist": twist}, reference3=space)
+    monkeypatch.setattr(LogOptions, "load_one", lambda *_: log)  # the native format has no logs in space
+    assert fgloc("export", "carried", "-o", tmp_path / "a.kitti").exit_code == 0
+    assert np.loadtxt(tmp_path / "a.kitti")[1].tolist() == [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3]
+    assert "goes into .kitti only" in fgloc("export", "carried", "-o", tmp_path / "a.tum").stderr
+
+
 def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):
     assert fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.g2o").exit_code == 0
     factors, values = gtsam.readG2o(str(tmp_path / "ekf.g2o"), False)
@@ -76,4 +93,4 @@ def test_bad_input(fgloc, short_log, comparison, ekf, tmp_path):
     for file in short_log.iterdir():
         if file.stem != "reference":
             (bare / file.name).write_bytes(file.read_bytes())
-    assert "has no reference to write" in error(bare, "-o", tmp_path / "a.tum")
+    assert "has no reference to write, expected the folder of a run too" in error(bare, "-o", tmp_path / "a.tum")

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.points import PointMap
+from factorgraph_loc.trajectory3 import Trajectory3
 from factors import reprojection
 
 rr = pytest.importorskip("rerun")
@@ -141,6 +143,18 @@ def test_a_log_alone_and_a_reference_without_headings(log, tmp_path):
     blind = replace(log, reference=None, streams={"odometry": log.streams["odometry"]}, world=type(log.world)())
     rerun_scene.write_rrd(blind, [], tmp_path / "log.rrd")
     assert {at for at, _ in Recording(tmp_path / "log.rrd").rows if not at.startswith("/__")} == {"/world"}
+
+
+def test_a_reference_in_space_carries_its_camera(log, tmp_path):
+    turns = Rotation.from_rotvec([(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)]).as_matrix()
+    space = Trajectory3(np.array((0.0, 1.0)), np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 1.5))), turns)
+    rerun_scene.write_rrd(replace(log, reference=None, reference3=space), [], tmp_path / "log.rrd")
+    recording = Recording(tmp_path / "log.rrd")
+    rows = recording("/world/reference/robot", "quaternion")
+    assert np.allclose(np.ravel(rows[1][1]), (np.sin(0.2), 0.0, 0.0, np.cos(0.2)))
+    assert np.allclose(np.ravel(recording("/world/reference/robot", "translation")[1][1]), (1.0, 0.0, 1.5))
+    assert len(recording("/world/reference/robot/camera/image", "blob")) == 3
+    assert len(recording("/world/reference/robot/camera", "translation")) == 1
 
 
 def test_without_the_library_it_says_what_to_install(log, tmp_path, monkeypatch):

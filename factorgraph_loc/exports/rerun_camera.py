@@ -1,0 +1,118 @@
+"""What the camera saw, in a recording of Rerun: images, identified points in them, and where the points of the map should be."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgraph_loc.exports import scene
+from factorgraph_loc.exports.runs import StoredRun
+from factorgraph_loc.exports.scene import LIT, SEEN
+from factorgraph_loc.log import Log
+from factorgraph_loc.trajectory import Trajectory
+from factors import reprojection
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+TIMELINE = "log_time"
+WORLD, CAMERA = "/world", "/camera"  # the latter of a robot whose place is not known
+FRUSTUM = 0.4  # m from the camera to its image
+BATCH = 16  # pictures that are sent at once
+NEAREST = 300  # points of the map that are drawn into an image
+
+
+def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
+    """What the camera saw, as a picture before the first robot; identified points in it, and where the map's points should be."""
+    import rerun as rr  # noqa: PLC0415
+
+    settings = log.rig.camera
+    if settings is None or not has_pictures(log):
+        return
+    model, at, poses = settings.model(), camera_path(log, runs), _carrier(log, runs)
+    if at != CAMERA:
+        place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
+        recording.log(at, place, static=True)
+    lens = rr.Pinhole(
+        image_from_camera=model.matrix(),
+        resolution=(model.width, model.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM,
+    )
+    recording.log(at, lens, static=True)
+    for some in _batches(scene.images(log)):
+        _pictures(recording, f"{at}/image", some)
+        if log.world.points is not None and poses is not None:
+            t = np.array([t for t, _ in some])
+            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=scene.GAP)]
+            _pixels_over_time(recording, f"{at}/image/map", t, expected)
+            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
+    seen = list(scene.sightings(log))
+    if seen:
+        labels = [name for _, names, _ in seen for name in names]
+        t = np.array([t for t, _, _ in seen])
+        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in seen], labels)
+        look = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
+        recording.log(f"{at}/image/landmarks", look, static=True)
+
+
+def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
+    while some := list(itertools.islice(pictures, BATCH)):
+        yield some
+
+
+def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
+    import rerun as rr  # noqa: PLC0415
+
+    t, contents = zip(*pictures, strict=True)
+    columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
+    recording.send_columns(at, times(np.array(t)), columns)
+
+
+def _pixels_over_time(
+    recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
+) -> None:
+    """The points (K, 2) in each picture; the viewer counts pixels from the corner of the first, not from its centre."""
+    import rerun as rr  # noqa: PLC0415
+
+    columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
+    recording.send_columns(at, times(t), columns.partition([len(p) for p in pixels]))
+
+
+def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
+    """The pixels (K, 2) of the nearest ``points`` (P, 3) that are in the picture from ``pose`` (3,), if that is known."""
+    if not np.isfinite(pose).all():
+        return np.empty((0, 2))
+    pixels, depths = reprojection.predict(model, pose, points)
+    visible = np.flatnonzero((depths > 0.0) & model.contains(pixels))
+    return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
+
+
+def has_pictures(log: Log) -> bool:
+    """Whether the log holds images, or points that were identified in some."""
+    return "camera" in log.streams or "sightings" in log.streams
+
+
+def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
+    """The poses of the robot whose camera is drawn: of the first run that has some, else the reference."""
+    found = [run.played() for run in runs if len(run.played())]
+    return found[0] if found else log.reference
+
+
+def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
+    """The entity of the camera: on the first robot that is drawn, if there is one."""
+    robots = [run.name for run in runs if len(run.played())]
+    if log.reference is not None or log.reference3 is not None:
+        robots.append("reference")
+    return f"{WORLD}/{robots[0]}/robot/camera" if robots else CAMERA
+
+
+def times(t: Array) -> list[rr.TimeColumn]:
+    """Seconds of the log as what Rerun calls an index."""
+    import rerun as rr  # noqa: PLC0415
+
+    return [rr.TimeColumn(TIMELINE, duration=t)]
