@@ -253,7 +253,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 
 
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
-    """The middle (2,) of all that is drawn, and its larger side [m]."""
+    """The middle (2,) of all that is drawn, and its larger side [m], at least 5: a hand-held camera is not looked at from within."""
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
     parts += [p[None, :2] for p in (*scene.tag_positions(log).values(), *scene.landmark_positions(log).values())]
     if log.reference is not None:
@@ -264,7 +264,7 @@ def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
     if not len(points):
         return np.zeros(2), 10.0
     low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2.0, max(float((high - low).max()), 1.0)
+    return (low + high) / 2.0, max(float((high - low).max()), 5.0)
 
 
 def _on_floor(points: Array) -> Array:
