@@ -253,7 +253,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 
 
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
-    """The middle (2,) of all that is drawn, and its larger side [m], at least 5: a hand-held camera is not looked at from within."""
+    """The middle (2,) of all that is drawn, and its larger side [m]; at least 5, not to look at a small scene from within."""
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
     parts += [p[None, :2] for p in (*scene.tag_positions(log).values(), *scene.landmark_positions(log).values())]
     if log.reference is not None:
