@@ -18,7 +18,7 @@ from factorgraph_loc.measurements import Measurement, RfidScan
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
 from factorgraph_loc.planning.fisher import Sensors
-from factorgraph_loc.planning.paths import Path, primitives, waypoint_paths, waypoints
+from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -33,6 +33,7 @@ from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
+NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes that are no farther apart are one place
 SHOWN = 300  # particles of a belief that are kept
 SPREAD = 2000  # poses that stand for a belief without particles
 WRONG = 3.0  # times the limits: an error that is no bad luck
@@ -62,7 +63,7 @@ def run_active(
     start = _start(world, space, settings, of_start)
     robot = SimulatedRobot(world, space, simulation.rig, simulation.rounds_per_second, start, settings, of_robot)
     setup = registry.Setup(simulation.rig, world, ("odometry", "rfid"), of_estimator)
-    rounds = simulation.rounds_per_second / settings.speed
+    rounds = simulation.rounds_per_second
     loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, rounds, of_policy)
     localized = loop.run()
     position, heading = loop.errors()
@@ -94,14 +95,15 @@ class _Loop:
         setup: registry.Setup,
         space: FreeSpace,
         settings: ActiveSettings,
-        rounds_per_metre: float,
+        rounds_per_second: float,
         rng: np.random.Generator,
     ) -> None:
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
         self._robot, self._estimator, self._policy = robot, estimator, policy
-        self._space, self._settings, self._rounds_per_metre, self._rng = space, settings, rounds_per_metre, rng
-        self._paths = primitives(settings.policy.horizon)
+        self._space, self._settings, self._rounds_per_second, self._rng = space, settings, rounds_per_second, rng
+        self._paths, self._turn = primitives(settings.policy.horizon), look_around()
+        self._turned_at = -math.inf  # metres driven when the robot last turned around
         self._sensors = Sensors.of(setup.world, setup.rig)
         tags = tag_map(setup.world, setup.rig.survey).tags
         assert setup.rig.rfid is not None, "the settings have been checked"
@@ -157,8 +159,10 @@ class _Loop:
         belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         started = perf_counter()
-        modes = tuple(m for m in belief.modes[:MODES] if m.weight >= LIKELY and np.all(np.isfinite(m.pose)))
+        modes = _places(belief)
         proposed = [*self._paths, *self._far(modes)]
+        if self._robot.metres >= self._turned_at + self._settings.policy.replan:
+            proposed.append(self._turn)
         paths, free = usable(proposed, self._robot.free_ahead(proposed), self._settings.sight)
         situation = Situation(
             particles,
@@ -171,10 +175,13 @@ class _Loop:
             self._rng,
             modes,
             self._sensors,
-            self._rounds_per_metre,
+            self._rounds_per_second / self._settings.speed,
+            self._rounds_per_second / self._settings.turn_rate,
         )
         choice = self._policy.choose(situation)
         elapsed = 1e3 * (perf_counter() - started)
+        if choice.path is not None and choice.path.kind == self._turn.kind:
+            self._turned_at = self._robot.metres
         estimate = self._estimator.estimate()
         self.steps.append(
             PlanningStep(
@@ -231,6 +238,22 @@ def _start(world: World, space: FreeSpace, settings: ActiveSettings, rng: np.ran
             f"at least {settings.clearance:g} m from all"
         )
     return np.array(settings.start)
+
+
+def _places(belief: Belief) -> tuple[Mode, ...]:
+    """The places of a belief that count, at most :data:`MODES`; two modes that are next to each other are one, the heavier."""
+    places: list[Mode] = []
+    for mode in belief.modes:
+        if not np.all(np.isfinite(mode.pose)):
+            continue
+        error = [se2.between(place.pose, mode.pose) for place in places]
+        near = [i for i, e in enumerate(error) if math.hypot(e[0], e[1]) < NEXT and abs(e[2]) < NEXT_HEADING]
+        if near:
+            one = places[near[0]]
+            places[near[0]] = Mode(one.weight + mode.weight, one.pose, one.covariance)
+        else:
+            places.append(mode)
+    return tuple(place for place in places[:MODES] if place.weight >= LIKELY)
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_loc.estimators.motion import propagate
-from factorgraph_loc.planning.information import POSITION, ROUNDS_PER_METRE, gaussian_entropy
+from factorgraph_loc.planning.information import POSITION, ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.settings import PixelSettings, SightingSettings
@@ -37,8 +37,8 @@ class Sensors:
     """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion.
 
     The other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna;
-    ``looks_per_metre``: of the other sensors. Landmarks are seen up to ``max_range`` [m], at most ``max_points`` points up to
-    ``max_depth`` [m], neither through walls.
+    ``looks_per_metre``: of the other sensors; ``metres_per_radian``: that take as long as a turn in place. Landmarks are seen up to
+    ``max_range`` [m], at most ``max_points`` points up to ``max_depth`` [m], neither through walls.
     """
 
     world: World
@@ -47,6 +47,7 @@ class Sensors:
     bearing_range: BearingRangeModel | None = None
     camera: CameraModel | None = None
     rounds_per_metre: float = ROUNDS_PER_METRE
+    metres_per_radian: float = ROUNDS_PER_RADIAN / ROUNDS_PER_METRE
     looks_per_metre: float = _SIGHTINGS.rate / SPEED
     max_range: float = _SIGHTINGS.max_range
     max_depth: float = _PIXELS.max_depth
@@ -69,7 +70,8 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     (3,) and ``covariance`` (3, 3) in the world's frame at its start. The robot looks at each pose of the path but the first."""
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
-    told = expected_information(poses[1:], np.diff(path.way), sensors)
+    passed = path.passed(1.0, sensors.metres_per_radian)
+    told = expected_information(poses[1:], np.diff(passed), sensors)
     states = [
         ChainState(way / SPEED, x, y, heading, way, turn, 0.0)
         for way, (x, y, heading), turn in zip(path.way.tolist(), path.poses.tolist(), path.turned.tolist(), strict=True)
@@ -92,7 +94,7 @@ def fisher_gain(
 
 def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:
     """Fisher's information (N, 3, 3) on the body-frame perturbation of poses (N, 3), from all sensors, of ``ways`` (N,) metres that
-    are driven about each."""
+    are driven about each, or of turns that take as long."""
     out = np.zeros((len(poses), 3, 3))
     if sensors.rfid is not None:
         count = len(sensors.rfid.model.antennas)

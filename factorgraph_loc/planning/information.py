@@ -34,9 +34,9 @@ DIMS = ("x", "y", "heading")
 POSITION = ("x", "y")
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a whole number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
-LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way
+LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way, or of turns that take as long
 LOOKS = 10  # at most: on a longer way they are farther apart
-ROUNDS_PER_METRE = 4.0  # of a robot with 2 rounds a second at 0.5 m/s
+ROUNDS_PER_METRE, ROUNDS_PER_RADIAN = 4.0, 2.0  # of a robot with 2 rounds a second at 0.5 m/s, or at 1 rad/s in place
 SAMPLES, SCANS = 256, 48  # particles that are weighed, and those that scans are drawn from
 FEWEST = 10  # particles, of which each may stand for many
 SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
@@ -89,13 +89,14 @@ def expected_gain(
     samples: int = SAMPLES,
     scans: int = SCANS,
     rounds_per_metre: float = ROUNDS_PER_METRE,
+    rounds_per_radian: float = ROUNDS_PER_RADIAN,
 ) -> Array:
     """Expected reduction of entropy (C,) [nats] on each of C paths, of a belief of particles (M, 3) in the world with weights (M,).
 
     The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
     particle whose way leads to a wall stops there, and scans no more. ``noise``: of the odometry on the way, none by default.
-    ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``: inventory rounds
-    of each antenna.
+    ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``,
+    ``rounds_per_radian`` of a turn in place: inventory rounds of each antenna.
     """
     if not paths:
         return np.empty(0)
@@ -107,7 +108,8 @@ def expected_gain(
     count = len(poses)
     scans = min(scans, count)
     seed = np.uint64(rng.integers(2**63))
-    stations = [_stations(path) for path in paths]
+    passed = [path.passed(rounds_per_metre, rounds_per_radian) for path in paths]
+    stations = [_stations(rounds, LOOK * rounds_per_metre) for rounds in passed]
     normals = rng.standard_normal((max(len(s) for s in stations), count, 3))
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
     after = np.empty((len(paths), scans))
@@ -120,7 +122,7 @@ def expected_gain(
         looks = steps[1:-1]
         stops = np.searchsorted(looks, last[c], side="right")
         log_weights: Array32 = np.empty((scans, count), dtype=np.float32)
-        rounds = _rounds(path, len(looks), rounds_per_metre)
+        rounds = _rounds(passed[c], len(looks))
         expected_scans.log_weights(
             tables, at[1:-1], rounds, stops, scans, seed, likelihood.model.tempering, log_weights
         )
@@ -168,18 +170,19 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
     return gaussian_entropy(covariances + np.diag(FINEST**2), DIMS[:dims])
 
 
-def _stations(path: Path) -> Places:
-    """Places among the poses of a path of the start, of the looks, one in the middle of each :data:`LOOK`, and of the end."""
-    count = min(max(1, round(path.length / LOOK)), LOOKS)
-    middles = (np.arange(count) + 0.5) * path.length / count
-    looks = np.searchsorted(path.way, middles - 1e-9)
-    return np.concatenate(([0], looks, [len(path.poses) - 1])).astype(np.int64)
+def _stations(passed: Array, each: float) -> Places:
+    """Places among the poses of a path, by the rounds (S,) that have ``passed`` there: the start, the looks, each in the middle of
+    about ``each`` rounds, and the end."""
+    count = min(max(1, round(passed[-1] / each)), LOOKS)
+    middles = (np.arange(count) + 0.5) * passed[-1] / count
+    looks = np.searchsorted(passed, middles - 1e-9)
+    return np.concatenate(([0], looks, [len(passed) - 1])).astype(np.int64)
 
 
-def _rounds(path: Path, looks: int, rounds_per_metre: float) -> Places:
+def _rounds(passed: Array, looks: int) -> Places:
     """Rounds (S,) of the looks: as many as there are on the way, spread over them."""
-    total = round(path.length * rounds_per_metre)
-    return np.diff(np.arange(looks + 1) * total // looks).astype(np.int64)
+    total = round(passed[-1])
+    return np.asarray(np.diff(np.arange(looks + 1) * total // looks), dtype=np.int64)
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:

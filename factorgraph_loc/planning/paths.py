@@ -47,13 +47,26 @@ class Path:
         """Metres driven."""
         return float(self.way[-1])
 
+    def passed(self, per_metre: float, per_radian: float) -> Array:
+        """What has passed (S,) up to each pose of what comes so often per metre driven or per radian turned, the more of both."""
+        steps = np.maximum(np.diff(self.way) * per_metre, np.diff(self.turned) * per_radian)
+        return np.concatenate((np.zeros(1), np.cumsum(steps)))
+
     def duration(self, speed: float, turn_rate: float) -> float:
         """Seconds at ``speed`` [m/s] where no more than ``turn_rate`` [rad/s] is turned."""
-        return float(np.maximum(np.diff(self.way) / speed, np.diff(self.turned) / turn_rate).sum())
+        return float(self.passed(1.0 / speed, 1.0 / turn_rate)[-1])
 
     def until(self, length: float) -> Path:
         """The path up to the last pose that is no farther than ``length`` [m] on the way."""
         return Path(self.poses[self.way <= length + 1e-9], self.kind)
+
+
+def look_around() -> Path:
+    """A turn in place, once around: it takes time, but no way."""
+    count = 2 * DIRECTIONS
+    poses = np.zeros((count + 1, 3))
+    poses[:, 2] = se2.wrap(2.0 * math.pi * np.arange(count + 1) / count)
+    return Path(poses, "turn")
 
 
 def primitives(length: float) -> list[Path]:

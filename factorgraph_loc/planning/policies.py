@@ -4,7 +4,8 @@
 after, less what the way costs. ``paper_literal``: the same with the sign as it is printed, the entropy after minus that before,
 which picks what tells least. ``random``, ``patrol`` and ``nearest_tags`` are what to compare with.
 
-All are given the same ways, those of which the robot's proximity sensor finds the first metre free.
+All are given the same ways, those of which the robot's proximity sensor finds the first metre free, and where the robot has not
+turned around yet that turn.
 """
 
 from __future__ import annotations
@@ -21,7 +22,12 @@ from factorgraph_loc.estimators.base import Mode
 from factorgraph_loc.estimators.cloud import pose_moments
 from factorgraph_loc.files import nearest
 from factorgraph_loc.planning.fisher import Sensors, fisher_gain
-from factorgraph_loc.planning.information import ROUNDS_PER_METRE, expected_gain, has_several_modes
+from factorgraph_loc.planning.information import (
+    ROUNDS_PER_METRE,
+    ROUNDS_PER_RADIAN,
+    expected_gain,
+    has_several_modes,
+)
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.free_space import FreeSpace
@@ -32,7 +38,7 @@ from factors.se2 import Array
 NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation
 FEW = 0.6  # weight of few places, that ways may lead from
 OF_MODES = 48  # particles that stand for these
-COMMITTED = 0.5  # of a long way, before another is chosen
+COMMITTED = 0.5  # of an arc, before another is chosen
 FAR = "waypoint"  # kind of ways to places
 AHEAD = 1.0  # m that must be free
 BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
@@ -44,7 +50,7 @@ class Situation:
     """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), the map's tags by ``likelihood`` (None without
     any), where walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees.
     ``modes``: the places that count. ``sensors``: what is seen on a way, for the expectation in closed form;
-    ``rounds_per_metre`` of each antenna."""
+    ``rounds_per_metre`` and ``rounds_per_radian`` of each antenna."""
 
     particles: Array
     weights: Array
@@ -57,6 +63,7 @@ class Situation:
     modes: tuple[Mode, ...] = ()
     sensors: Sensors | None = None
     rounds_per_metre: float = ROUNDS_PER_METRE
+    rounds_per_radian: float = ROUNDS_PER_RADIAN
 
 
 @dataclass(frozen=True)
@@ -91,8 +98,8 @@ class Information:
         gains = np.zeros(len(s.candidates))
         far = np.array([p.kind == FAR for p in s.candidates])
         gains[~far] = self._near(s, [p for p in s.candidates if p.kind != FAR])
-        if few and len(s.modes) > 1 and far.any():
-            gains[far] = self._of_modes(s, [p for p in s.candidates if p.kind == FAR])
+        if few and far.any():
+            gains[far] = self._far(s, [p for p in s.candidates if p.kind == FAR])
         if np.max(gains) < NOTHING:
             patrol = self._otherwise.choose(s)
             return Choice(patrol.path, patrol.metres, patrol.values, while_silent=not few)
@@ -100,8 +107,8 @@ class Information:
         costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
         values = self._sign * gains - np.array(costs)
         best = s.candidates[int(np.argmax(values))]
-        # who goes far away for something is on the way for long
-        return Choice(best, max(settings.replan, COMMITTED * best.length), values)
+        # who goes far away for something is on the way for long, and would turn back for less
+        return Choice(best, best.length if best.kind == FAR else max(settings.replan, COMMITTED * best.length), values)
 
     @staticmethod
     def _near(s: Situation, paths: Sequence[Path]) -> Array:
@@ -110,7 +117,7 @@ class Information:
         settings = s.settings.policy
         if settings.expectation == "fisher" and s.sensors is not None and not has_several_modes(s.particles, s.weights):
             return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
-        return expected_gain(
+        gains = expected_gain(
             s.likelihood,
             s.particles,
             s.weights,
@@ -120,13 +127,24 @@ class Information:
             samples=settings.samples,
             space=s.space,
             rounds_per_metre=s.rounds_per_metre,
+            rounds_per_radian=s.rounds_per_radian,
         )
+        if s.sensors is None or not s.modes:
+            return gains
+        # else it would go to and fro for what the odometry takes away again
+        alone, mode = Sensors(s.sensors.world, s.sensors.odometry), s.modes[0]
+        return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
     @staticmethod
-    def _of_modes(s: Situation, paths: Sequence[Path]) -> Array:
-        """Of which place it is. Particles would spread on a long way, and run into walls that the robot will have turned from: it
-        plans anew before."""
+    def _far(s: Situation, paths: Sequence[Path]) -> Array:
+        """Of which place it is, or, where there is but one, of where in it. Particles would spread on a long way, and run into
+        walls that the robot will have turned from: it plans anew before."""
         assert s.likelihood is not None, "there are tags"
+        if len(s.modes) == 1:
+            if s.sensors is None:
+                return np.zeros(len(paths))
+            (mode,) = s.modes
+            return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
         # which of equal places is the heavier is the luck of the particles
         weights = np.sqrt([mode.weight for mode in s.modes])
         return expected_gain(
@@ -138,14 +156,15 @@ class Information:
             samples=OF_MODES,
             space=s.space,
             rounds_per_metre=s.rounds_per_metre,
+            rounds_per_radian=s.rounds_per_radian,
         )
 
 
 class Random:
-    """Any of the arcs and short straight runs, to its end."""
+    """Any of the arcs and short straight runs, to its end, or the turn in place."""
 
     def choose(self, situation: Situation) -> Choice:
-        arcs = [p for p in situation.candidates if p.kind == "arc"]
+        arcs = [p for p in situation.candidates if p.kind != FAR]
         if not arcs:
             return Choice(None, 0.0, np.empty(0))
         path = arcs[int(situation.rng.integers(len(arcs)))]

@@ -82,7 +82,7 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
     if settings.plan == "warehouse":
         return Plan(width, depth, outline, _shelves(width, depth))
     if settings.plan == "corridors":
-        return _corridors(width, depth, outline)
+        return _corridors(width, depth, outline, rng)
     return _office(width, depth, outline, rng)
 
 
@@ -133,9 +133,10 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
     return tuple((x1, y, x2, y + SHELF_DEPTH) for y in bottoms for x1, x2 in spans)
 
 
-def _corridors(width: float, depth: float, outline: tuple[Segment, ...]) -> Plan:
+def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
     """An H that looks the same when it is turned by half: a corridor along x, and one across each of its ends. What is between them
-    is closed rooms. A tag hangs in the middle, one in an arm at one end, and one in the opposite arm at the other."""
+    is closed rooms. A tag hangs in the middle, one in an arm at one end, and one in the opposite arm at the other: who comes from
+    the middle finds both to the left or both to the right, which is drawn."""
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
             f"world: {width:g} x {depth:g} m is too small for corridors, expected at least "
@@ -146,7 +147,8 @@ def _corridors(width: float, depth: float, outline: tuple[Segment, ...]) -> Plan
     edges = np.linspace(HALL_WIDTH, width - HALL_WIDTH, count + 1).tolist()
     rooms = [(x1, y1, x2, y2) for y1, y2 in ((0.0, low), (high, depth)) for x1, x2 in pairwise(edges)]
     middle = HALL_WIDTH / 2.0
-    hanging = ((width / 2.0, depth / 2.0), (middle, FROM_END), (width - middle, depth - FROM_END))
+    at = FROM_END if rng.random() < 0.5 else depth - FROM_END
+    hanging = ((width / 2.0, depth / 2.0), (middle, at), (width - middle, depth - at))
     return Plan(width, depth, outline, tuple(rooms), hanging=hanging)
 
 

@@ -222,8 +222,7 @@ def test_weights_of_the_belief_are_respected():
 
 
 def test_a_small_sample_chooses_nearly_as_well_as_a_large_one():
-    """In an office, from a belief of one place: what is lost by the choice of the default sample is little of what there is to
-    choose."""
+    """In an office, from a belief of one place: little is lost by the choice of the default sample, though much is to be learnt."""
     settings = preset("office")
     world = make_world(settings.world, np.random.default_rng(3))
     space = free_space(world, 0.3)
@@ -238,7 +237,8 @@ def test_a_small_sample_chooses_nearly_as_well_as_a_large_one():
         - large[np.argmax(expected_gain(found, poses, weights, paths, np.random.default_rng(k), space=space))]
         for k in range(5)
     ]
-    assert np.mean(lost) < 0.35 * (large.max() - large.mean())
+    assert np.mean(lost) < 0.15
+    assert large.max() > 2.0
 
 
 def test_no_paths():
