@@ -21,9 +21,11 @@ from factorgraph_loc.log import (
     IncrementStream,
     Log,
     RfidStream,
+    RightSightingStream,
     SightingStream,
     StartPose,
     Stream,
+    TwistStream,
     VelocityStream,
     YawRateStream,
 )
@@ -199,7 +201,7 @@ def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "cs
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
     written, and of a start's deviations in x and y only the larger one. Images are links to those of ``log`` where the file
-    system has links; features that were found in images cannot be written: InputError.
+    system has links; features that were found in images, motion in space and a second camera cannot be written: InputError.
     """
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -232,6 +234,8 @@ def write_files(log: Log, folder: Path, format: str) -> None:
             continue
         if isinstance(stream, FeatureStream):
             raise InputError(f"{log.name}: {sensor} holds features, expected the images in which they were found")
+        if isinstance(stream, TwistStream | RightSightingStream):
+            raise InputError(f"{log.name}: {sensor} has no table in this format, expected the log of a robot on a floor")
         columns: dict[str, Any] = {"t_ns": absolute(stream.t, log.t0_ns)}
         columns |= (
             {"file": write_images(stream.file, folder)} if isinstance(stream, ImageStream) else columns_of(stream)
