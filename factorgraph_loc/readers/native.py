@@ -235,7 +235,9 @@ def write_files(log: Log, folder: Path, format: str) -> None:
         if isinstance(stream, FeatureStream):
             raise InputError(f"{log.name}: {sensor} holds features, expected the images in which they were found")
         if isinstance(stream, TwistStream | RightSightingStream):
-            raise InputError(f"{log.name}: {sensor} has no table in this format, expected the log of a robot on a floor")
+            raise InputError(
+                f"{log.name}: {sensor} has no table in this format, expected the log of a robot on a floor"
+            )
         columns: dict[str, Any] = {"t_ns": absolute(stream.t, log.t0_ns)}
         columns |= (
             {"file": write_images(stream.file, folder)} if isinstance(stream, ImageStream) else columns_of(stream)
