@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Belief, Mode
 from factorgraph_loc.files import parse_model
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.active_run import ActiveRun
@@ -149,3 +150,13 @@ def test_two_places_that_look_alike_are_told_apart() -> None:
     for place in (early[0].truth, turned):
         assert np.mean(np.hypot(*(early[0].particles - place)[:, :2].T) < 2.0) > 0.1
     assert run.metres > 8.0
+
+
+def test_modes_that_are_next_to_each_other_are_one_place() -> None:
+    covariance = np.diag((0.04, 0.04, 0.01))
+    at = {"here": (5.0, 5.0, 0.0), "beside": (6.5, 5.0, 0.3), "turned": (5.0, 5.0, 3.0), "rare": (20.0, 5.0, 0.0)}
+    weights = (0.5, 0.3, 0.17, 0.03)
+    modes = tuple(Mode(w, np.array(pose), covariance) for w, pose in zip(weights, at.values(), strict=True))
+    places = closed_loop._places(Belief(modes))
+    assert [place.weight for place in places] == [0.8, 0.17]
+    assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]

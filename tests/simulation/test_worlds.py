@@ -70,6 +70,14 @@ def test_corridors_look_the_same_when_they_are_turned_by_half():
         assert gaps.min(axis=1).max() < 2e-3
 
 
+def test_the_tags_of_corridors_are_to_the_left_or_to_the_right():
+    """Over 20 seeds both occur, but for one chance in half a million."""
+    found = [places(world(seed, plan="corridors", width=30.0, depth=24.0, tags=3)) for seed in range(20)]
+    assert {bool(tags[1, 1] < 12.0) for tags in found} == {True, False}
+    for tags in found:
+        np.testing.assert_allclose(tags[1] + tags[2], (30.0, 24.0), atol=1e-9)
+
+
 def test_tags_are_spread_wider_than_at_random():
     """Drawn without a choice, 40 tags in this office have their nearest neighbour at 0.5 m to 1.2 m, in the median."""
     gaps = []
