@@ -204,16 +204,7 @@ def calibrate(
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
     """The path of the report beside a rig; InputError if the rig's name is not one, or something is there already."""
-    name = out.name.removesuffix(RIG)
-    if name in ("", out.name):
-        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {RIG}")
-    if not out.parent.is_dir():
-        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
-    page = out.with_name(f"{name}.report.html")
-    for path in (out, page):
-        if path.exists() and not overwrite:
-            raise InputError(f"{path}: exists already; choose another name or give --overwrite")
-    return page
+    return output.beside(out, RIG, ".report.html", overwrite=overwrite)
 
 
 def map(

@@ -19,6 +19,7 @@ from factorgraph_loc.calibration.tag_mapping import MadeTags
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.evaluation.figures import save
+from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files import replacing
@@ -94,16 +95,7 @@ class MadeMap:
 
 def picture_beside(out: Path, *, overwrite: bool) -> Path:
     """The path of the picture beside a map; InputError if the map's name is not one, or something is there already."""
-    name = out.name.removesuffix(SUFFIX)
-    if name in ("", out.name):
-        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {SUFFIX}")
-    if not out.parent.is_dir():
-        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
-    picture = out.with_name(f"{name}.map.png")
-    for path in (out, picture):
-        if path.exists() and not overwrite:
-            raise InputError(f"{path}: exists already; choose another name or give --overwrite")
-    return picture
+    return beside(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
 def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silent) -> MadeMap:

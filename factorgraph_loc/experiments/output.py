@@ -102,6 +102,21 @@ def file_name(text: str) -> str:
     return re.sub(r"[^\w.-]", "_", text).lstrip(".") or "_"
 
 
+def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
+    """The path of what is written beside ``out``, whose name ends in ``suffix``: the same name with another ``ending``. InputError
+    if it does not, if there is no folder for it, or if either is there already."""
+    name = out.name.removesuffix(suffix)
+    if name in ("", out.name):
+        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {suffix}")
+    if not out.parent.is_dir():
+        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
+    other = out.with_name(f"{name}{ending}")
+    for path in (out, other):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists already; choose another name or give --overwrite")
+    return other
+
+
 def check_free(out: Path, *, overwrite: bool) -> None:
     """InputError if ``out`` is no folder, or holds the results of a run that may not be replaced."""
     if out.exists() and not out.is_dir():

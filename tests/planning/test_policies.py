@@ -134,3 +134,25 @@ def test_random_takes_all_ways():
 def test_a_wrong_name_is_an_error():
     with pytest.raises(InputError, match="did you mean patrol"):
         make_policy("patroll")
+
+
+def one_place(tags, candidates):
+    """A situation with one place in the middle, known to 0.8 m and 0.1 rad, and what is seen from ways."""
+    s = situation(candidates=candidates, tags=tags)
+    sensors = Sensors(World(), Rig(**RACKHAM_RIG).odometry_model(constants_as_noise=True), s.likelihood)
+    mode = Mode(1.0, np.array((20.0, 20.0, 0.0)), np.diag((0.64, 0.64, 0.01)))
+    return replace(s, modes=(mode,), sensors=sensors)
+
+
+def test_one_place_too_wide_is_told_by_tags_far_away():
+    far = np.array(((36.0, 20.0, 1.2), (36.0, 23.0, 1.2)))
+    ways = waypoint_paths(SPACE, np.array((20.0, 20.0, 0.0)), np.array(((35.0, 21.0), (5.0, 20.0))))
+    choice = make_policy("information").choose(one_place(far, (*primitives(3.0), *ways)))
+    assert choice.path is ways[np.argmax([way.poses[-1, 0] for way in ways])]
+    assert choice.metres == choice.path.length
+
+
+def test_what_the_odometry_takes_away_is_no_gain():
+    s, policy = one_place(TAGS, primitives(3.0)), make_policy("information")
+    net, gross = policy.choose(s).values, policy.choose(replace(s, sensors=None, rng=one_place(TAGS, ()).rng)).values
+    assert np.all(net < gross)
