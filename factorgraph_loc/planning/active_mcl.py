@@ -14,6 +14,7 @@ number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
+from scipy.special import logsumexp
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
@@ -29,6 +31,7 @@ from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_tick
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.tags import KnownTags
 from factorgraph_loc.measurements import BearingRange, RfidScan
+from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.simulation.free_space import CELL, FreeSpace
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
@@ -39,8 +42,9 @@ RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resampl
 OUTSIDE = -1.0  # log-weight per motion of a particle that is where no robot can be
 KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
 LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
+LOST = math.log(1e-3)  # of the robot being anywhere, at a scan that reads tags
 ONE_PLACE = 1.0  # m: largest standard deviation of a place
-MORE = 5  # times as many particles while they are everywhere
+MORE = 10  # times as many particles while they are everywhere
 
 
 class ActiveMclSettings(FilterSettings):
@@ -80,13 +84,16 @@ class ActiveMcl(Filter):
 
     def _seek(self, m: object) -> Cloud:
         """Evenly over free space and all headings."""
+        state = self._everywhere()
+        return self._weighed(state, m) if isinstance(m, RfidScan) else state
+
+    def _everywhere(self) -> Cloud:
         count = MORE * self._count
         cells = np.floor((np.arange(count) + self._rng.random()) * len(self._space.centres) / count)
         places = self._space.centres[cells.astype(np.int64)] + CELL * (self._rng.random((count, 2)) - 0.5)
         # a sequence of low discrepancy, so that neighbours look everywhere (golden ratio)
         shares = (np.arange(count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
-        state = _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
-        return self._weighed(state, m) if isinstance(m, RfidScan) else state
+        return _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
 
     def _predict(self, increment: Increment) -> None:
         noise = self._rng.standard_normal(self._state.poses.shape) @ np.linalg.cholesky(increment.covariance).T
@@ -100,16 +107,32 @@ class ActiveMcl(Filter):
     def _scan(self, m: RfidScan) -> None:
         self._state = self._weighed(self._state, m)
 
+    def see(self, sensor: ProximitySensor, lengths: Array) -> None:
+        """Weigh the particles by free lengths (D,) [m] that a proximity sensor finds around the robot; see :meth:`ProximitySensor.read`.
+        Before the first scan there are none."""
+        if self._state is not None:
+            self._state = self._tempered(self._state, lambda poses: sensor.log_likelihood(poses, lengths))
+
     def _weighed(self, cloud: Cloud, m: RfidScan) -> Cloud:
         looks, likelihood = self._tags.looks(m), self._tags.likelihood
         if looks is None or likelihood is None:
             return cloud
+        if m.tags:
+            # tags that are read where none of the particles is: they have lost the robot
+            anywhere = self._everywhere()
+            told, else_told = (_evidence(c, likelihood.log_likelihood(c.poses, looks)) for c in (cloud, anywhere))
+            if told < else_told + LOST:
+                cloud = anywhere
+        return self._tempered(cloud, lambda poses: likelihood.log_likelihood(poses, looks))
+
+    def _tempered(self, cloud: Cloud, log_likelihood: Callable[[Array], Array]) -> Cloud:
+        """Weighed by a likelihood, a share at a time."""
         left = 1.0
         while left > 0.0:
-            log_likelihood = likelihood.log_likelihood(cloud.poses, looks)
+            found = log_likelihood(cloud.poses)
             enough = ENOUGH * effective_size(cloud.log_weights)
-            share = largest_share(cloud.log_weights, log_likelihood, left, enough)
-            cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * log_likelihood))
+            share = largest_share(cloud.log_weights, found, left, enough)
+            cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * found))
             left -= share
             if effective_size(cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
                 rows = systematic(cloud.weights, self._rng, MORE * self._count)
@@ -139,6 +162,11 @@ def _drawn(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator) -> A
     width = np.minimum(KERNEL * gaps[:, -1], WIDEST)[which]
     noise = rng.standard_normal((len(rows), 3)) * np.column_stack((width, width, width / LEVER))
     return se2.compose(poses[rows], se2.exp(noise))
+
+
+def _evidence(cloud: Cloud, log_likelihood: Array) -> float:
+    """Logarithm of a scan's mean likelihood over the particles."""
+    return float(logsumexp(cloud.log_weights + log_likelihood))
 
 
 def _cloud(poses: Array) -> Cloud:

@@ -39,6 +39,7 @@ SPREAD = 2000  # poses that stand for a belief without particles
 WRONG = 3.0  # times the limits: an error that is no bad luck
 MODES, LIKELY = 3, 0.05  # places, at most, and their least weight, from which ways lead to others
 TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, and nearest of places that are spread over free space
+LOOK = 0.5  # m that the robot drives between looks at the walls
 PAUSE = 1.0  # s that a robot waits that cannot go anywhere
 SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
 
@@ -103,6 +104,7 @@ class _Loop:
         self._robot, self._estimator, self._policy = robot, estimator, policy
         self._space, self._settings, self._rounds_per_second, self._rng = space, settings, rounds_per_second, rng
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
+        self._looked_at = -math.inf  # metres driven when the particles were last told of the walls
         self._turned_at = -math.inf  # metres driven when the robot last turned around
         self._sensors = Sensors.of(setup.world, setup.rig)
         tags = tag_map(setup.world, setup.rig.survey).tags
@@ -121,7 +123,7 @@ class _Loop:
             before = robot.t
             if choice.path is not None:
                 metres = min(choice.metres, settings.max_metres - robot.metres)
-                done = self._take(robot.drive(choice.path.poses, metres), choice.while_silent)
+                done = self._take(robot.drive(choice.path.poses, metres))
             if robot.t == before:
                 done = self._take(robot.wait(PAUSE))
         return done
@@ -131,20 +133,19 @@ class _Loop:
         error = self._estimator.estimate().pose - self._robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
-    def _take(self, reports: Iterator[Measurement], while_silent: bool = False) -> bool:
-        """Whether the place is known, and truly, on the way of these reports, up to the first read where that is the end of it."""
-        enough = self._robot.metres + self._settings.policy.replan
+    def _take(self, reports: Iterator[Measurement]) -> bool:
+        """Whether the place is known, and truly, on the way of these reports."""
         for report in reports:
             self._estimator.process(report)
+            if isinstance(self._estimator, ActiveMcl) and self._robot.metres >= self._looked_at + LOOK:
+                self._looked_at = self._robot.metres
+                self._estimator.see(self._robot.proximity, self._robot.look())
             if isinstance(report, RfidScan) and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
                     return True
                 beyond = max(position / self._settings.position_limit, heading / self._settings.heading_limit)
                 self.claimed_wrong |= beyond > WRONG
-            read = isinstance(report, RfidScan) and len(report.tags) > 0
-            if while_silent and read and self._robot.metres > enough:
-                break
         return False
 
     def _is_sure(self) -> bool:

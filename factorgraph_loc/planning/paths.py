@@ -69,6 +69,11 @@ def look_around() -> Path:
     return Path(poses, "turn")
 
 
+def straight(turn: float, length: float) -> Path:
+    """A straight run of ``length`` [m] after a turn in place [rad]."""
+    return _arc(turn, 0.0, length)
+
+
 def primitives(length: float) -> list[Path]:
     """Arcs and straight runs of ``length`` [m]: in each of :data:`DIRECTIONS`, after a turn in place, straight and gently curved,
     and straight half as far; sharper curves to the front. InputError if the length is not above zero."""

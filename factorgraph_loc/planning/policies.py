@@ -40,6 +40,7 @@ FEW = 0.6  # weight of few places, that ways may lead from
 OF_MODES = 48  # particles that stand for these
 COMMITTED = 0.5  # of an arc, before another is chosen
 FAR = "waypoint"  # kind of ways to places
+FAR_PER_METRE = 0.02  # nats: of ways that tell the same the shorter is gone
 AHEAD = 1.0  # m that must be free
 BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
 NEAR = 3  # tags that tell a place
@@ -68,13 +69,12 @@ class Situation:
 
 @dataclass(frozen=True)
 class Choice:
-    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, if they are compared.
-    ``while_silent``: only until a tag is read."""
+    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, not a number where one is
+    not looked at, or (0,) if they are not compared."""
 
     path: Path | None
     metres: float
     values: Array
-    while_silent: bool = False
 
 
 class Policy(Protocol):
@@ -84,7 +84,11 @@ class Policy(Protocol):
 
 
 class Information:
-    """By expected information; ``sign`` -1: as the paper prints it."""
+    """By expected information; ``sign`` -1: as the paper prints it.
+
+    What is near comes first. Where nothing near is worth its way, places far off are looked at, that tell few possible poses apart;
+    where these tell nothing either, or the robot may be anywhere, it patrols.
+    """
 
     def __init__(self, sign: float = 1.0) -> None:
         self._sign = sign
@@ -94,21 +98,24 @@ class Information:
         s, settings = situation, situation.settings.policy
         if s.likelihood is None or not s.candidates:
             return self._otherwise.choose(s)
-        few = sum(mode.weight for mode in s.modes) > FEW
-        gains = np.zeros(len(s.candidates))
-        far = np.array([p.kind == FAR for p in s.candidates])
-        gains[~far] = self._near(s, [p for p in s.candidates if p.kind != FAR])
-        if few and far.any():
-            gains[far] = self._far(s, [p for p in s.candidates if p.kind == FAR])
-        if np.max(gains) < NOTHING:
-            patrol = self._otherwise.choose(s)
-            return Choice(patrol.path, patrol.metres, patrol.values, while_silent=not few)
-        rates = s.settings.speed, s.settings.turn_rate
-        costs = [settings.per_metre * p.length + settings.per_second * p.duration(*rates) for p in s.candidates]
-        values = self._sign * gains - np.array(costs)
-        best = s.candidates[int(np.argmax(values))]
-        # who goes far away for something is on the way for long, and would turn back for less
-        return Choice(best, best.length if best.kind == FAR else max(settings.replan, COMMITTED * best.length), values)
+        values = np.full(len(s.candidates), np.nan)
+        near = [i for i, p in enumerate(s.candidates) if p.kind != FAR]
+        gains = self._near(s, [s.candidates[i] for i in near])
+        costs = _costs(s, near, settings.per_metre)
+        values[near] = self._sign * gains - costs
+        if np.any((gains >= NOTHING) & (gains > costs)):
+            best = s.candidates[int(np.nanargmax(values))]
+            return Choice(best, max(settings.replan, COMMITTED * best.length), values)
+        far = [i for i, p in enumerate(s.candidates) if p.kind == FAR]
+        if far and sum(mode.weight for mode in s.modes) > FEW:
+            gains = self._far(s, [s.candidates[i] for i in far])
+            values[far] = self._sign * gains - _costs(s, far, FAR_PER_METRE)
+            if np.max(gains) >= NOTHING:
+                best = s.candidates[far[int(np.argmax(values[far]))]]
+                # who goes far away for something is on the way for long, and would turn back for less
+                return Choice(best, best.length, values)
+        patrol = self._otherwise.choose(s)
+        return Choice(patrol.path, settings.replan, patrol.values)
 
     @staticmethod
     def _near(s: Situation, paths: Sequence[Path]) -> Array:
@@ -158,6 +165,13 @@ class Information:
             rounds_per_metre=s.rounds_per_metre,
             rounds_per_radian=s.rounds_per_radian,
         )
+
+
+def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
+    """Nats (K,) that the candidates ``rows`` (K,) cost."""
+    paths = [s.candidates[i] for i in rows]
+    seconds = [p.duration(s.settings.speed, s.settings.turn_rate) for p in paths]
+    return per_metre * np.array([p.length for p in paths]) + s.settings.policy.per_second * np.array(seconds)
 
 
 class Random:

@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgraph_loc.measurements import IncrementOdometry, RfidScan
 from factorgraph_loc.planning.paths import Path, free_steps
+from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.readers import simulated_odometry as wheels
 from factorgraph_loc.rig import Rig
@@ -49,11 +50,12 @@ class SimulatedRobot:
         self.blocked = False
         self._settings = settings
         self._space = space
+        self.proximity = ProximitySensor(space, settings.sight)
         self._antennas = tuple(rig.rfid.all_antennas())
         self._map = tag_map(world, rig.survey)
         self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
         self._round, self._rounds_per_second = 0, rounds_per_second
-        constants, self._noise, self._reads = rng.spawn(3)
+        constants, self._noise, self._reads, self._lengths = rng.spawn(4)
         self._scale, self._drift, self._scale_of_turns = constants.normal(
             0.0, (wheels.SCALE_SIGMA, wheels.DRIFT_SIGMA, wheels.SCALE_SIGMA)
         )
@@ -75,6 +77,10 @@ class SimulatedRobot:
         steps = free_steps(self._space, self.pose[None], paths, BETWEEN)[:, 0]
         way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
         return np.asarray(np.minimum(way, self._settings.sight))
+
+    def look(self) -> Array:
+        """Free lengths [m] (D,) all around, as its proximity sensor measures them."""
+        return self.proximity.read(self.pose, self._lengths)
 
     def drive(self, path: Array, metres: float) -> Iterator[IncrementOdometry | RfidScan]:
         """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""

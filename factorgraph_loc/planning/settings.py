@@ -22,8 +22,8 @@ class PolicySettings(FileModel):
 
     horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 3.0
     far: Metres = 25.0
-    replan: Metres = 1.0
-    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.02
+    replan: Metres = 0.5
+    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.3
     expectation: Literal["sampled", "fisher"] = "sampled"
     per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
