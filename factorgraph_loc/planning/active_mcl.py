@@ -8,7 +8,8 @@ here.
 
 They begin evenly over free space. A scan is weighed a share at a time, with resampling from a kernel density in between
 (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4). Their
-number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7).
+number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). Where tags are read that none
+of them expects, they begin anew (sensor resetting: Lenser, Veloso, ICRA 2000).
 """
 
 from __future__ import annotations
@@ -108,8 +109,7 @@ class ActiveMcl(Filter):
         self._state = self._weighed(self._state, m)
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weigh the particles by free lengths (D,) [m] that a proximity sensor finds around the robot; see :meth:`ProximitySensor.read`.
-        Before the first scan there are none."""
+        """Weigh the particles by free lengths (D,) [m] that a proximity sensor has read; before the first scan there are none."""
         if self._state is not None:
             self._state = self._tempered(self._state, lambda poses: sensor.log_likelihood(poses, lengths))
 

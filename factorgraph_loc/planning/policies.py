@@ -69,8 +69,8 @@ class Situation:
 
 @dataclass(frozen=True)
 class Choice:
-    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, not a number where one is
-    not looked at, or (0,) if they are not compared."""
+    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, not a number where one
+    is not looked at, or (0,) if they are not compared."""
 
     path: Path | None
     metres: float

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.planning.paths import DIRECTIONS, Path, free_steps, straight
+from factorgraph_loc.planning.paths import DIRECTIONS, free_steps, straight
 from factorgraph_loc.simulation.free_space import FreeSpace
 from factors.se2 import Array
 
@@ -24,13 +24,13 @@ class ProximitySensor:
     """Looks up to ``sight`` [m] in :data:`~factorgraph_loc.planning.paths.DIRECTIONS` directions, all around, in ``space``."""
 
     def __init__(self, space: FreeSpace, sight: float) -> None:
-        self._space = space
+        self.space = space
         self._rays = [straight(2.0 * math.pi * k / DIRECTIONS, sight) for k in range(DIRECTIONS)]
         self._sight = sight
 
     def expected(self, poses: Array) -> Array:
         """Free lengths [m] (M, D) at poses (M, 3)."""
-        steps = free_steps(self._space, poses, self._rays)
+        steps = free_steps(self.space, poses, self._rays)
         return np.stack([ray.way[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
 
     def read(self, pose: Array, rng: np.random.Generator) -> Array:

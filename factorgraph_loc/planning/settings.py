@@ -43,7 +43,7 @@ class ActiveSettings(FileModel):
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
     speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
     turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
-    clearance: Annotated[float, Field(ge=0.05, le=2.0, description="m")] = 0.3
+    clearance: Annotated[float, Field(ge=0.05, le=2.0, description="m")] = 0.35
     sight: Metres = 3.0
     start: tuple[Coordinate, Coordinate, Coordinate] | None = None
     position_limit: Metres = 0.3

@@ -56,11 +56,17 @@ def test_the_literal_sign_goes_elsewhere():
 
 
 def test_what_a_way_costs_counts():
-    """At a price above all that can be learnt the shortest way is best."""
-    s = situation()
-    dear = s.settings.model_copy(update={"policy": s.settings.policy.model_copy(update={"per_metre": 50.0})})
-    choice = make_policy("information").choose(Situation(**{**s.__dict__, "settings": dear}))
-    assert np.isclose(choice.path.length, min(p.length for p in s.candidates))
+    """In nats per metre; at a price above all that can be learnt no way is worth it, and the robot patrols."""
+
+    def choice(per_metre):
+        s = situation()
+        policy = s.settings.policy.model_copy(update={"per_metre": per_metre})
+        dear = replace(s, settings=s.settings.model_copy(update={"policy": policy}))
+        return make_policy("information").choose(dear)
+
+    lengths = np.array([p.length for p in situation().candidates])
+    assert np.allclose(choice(0.1).values, choice(0.0).values - 0.1 * lengths)
+    assert choice(50.0).path.kind == "patrol"
 
 
 @pytest.mark.parametrize("name", POLICIES)
