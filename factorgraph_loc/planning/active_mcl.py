@@ -29,13 +29,14 @@ from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
+from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.tags import KnownTags
 from factorgraph_loc.measurements import BearingRange, RfidScan
 from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.simulation.free_space import CELL, FreeSpace
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
+from factors import bearing_range, se2
 from factors.odometry import Increment
 from factors.se2 import Array
 
@@ -66,6 +67,7 @@ class ActiveMcl(Filter):
         super().__init__(setup, settings)
         self._count, self._rng, self._space = settings.particles, setup.rng, space
         self._tags = KnownTags(setup, self.diagnostics)
+        self._landmarks = KnownLandmarks(setup, self.diagnostics)
 
     def belief(self) -> Belief:
         """The particles with their weights, and their modes."""
@@ -103,7 +105,12 @@ class ActiveMcl(Filter):
         self._state = replace(self._state, poses=poses, log_weights=normalised(self._state.log_weights + outside))
 
     def _update(self, m: BearingRange) -> None:
-        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+        seen = self._landmarks.factor(m)
+        if seen is not None:
+            self._state = self._tempered(
+                self._state,
+                lambda poses: bearing_range.log_likelihood(seen.model, poses, seen.points, seen.ranges, seen.bearings),
+            )
 
     def _scan(self, m: RfidScan) -> None:
         self._state = self._weighed(self._state, m)

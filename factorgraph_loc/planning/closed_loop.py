@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -17,10 +18,10 @@ from factorgraph_loc.files import nearest
 from factorgraph_loc.measurements import Measurement, RfidScan
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
-from factorgraph_loc.planning.fisher import Sensors
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
+from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.free_space import CELL, FreeSpace, distance_to_walls, free_space
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
@@ -62,10 +63,10 @@ def run_active(
     space = free_space(world, settings.clearance)
     of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
     start = _start(world, space, settings, of_start)
-    robot = SimulatedRobot(world, space, simulation.rig, simulation.rounds_per_second, start, settings, of_robot)
-    setup = registry.Setup(simulation.rig, world, ("odometry", "rfid"), of_estimator)
-    rounds = simulation.rounds_per_second
-    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, settings, rounds, of_policy)
+    robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
+    sensors = ("odometry", "rfid", *(("bearing_range",) if world.landmarks else ()))
+    setup = registry.Setup(simulation.rig, world, sensors, of_estimator)
+    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, simulation, settings, of_policy)
     localized = loop.run()
     position, heading = loop.errors()
     return ActiveRun(
@@ -95,18 +96,27 @@ class _Loop:
         policy: Policy,
         setup: registry.Setup,
         space: FreeSpace,
+        simulation: SimulationSettings,
         settings: ActiveSettings,
-        rounds_per_second: float,
         rng: np.random.Generator,
     ) -> None:
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
         self._robot, self._estimator, self._policy = robot, estimator, policy
-        self._space, self._settings, self._rounds_per_second, self._rng = space, settings, rounds_per_second, rng
+        self._space, self._settings, self._rng = space, settings, rng
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
         self._looked_at = -math.inf  # metres driven when the particles were last told of the walls
         self._turned_at = -math.inf  # metres driven when the robot last turned around
-        self._sensors = Sensors.of(setup.world, setup.rig)
+        self._rounds_per_metre = simulation.rounds_per_second / settings.speed
+        # the simulated robot has no camera
+        self._sensors = replace(
+            Sensors.of(setup.world, setup.rig),
+            camera=None,
+            rounds_per_metre=self._rounds_per_metre,
+            metres_per_radian=settings.speed / settings.turn_rate,
+            looks_per_metre=simulation.sightings.rate / settings.speed,
+            max_range=simulation.sightings.max_range,
+        )
         tags = tag_map(setup.world, setup.rig.survey).tags
         assert setup.rig.rfid is not None, "the settings have been checked"
         # where a robot is nearest to each tag
@@ -176,8 +186,8 @@ class _Loop:
             self._rng,
             modes,
             self._sensors,
-            self._rounds_per_second / self._settings.speed,
-            self._rounds_per_second / self._settings.turn_rate,
+            self._rounds_per_metre,
+            self._rounds_per_metre * self._settings.speed / self._settings.turn_rate,
         )
         choice = self._policy.choose(situation)
         elapsed = 1e3 * (perf_counter() - started)

@@ -8,61 +8,21 @@ an efficient estimator reaches). No measurement is drawn. It holds while the sen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from factorgraph_loc.estimators.motion import propagate
-from factorgraph_loc.planning.information import POSITION, ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, gaussian_entropy
+from factorgraph_loc.planning.information import POSITION, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.settings import PixelSettings, SightingSettings
+from factorgraph_loc.planning.sensors import SPEED, Sensors
 from factorgraph_loc.simulation.sightings import crosses
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.world import World
 from factors import bearing_range, odometry, reprojection, se2
 from factors.bearing_range import BearingRangeModel
-from factors.odometry import ChainState, OdometryModel
+from factors.odometry import ChainState
 from factors.reprojection import CameraModel
-from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.rfid_likelihood import Looks
 from factors.se2 import Array
-
-SPEED = 0.5  # m/s, at which the odometry's noise that grows with time is taken
-_SIGHTINGS, _PIXELS = SightingSettings(), PixelSettings()
-
-
-@dataclass(frozen=True, eq=False)
-class Sensors:
-    """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion.
-
-    The other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna;
-    ``looks_per_metre``: of the other sensors; ``metres_per_radian``: that take as long as a turn in place. Landmarks are seen up to
-    ``max_range`` [m], at most ``max_points`` points up to ``max_depth`` [m], neither through walls.
-    """
-
-    world: World
-    odometry: OdometryModel
-    rfid: RfidLikelihood | None = None
-    bearing_range: BearingRangeModel | None = None
-    camera: CameraModel | None = None
-    rounds_per_metre: float = ROUNDS_PER_METRE
-    metres_per_radian: float = ROUNDS_PER_RADIAN / ROUNDS_PER_METRE
-    looks_per_metre: float = _SIGHTINGS.rate / SPEED
-    max_range: float = _SIGHTINGS.max_range
-    max_depth: float = _PIXELS.max_depth
-    max_points: int = _PIXELS.max_points
-
-    @staticmethod
-    def of(world: World, rig: Rig) -> Sensors:
-        """All sensors of a rig that find something in the world."""
-        return Sensors(
-            world,
-            rig.odometry_model(constants_as_noise=True),
-            RfidLikelihood(rig.rfid.model(), tag_map(world, rig.survey).tags) if rig.rfid and world.tags else None,
-            rig.bearing_range.model() if rig.bearing_range and world.landmarks else None,
-            rig.camera.model() if rig.camera and world.points is not None else None,
-        )
 
 
 def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:

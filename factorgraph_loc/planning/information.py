@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.cloud import pose_moments, systematic
-from factorgraph_loc.planning import expected_scans
+from factorgraph_loc.planning import expected_scans, expected_sightings
 from factorgraph_loc.planning.expected_scans import Places, ScanTables
 from factorgraph_loc.planning.paths import Path, free_steps
+from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
 from factorgraph_loc.simulation.free_space import FreeSpace
 from factors.odometry import OdometryModel
 from factors.rfid_likelihood import RfidLikelihood
@@ -36,7 +37,6 @@ CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
 LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way, or of turns that take as long
 LOOKS = 10  # at most: on a longer way they are farther apart
-ROUNDS_PER_METRE, ROUNDS_PER_RADIAN = 4.0, 2.0  # of a robot with 2 rounds a second at 0.5 m/s, or at 1 rad/s in place
 SAMPLES, SCANS = 256, 48  # particles that are weighed, and those that scans are drawn from
 FEWEST = 10  # particles, of which each may stand for many
 SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
@@ -85,6 +85,7 @@ def expected_gain(
     *,
     dims: Sequence[str] = POSITION,
     space: FreeSpace | None = None,
+    sensors: Sensors | None = None,
     noise: OdometryModel | None = None,
     samples: int = SAMPLES,
     scans: int = SCANS,
@@ -94,7 +95,8 @@ def expected_gain(
     """Expected reduction of entropy (C,) [nats] on each of C paths, of a belief of particles (M, 3) in the world with weights (M,).
 
     The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
-    particle whose way leads to a wall stops there, and scans no more. ``noise``: of the odometry on the way, none by default.
+    particle whose way leads to a wall stops there, and scans no more. ``sensors``: the landmarks of its world are seen on the way,
+    as its ``bearing_range`` tells; tags are read as ``likelihood`` tells. ``noise``: of the odometry on the way, none by default.
     ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``,
     ``rounds_per_radian`` of a turn in place: inventory rounds of each antenna.
     """
@@ -126,6 +128,9 @@ def expected_gain(
         expected_scans.log_weights(
             tables, at[1:-1], rounds, stops, scans, seed, likelihood.model.tempering, log_weights
         )
+        if sensors is not None and sensors.bearing_range is not None:
+            each = np.asarray(rounds * (sensors.looks_per_metre / rounds_per_metre), dtype=np.float64)
+            expected_sightings.add_log_weights(sensors, at[1:-1], each, stops[:scans], seed, log_weights)
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])

@@ -21,14 +21,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Mode
 from factorgraph_loc.estimators.cloud import pose_moments
 from factorgraph_loc.files import nearest
-from factorgraph_loc.planning.fisher import Sensors, fisher_gain
-from factorgraph_loc.planning.information import (
-    ROUNDS_PER_METRE,
-    ROUNDS_PER_RADIAN,
-    expected_gain,
-    has_several_modes,
-)
+from factorgraph_loc.planning.fisher import fisher_gain
+from factorgraph_loc.planning.information import expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import STEP, Path
+from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.free_space import FreeSpace
 from factors import se2
@@ -133,6 +129,7 @@ class Information:
             dims=settings.dimensions,
             samples=settings.samples,
             space=s.space,
+            sensors=s.sensors,
             rounds_per_metre=s.rounds_per_metre,
             rounds_per_radian=s.rounds_per_radian,
         )
@@ -162,6 +159,7 @@ class Information:
             s.rng,
             samples=OF_MODES,
             space=s.space,
+            sensors=s.sensors,
             rounds_per_metre=s.rounds_per_metre,
             rounds_per_radian=s.rounds_per_radian,
         )

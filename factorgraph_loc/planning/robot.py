@@ -1,4 +1,4 @@
-"""A simulated robot that drives as it is told, by its own odometry, and hears tags on the way."""
+"""A simulated robot that drives as it is told, by its own odometry, and hears tags and sees landmarks on the way."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from factorgraph_loc.measurements import IncrementOdometry, RfidScan
+from factorgraph_loc.measurements import BearingRange, IncrementOdometry, RfidScan
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.readers import simulated_odometry as wheels
-from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.free_space import FreeSpace
+from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.simulation.sightings import sighting_stream
 from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 from factors import se2
+from factors.bearing_range import BearingRangeModel
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
 
+Report = IncrementOdometry | RfidScan | BearingRange
 PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
 BETWEEN = 5  # parts of the way from one pose of a path to the next
 
@@ -37,12 +40,12 @@ class SimulatedRobot:
         self,
         world: World,
         space: FreeSpace,
-        rig: Rig,
-        rounds_per_second: float,
+        simulation: SimulationSettings,
         start: Array,
         settings: ActiveSettings,
         rng: np.random.Generator,
     ) -> None:
+        rig = simulation.rig
         assert rig.rfid is not None, "the settings have been checked"
         self.pose = np.array(start, dtype=float)
         self.t = 0.0
@@ -54,8 +57,10 @@ class SimulatedRobot:
         self._antennas = tuple(rig.rfid.all_antennas())
         self._map = tag_map(world, rig.survey)
         self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
-        self._round, self._rounds_per_second = 0, rounds_per_second
-        constants, self._noise, self._reads, self._lengths = rng.spawn(4)
+        self._round, self._rounds_per_second = 0, simulation.rounds_per_second
+        self._look, self._sightings, self._world = 0, simulation.sightings, world
+        self._landmarks = rig.bearing_range.model() if rig.bearing_range and world.landmarks else None
+        constants, self._noise, self._reads, self._lengths, self._sight = rng.spawn(5)
         self._scale, self._drift, self._scale_of_turns = constants.normal(
             0.0, (wheels.SCALE_SIGMA, wheels.DRIFT_SIGMA, wheels.SCALE_SIGMA)
         )
@@ -66,10 +71,10 @@ class SimulatedRobot:
         rows = np.array(self._truth)
         return Trajectory(rows[:, 0], rows[:, 1:])
 
-    def begin(self) -> Iterator[IncrementOdometry | RfidScan]:
-        """What it reports before it has moved: a row of odometry without motion, and a first round."""
+    def begin(self) -> Iterator[Report]:
+        """What it reports before it has moved: a row of odometry without motion, a first round, and a first look at landmarks."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
-        yield self._scan()
+        yield from self._found()
 
     def free_ahead(self, paths: Sequence[Path]) -> Array:
         """How far [m] (C,) each of C ways can be gone, as far as the proximity sensor sees."""
@@ -82,7 +87,7 @@ class SimulatedRobot:
         """Free lengths [m] (D,) all around, as its proximity sensor measures them."""
         return self.proximity.read(self.pose, self._lengths)
 
-    def drive(self, path: Array, metres: float) -> Iterator[IncrementOdometry | RfidScan]:
+    def drive(self, path: Array, metres: float) -> Iterator[Report]:
         """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""
         self.blocked = False
         for told in self._told(path, metres):
@@ -99,18 +104,25 @@ class SimulatedRobot:
             self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
             yield from self._passed(told)
 
-    def wait(self, seconds: float) -> Iterator[IncrementOdometry | RfidScan]:
+    def wait(self, seconds: float) -> Iterator[Report]:
         """Stand still."""
         for _ in range(max(1, round(seconds / PERIOD))):
             yield from self._passed(np.zeros(3))
 
-    def _passed(self, told: Array) -> Iterator[IncrementOdometry | RfidScan]:
+    def _passed(self, told: Array) -> Iterator[Report]:
         """The reports of one period."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(told[0]), float(told[1]), float(told[2]))
+        yield from self._found()
+
+    def _found(self) -> Iterator[Report]:
+        """What its sensors report that are due."""
         if self.t * self._rounds_per_second >= self._round - 1e-6:
             yield self._scan()
+        if self._landmarks is not None and self.t * self._sightings.rate >= self._look - 1e-6:
+            self._look += 1
+            yield self._sighting(self._landmarks)
 
     def _told(self, path: Array, metres: float) -> Array:
         """Motions (N, 3) of one period each along a way, each in the robot's frame before it."""
@@ -136,6 +148,12 @@ class SimulatedRobot:
         return RfidScan(
             self.t, self._antennas, antenna.astype(np.int64), names, np.zeros(len(tag)), unknown, unknown, unknown
         )
+
+    def _sighting(self, model: BearingRangeModel) -> BearingRange:
+        """One look at the landmarks."""
+        now, here = np.array((self.t,)), self.pose[None]
+        seen = sighting_stream(model, self._world, now, here, self._sightings, self._sight)
+        return BearingRange(self.t, tuple(seen.landmark), seen.range, seen.bearing)
 
     def _is_free(self, there: Array) -> bool:
         """Whether the robot may go there: to a free cell, or, where it is in none, to a cell that is no nearer to a wall."""

@@ -122,7 +122,7 @@ def belief_of(name: str, seed: int) -> Belief:
     world = make_world(simulation.world, rng)
     space = free_space(world, SETTINGS.clearance)
     start = np.array((*space.centres[rng.integers(len(space.centres))], rng.uniform(-np.pi, np.pi)))
-    robot = SimulatedRobot(world, space, simulation.rig, simulation.rounds_per_second, start, SETTINGS, rng)
+    robot = SimulatedRobot(world, space, simulation, start, SETTINGS, rng)
     setup = Setup(simulation.rig, world, ("odometry", "rfid"), rng)
     particles = ActiveMcl(setup, ActiveMclSettings(particles=SETTINGS.particles), space)
     straight = primitives(DRIVEN)

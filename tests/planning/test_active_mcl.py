@@ -23,7 +23,7 @@ def made(seed: int = 0, name: str = "office"):
     setup = Setup(simulation.rig, world, ("odometry", "rfid"), np.random.default_rng((seed, 1)))
     rng = np.random.default_rng((seed, 2))
     start = np.array((*space.centres[rng.integers(len(space.centres))], rng.uniform(-math.pi, math.pi)))
-    robot = SimulatedRobot(world, space, simulation.rig, 2.0, start, ActiveSettings(), rng)
+    robot = SimulatedRobot(world, space, simulation, start, ActiveSettings(), rng)
     return ActiveMcl(setup, ActiveMclSettings(), space), robot, space
 
 
@@ -124,3 +124,21 @@ def test_particles_that_have_lost_the_robot_begin_anew_where_tags_are_read():
     for m in robot.wait(3.0):
         estimator.process(m)
     assert np.hypot(*(estimator.estimate().pose - robot.pose)[:2]) < 0.5
+
+
+def test_landmarks_in_sight_tell_the_place():
+    """Two bearings and ranges tell all three coordinates at once: one look of a robot that has read no tag."""
+    simulation = preset("symmetric", {"world": {"landmarks": 30}})
+    world = make_world(simulation.world, np.random.default_rng(0))
+    space = free_space(world, 0.35)
+    setup = Setup(simulation.rig, world, ("odometry", "rfid", "bearing_range"), np.random.default_rng(1))
+    start = np.array((1.5, 18.0, 1.0))
+    robot = SimulatedRobot(world, space, simulation, start, ActiveSettings(), np.random.default_rng(2))
+    estimator = ActiveMcl(setup, ActiveMclSettings(), space)
+    reports = list(robot.begin())
+    assert len(reports[-1].landmarks) >= 2
+    for m in (*reports, *robot.wait(1.0)):
+        estimator.process(m)
+    error = estimator.estimate().pose - robot.pose
+    assert np.hypot(*error[:2]) < 0.3
+    assert abs(se2.wrap_scalar(float(error[2]))) < 0.1

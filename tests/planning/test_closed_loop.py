@@ -160,3 +160,12 @@ def test_modes_that_are_next_to_each_other_are_one_place() -> None:
     places = closed_loop._places(Belief(modes))
     assert [place.weight for place in places] == [0.8, 0.17]
     assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]
+
+
+@pytest.mark.parametrize("estimator", ["active_mcl", "particle_filter", "smoother"])
+def test_landmarks_are_seen_too(estimator: str) -> None:
+    """Where there are some on all walls, the place is known much sooner than by the three tags."""
+    world = preset("symmetric", {"world": {"landmarks": 40}})
+    run = run_active(world, "information", estimator, 1006, ActiveSettings(max_metres=20.0))
+    assert run.localized
+    assert run.metres < 5.0

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.planning.fisher import Sensors, expected_covariance, expected_information, fisher_gain
+from factorgraph_loc.planning.fisher import expected_covariance, expected_information, fisher_gain
 from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import Path, primitives
+from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.settings import RACKHAM_RIG

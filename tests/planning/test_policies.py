@@ -9,9 +9,9 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Mode
 from factorgraph_loc.files import parse_model
-from factorgraph_loc.planning.fisher import Sensors
 from factorgraph_loc.planning.paths import primitives, waypoint_paths
 from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
+from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.rfid_settings import RfidSettings
 from factorgraph_loc.rig import Rig

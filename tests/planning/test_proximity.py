@@ -16,7 +16,9 @@ SIGHT, CLEARANCE = 3.0, 0.35
 @pytest.fixture(scope="module")
 def sensor() -> ProximitySensor:
     """In the corridors of an H, 3 m wide: arms along y at both ends, a crossbar along x at y = 12 m."""
-    return ProximitySensor(free_space(make_world(preset("symmetric").world, np.random.default_rng(0)), CLEARANCE), SIGHT)
+    return ProximitySensor(
+        free_space(make_world(preset("symmetric").world, np.random.default_rng(0)), CLEARANCE), SIGHT
+    )
 
 
 def test_lengths_are_those_to_the_walls_less_the_clearance(sensor: ProximitySensor) -> None:

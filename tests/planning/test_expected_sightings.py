@@ -1,0 +1,89 @@
+"""Landmarks that would be seen on the way."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.planning import expected_sightings
+from factorgraph_loc.planning.fisher import expected_covariance
+from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
+from factorgraph_loc.planning.paths import primitives
+from factorgraph_loc.planning.sensors import Sensors
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation.settings import RACKHAM_RIG
+from factorgraph_loc.world import Landmark, World
+from factors import bearing_range
+from factors.rfid_likelihood import RfidLikelihood, TagArray
+
+RIG = Rig.model_validate(RACKHAM_RIG)
+MEAN = np.array((1.0, 2.0, 0.7))
+NO_TAGS = RfidLikelihood(RIG.rfid.model(), TagArray(np.empty((0, 3)), np.empty(0)))
+
+
+def sensors_of(*points, walls=()):
+    world = World(landmarks={f"L{i}": Landmark(x=x, y=y) for i, (x, y) in enumerate(points)}, walls=walls)
+    return Sensors.of(world, RIG)
+
+
+def test_it_agrees_with_the_closed_form_where_the_belief_is_narrow():
+    """Two landmarks, one or both of which are within 6 m along each way: the sensor is nearly linear over the belief. The odometry
+    is exact, so the fall of entropy is that of the sightings alone."""
+    sensors = sensors_of((4.8, 3.0), (-1.5, 5.5))
+    still = replace(sensors, bearing_range=replace(sensors.bearing_range, range_sigma=0.6, bearing_sigma=0.4))
+    exact = replace(still, odometry=type(still.odometry)())
+    covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
+    rng = np.random.default_rng(0)
+    particles = rng.multivariate_normal(MEAN, covariance, 2000)
+    weights = np.full(2000, 1.0 / 2000)
+    paths = [p for p in primitives(1.5) if p.length > 1.4][::5]
+    drawn = expected_gain(NO_TAGS, particles, weights, paths, rng, sensors=still, samples=2000, scans=200)
+    fine = np.diag(FINEST**2)
+    after = np.array([expected_covariance(MEAN, covariance, path, exact) for path in paths])
+    closed = gaussian_entropy(covariance + fine, ("x", "y")) - gaussian_entropy(after + fine, ("x", "y"))
+    assert closed.min() > 0.1
+    assert abs(drawn - closed).max() < 0.15
+
+
+def test_weights_are_those_of_the_sensor_model():
+    """With so little noise that what is measured is what is expected: the whitened errors of the model, for each look."""
+    sensors = sensors_of((4.8, 3.0), (-1.5, 5.5))
+    model = replace(sensors.bearing_range, robust=1e6)
+    poses = np.array(((1.0, 2.0, 0.7), (1.1, 1.9, 0.75), (0.8, 2.2, -3.0)))
+    out = np.zeros((1, 3), dtype=np.float32)
+    stops = np.ones(1, dtype=np.int64)
+    expected_sightings.add_log_weights(
+        replace(sensors, bearing_range=model), poses[None], np.array((1e8,)), stops, np.uint64(0), out
+    )
+    ranges, bearings = bearing_range.predict(model, poses[0], sensors.world.positions())
+    told = bearing_range.log_likelihood(model, poses, sensors.world.positions(), ranges, bearings)
+    # noise of 1e-4 standard deviations of one sighting times errors of up to 200
+    assert out[0] / 1e8 == pytest.approx(told, rel=1e-3, abs=1e-6)
+
+
+def test_what_is_far_or_behind_a_wall_tells_nothing():
+    rng = np.random.default_rng(0)
+    particles = rng.multivariate_normal(MEAN, np.diag((0.2**2, 0.2**2, 0.1**2)), 300)
+    weights = np.full(300, 1.0 / 300)
+    ways = [p for p in primitives(1.5) if p.length > 1.4][:1]
+
+    def gain(sensors):
+        draws = np.random.default_rng(1)
+        return expected_gain(NO_TAGS, particles, weights, ways, draws, dims=("x", "y", "heading"), sensors=sensors)[0]
+
+    nothing = gain(None)
+    wall = ((3.6, -10.0, 3.6, 10.0),)
+    assert gain(sensors_of((4.8, 3.0))) > nothing + 0.5
+    assert gain(sensors_of((4.8, 3.0), walls=wall)) == pytest.approx(nothing)
+    assert gain(sensors_of((40.0, 3.0))) == pytest.approx(nothing)
+
+
+def test_bearings_wrap():
+    """A landmark right behind: bearings to both sides of a half turn are near each other."""
+    sensors = sensors_of((-2.0, 0.0))
+    poses = np.array(((0.0, 0.0, 0.01), (0.0, 0.0, -0.01), (0.0, 0.0, math.pi / 2.0)))
+    out = np.zeros((1, 3), dtype=np.float32)
+    looks = np.ones(1)
+    expected_sightings.add_log_weights(sensors, poses[None], looks, np.ones(1, dtype=np.int64), np.uint64(0), out)
+    assert out[0, 1] > -10.0 > out[0, 2]
