@@ -45,7 +45,7 @@ OUTSIDE = -1.0  # log-weight per motion of a particle that is where no robot can
 KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
 LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
 LOST = math.log(1e-3)  # of the robot being anywhere, at a scan that reads tags
-ONE_PLACE = 1.0  # m: largest standard deviation of a place
+ONE_PLACE, ONE_HEADING = 1.0, 0.8  # m, rad: largest standard deviations of a place
 MORE = 10  # times as many particles while they are everywhere
 
 
@@ -149,7 +149,7 @@ class ActiveMcl(Filter):
 
     def _estimate(self) -> PoseEstimate:
         pose, covariance = self._state.moments
-        one = np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2
+        one = np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2 and covariance[2, 2] < ONE_HEADING**2
         return PoseEstimate(self._t, pose, covariance, "localized" if one else "ambiguous")
 
     def _record(self) -> PoseEstimate:
@@ -165,7 +165,7 @@ def _drawn(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator) -> A
     different, which = np.unique(rows, return_inverse=True)
     kept = poses[different]
     places = np.column_stack((kept[:, :2], LEVER * np.cos(kept[:, 2]), LEVER * np.sin(kept[:, 2])))
-    gaps, _ = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))
+    gaps, _ = cKDTree(places).query(places, k=[min(NEIGHBOURS + 1, len(places))])
     width = np.minimum(KERNEL * gaps[:, -1], WIDEST)[which]
     noise = rng.standard_normal((len(rows), 3)) * np.column_stack((width, width, width / LEVER))
     return se2.compose(poses[rows], se2.exp(noise))

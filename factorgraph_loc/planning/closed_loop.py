@@ -15,7 +15,7 @@ from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Belief, Estimator, Mode
 from factorgraph_loc.estimators.cloud import systematic
 from factorgraph_loc.files import nearest
-from factorgraph_loc.measurements import Measurement, RfidScan
+from factorgraph_loc.measurements import Measurement, RfidScan, Tick
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
@@ -136,6 +136,7 @@ class _Loop:
                 done = self._take(robot.drive(choice.path.poses, metres))
             if robot.t == before:
                 done = self._take(robot.wait(PAUSE))
+        self._estimator.process(Tick(robot.t))
         return done
 
     def errors(self) -> tuple[float, float]:
@@ -149,6 +150,8 @@ class _Loop:
             self._estimator.process(report)
             if isinstance(self._estimator, ActiveMcl) and self._robot.metres >= self._looked_at + LOOK:
                 self._looked_at = self._robot.metres
+                # filters move at scans and ticks alone
+                self._estimator.process(Tick(self._robot.t))
                 self._estimator.see(self._robot.proximity, self._robot.look())
             if isinstance(report, RfidScan) and self._is_sure():
                 position, heading = self.errors()
@@ -167,9 +170,10 @@ class _Loop:
         return position < self._settings.position_limit and heading < self._settings.heading_limit
 
     def _choose(self) -> Choice:
+        self._estimator.process(Tick(self._robot.t))
+        started = perf_counter()
         belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
-        started = perf_counter()
         modes = _places(belief)
         proposed = [*self._paths, *self._far(modes)]
         if self._robot.metres >= self._turned_at + self._settings.policy.replan:

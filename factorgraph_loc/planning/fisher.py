@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_loc.estimators.motion import propagate
-from factorgraph_loc.planning.information import POSITION, gaussian_entropy
+from factorgraph_loc.planning.information import FINEST, POSITION, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
 from factorgraph_loc.planning.sensors import SPEED, Sensors
 from factorgraph_loc.simulation.sightings import crosses
@@ -47,9 +47,11 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 def fisher_gain(
     mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors, *, dims: Sequence[str] = POSITION
 ) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths, in the dimensions ``dims``; see :func:`expected_covariance`."""
-    after = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors), dims) for path in paths]
-    return np.asarray(gaussian_entropy(covariance, dims) - np.array(after, dtype=float))
+    """Expected reduction of entropy (C,) [nats] on each of C paths, in the dimensions ``dims``; see :func:`expected_covariance`.
+    What is finer than :data:`~factorgraph_loc.planning.information.FINEST` counts nothing."""
+    fine = np.diag(FINEST**2)
+    after = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine, dims) for path in paths]
+    return np.asarray(gaussian_entropy(covariance + fine, dims) - np.array(after, dtype=float))
 
 
 def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:

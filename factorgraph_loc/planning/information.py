@@ -86,6 +86,7 @@ def expected_gain(
     dims: Sequence[str] = POSITION,
     space: FreeSpace | None = None,
     sensors: Sensors | None = None,
+    places: NDArray[np.int64] | None = None,
     noise: OdometryModel | None = None,
     samples: int = SAMPLES,
     scans: int = SCANS,
@@ -96,7 +97,8 @@ def expected_gain(
 
     The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
     particle whose way leads to a wall stops there, and scans no more. ``sensors``: the landmarks of its world are seen on the way,
-    as its ``bearing_range`` tells; tags are read as ``likelihood`` tells. ``noise``: of the odometry on the way, none by default.
+    as its ``bearing_range`` tells; tags are read as ``likelihood`` tells. ``places`` (M,): which place each
+    particle stands for; then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by default.
     ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``,
     ``rounds_per_radian`` of a turn in place: inventory rounds of each antenna.
     """
@@ -104,9 +106,13 @@ def expected_gain(
         return np.empty(0)
     tables = _tables(likelihood)
     chosen = _leading(dims)
-    several = has_several_modes(particles, weights)
-    rows = systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
-    poses = np.ascontiguousarray(particles[rng.permutation(rows)], dtype=float)
+    several = places is not None or has_several_modes(particles, weights)
+    rows = rng.permutation(
+        systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
+    )
+    poses = np.ascontiguousarray(particles[rows], dtype=float)
+    # a cell for each place
+    cells = None if places is None else np.multiply.outer(places[rows] + 0.5, (CELL[0], 0.0, 0.0))[None]
     count = len(poses)
     scans = min(scans, count)
     seed = np.uint64(rng.integers(2**63))
@@ -116,7 +122,7 @@ def expected_gain(
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
     after = np.empty((len(paths), scans))
     even: Array32 = np.full((1, count), 1.0 / count, dtype=np.float32)
-    before = _entropies(poses[None], np.zeros(1, dtype=np.int64), even, chosen, several)[0]
+    before = _entropies(poses[None] if cells is None else cells, np.zeros(1, dtype=np.int64), even, chosen, several)[0]
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
@@ -134,10 +140,10 @@ def expected_gain(
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
-        if several and noise is None:
+        if cells is not None or (several and noise is None):
             # the same as at the end, as the way moves all alike, but for how the places lie in the histogram's cells
             index = np.zeros_like(index)
-        after[c] = _entropies(at, index, np.exp(log_weights), chosen, several)
+        after[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
     return np.asarray(before - after.mean(axis=1))
 
 

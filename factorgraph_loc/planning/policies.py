@@ -33,7 +33,7 @@ from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation
 FEW = 0.6  # weight of few places, that ways may lead from
-OF_MODES = 48  # particles that stand for these
+EACH, OF_MODES = 48, 96  # particles that stand for each of these, and that are looked at
 COMMITTED = 0.5  # of an arc, before another is chosen
 FAR = "waypoint"  # kind of ways to places
 FAR_PER_METRE = 0.02  # nats: of ways that tell the same the shorter is gone
@@ -105,6 +105,7 @@ class Information:
         far = [i for i, p in enumerate(s.candidates) if p.kind == FAR]
         if far and sum(mode.weight for mode in s.modes) > FEW:
             gains = self._far(s, [s.candidates[i] for i in far])
+            values[:] = np.nan
             values[far] = self._sign * gains - _costs(s, far, FAR_PER_METRE)
             if np.max(gains) >= NOTHING:
                 best = s.candidates[far[int(np.argmax(values[far]))]]
@@ -133,10 +134,10 @@ class Information:
             rounds_per_metre=s.rounds_per_metre,
             rounds_per_radian=s.rounds_per_radian,
         )
-        if s.sensors is None or not s.modes:
+        if s.sensors is None or len(s.modes) != 1:
             return gains
         # else it would go to and fro for what the odometry takes away again
-        alone, mode = Sensors(s.sensors.world, s.sensors.odometry), s.modes[0]
+        alone, (mode,) = Sensors(s.sensors.world, s.sensors.odometry), s.modes
         return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
     @staticmethod
@@ -150,16 +151,17 @@ class Information:
             (mode,) = s.modes
             return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
         # which of equal places is the heavier is the luck of the particles
-        weights = np.sqrt([mode.weight for mode in s.modes])
+        weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
         return expected_gain(
             s.likelihood,
-            np.array([mode.pose for mode in s.modes]),
+            np.concatenate([s.rng.multivariate_normal(mode.pose, mode.covariance, EACH) for mode in s.modes]),
             weights / weights.sum(),
             paths,
             s.rng,
             samples=OF_MODES,
             space=s.space,
             sensors=s.sensors,
+            places=np.repeat(np.arange(len(s.modes)), EACH),
             rounds_per_metre=s.rounds_per_metre,
             rounds_per_radian=s.rounds_per_radian,
         )
@@ -180,7 +182,8 @@ class Random:
         if not arcs:
             return Choice(None, 0.0, np.empty(0))
         path = arcs[int(situation.rng.integers(len(arcs)))]
-        return Choice(path, path.length, np.empty(0))
+        # a turn has no length, but takes no more way than there is
+        return Choice(path, max(path.length, situation.settings.policy.replan), np.empty(0))
 
 
 class Patrol:
