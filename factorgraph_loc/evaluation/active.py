@@ -113,7 +113,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     """Header and lines of the table of :func:`summaries`."""
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
-    header += ["error [m]", "[deg]", "planning [ms]"]
+    header += ["error [m]", "[deg]", "time [s]", "planning [ms]"]
     lines = []
     for one in summaries(rows):
         low, high = 100.0 * one["failures_low"], 100.0 * one["failures_high"]
@@ -124,7 +124,7 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
                 f"{one['failures']} ({low:.0f} % to {high:.0f} %)",
                 str(one["claimed_wrong"]),
                 *(_text(one["error_position"], 2), _text(np.degrees(one["error_heading"]), 1)),
-                _text(one["planning_ms"], 1),
+                *(_text(one["seconds"], 0), _text(one["planning_ms"], 1)),
             ]
         )
     return header, lines

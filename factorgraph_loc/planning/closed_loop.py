@@ -23,7 +23,9 @@ from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_po
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.readers.simulated_odometry import RATE
 from factorgraph_loc.simulation.free_space import CELL, FreeSpace, distance_to_walls, free_space
+from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
 from factorgraph_loc.simulation.simulate import generators
 from factorgraph_loc.simulation.worlds import make_world
@@ -56,13 +58,23 @@ def run_active(
     settings = settings or ActiveSettings()
     if simulation.faults != FaultSettings():
         raise InputError(f"{simulation.name}: has faults, expected none: they are not part of active runs")
+    for name, rate in (
+        ("rounds_per_second", simulation.rounds_per_second),
+        ("sightings.rate", simulation.sightings.rate),
+    ):
+        if rate > RATE:
+            raise InputError(
+                f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
+            )
     chooser = make_policy(policy)
-    world = make_world(
-        simulation.world, generators(seed if simulation.world_seed is None else simulation.world_seed)[0]
-    )
+
+    def of_world() -> np.random.Generator:
+        return generators(seed if simulation.world_seed is None else simulation.world_seed)[0]
+
+    world = make_world(simulation.world, of_world())
     space = free_space(world, settings.clearance)
     of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
-    start = _start(world, space, settings, of_start)
+    start = _start(make_plan(simulation.world, of_world()), world, space, settings, of_start)
     robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
     sensors = ("odometry", "rfid", *(("bearing_range",) if world.landmarks else ()))
     setup = registry.Setup(simulation.rig, world, sensors, of_estimator)
@@ -115,14 +127,15 @@ class _Loop:
             rounds_per_metre=self._rounds_per_metre,
             metres_per_radian=settings.speed / settings.turn_rate,
             looks_per_metre=simulation.sightings.rate / settings.speed,
-            max_range=simulation.sightings.max_range,
+            sightings=simulation.sightings,
         )
         tags = tag_map(setup.world, setup.rig.survey).tags
         assert setup.rig.rfid is not None, "the settings have been checked"
         # where a robot is nearest to each tag
         nearest_cells = cKDTree(space.centres).query(tags.points[:, :2])[1]
         self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, SPREAD_OVER), PLACES))
-        self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if len(tags.points) else None
+        tells = len(tags.points) > 0 or self._sensors.bearing_range is not None
+        self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if tells else None
 
     def run(self) -> bool:
         """Whether the robot found out where it is."""
@@ -238,19 +251,19 @@ def _estimator(name: str, setup: registry.Setup, settings: ActiveSettings) -> Es
     return registry.create(name, setup, registry.settings_of(name, {}))
 
 
-def _start(world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
+def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
     """The true pose (3,) at first."""
     place = space.centres[rng.integers(len(space.centres))] + CELL * (rng.random(2) - 0.5)
     drawn = np.array((*place, rng.uniform(-math.pi, math.pi)))
     if settings.start is None:
         return drawn
     x, y, _ = settings.start
-    walls = np.array(world.walls).reshape(-1, 2)
-    gap = float(distance_to_walls(world, np.array(((x, y),)))[0])
-    if gap < settings.clearance or not np.all(((x, y) > walls.min(axis=0)) & ((x, y) < walls.max(axis=0))):
+    place = np.array(((x, y),))
+    gap = float(distance_to_walls(world, place)[0])
+    if gap < settings.clearance or not plan.open(place)[0]:
         raise InputError(
-            f"{world.name}: start ({x:g}, {y:g}) is in a wall or {gap:.2f} m from one, expected a place between the walls, "
-            f"at least {settings.clearance:g} m from all"
+            f"{world.name}: start ({x:g}, {y:g}) is in a wall, in something solid, or {gap:.2f} m from one, "
+            f"expected a place between the walls, at least {settings.clearance:g} m from all"
         )
     return np.array(settings.start)
 

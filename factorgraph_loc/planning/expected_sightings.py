@@ -6,21 +6,23 @@ The sightings of one look are as one with the mean of all, of less noise. Landma
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.planning.expected_scans import Array32, Places
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.simulation.sightings import crosses
-from factors import bearing_range, se2
+from factorgraph_loc.simulation.sightings import in_sight
+from factors import bearing_range
 from factors.se2 import Array
 
 
-def add_log_weights(sensors: Sensors, poses: Array, looks: Array, stops: Places, seed: np.uint64, out: Array32) -> None:
+def add_log_weights(sensors: Sensors, poses: Array, looks: float, stops: Places, seed: np.uint64, out: Array32) -> None:
     """Add to ``out`` (J, M) what the sightings that the first J particles might make on one path tell of each of M.
 
-    ``poses`` (S, M, 3): where they look; ``looks`` (S,): how often; ``stops`` (J,): at how many of the places each gets to look.
+    ``poses`` (S, M, 3): where they look; ``looks``: how often at each; ``stops`` (J,): at how many of the places each gets to look.
     Draws are the same for all paths of one ``seed``.
     """
     model = sensors.bearing_range
@@ -28,15 +30,13 @@ def add_log_weights(sensors: Sensors, poses: Array, looks: Array, stops: Places,
     points = sensors.world.positions()
     scans = len(stops)
     for s in range(len(poses)):
-        eyes = se2.compose(poses[s, :scans], np.array(model.mounting))[:, :2]
-        near = np.hypot(*np.moveaxis(points[None] - eyes[:, None], -1, 0)) <= sensors.max_range
-        j, k = np.nonzero(near & (s < stops)[:, None])
-        seen = ~crosses(sensors.world, eyes[j], points[k])
-        j, k = j[seen], k[seen]
-        if not len(j) or looks[s] == 0.0:
+        j, k = in_sight(model, sensors.world, poses[s, :scans], sensors.sightings)
+        looking = s < stops[j]
+        j, k = j[looking], k[looking]
+        if not len(j):
             continue
         ranges, bearings = bearing_range.predict(model, poses[s][:, None], points[None])
-        sigmas = bearing_range.sigmas(model, ranges[j, k]) / np.sqrt(looks[s])
+        sigmas = bearing_range.sigmas(model, ranges[j, k]) / math.sqrt(looks)
         normals = np.random.default_rng((int(seed), s)).standard_normal((scans, len(points), 2))
         noise = sigmas * normals[j, k]
         measured = np.column_stack((ranges[j, k] + noise[:, 0], bearings[j, k] + noise[:, 1]))

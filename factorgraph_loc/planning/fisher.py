@@ -16,7 +16,7 @@ from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.planning.information import FINEST, POSITION, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
 from factorgraph_loc.planning.sensors import SPEED, Sensors
-from factorgraph_loc.simulation.sightings import crosses
+from factorgraph_loc.simulation.sightings import crosses, in_sight
 from factors import bearing_range, odometry, reprojection, se2
 from factors.bearing_range import BearingRangeModel
 from factors.odometry import ChainState
@@ -76,11 +76,7 @@ def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:
 def _of_landmarks(model: BearingRangeModel, poses: Array, sensors: Sensors) -> Array:
     """Information (N, 3, 3) of one look at the landmarks in sight from each pose (N, 3)."""
     points = sensors.world.positions()
-    eyes = se2.compose(poses, np.array(model.mounting))
-    apart = np.hypot(*np.moveaxis(points[None] - eyes[:, None, :2], -1, 0))
-    n, k = np.nonzero(apart <= sensors.max_range)
-    seen = ~crosses(sensors.world, eyes[n, :2], points[k])
-    n, k = n[seen], k[seen]
+    n, k = in_sight(model, sensors.world, poses, sensors.sightings)
     by_pose, _, _ = bearing_range.jacobians(model, poses[n], points[k])
     ranges, _ = bearing_range.predict(model, poses[n], points[k])
     whitened = by_pose / bearing_range.sigmas(model, ranges)[:, :, None]

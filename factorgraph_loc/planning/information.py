@@ -98,7 +98,8 @@ def expected_gain(
     The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
     particle whose way leads to a wall stops there, and scans no more. ``sensors``: the landmarks of its world are seen on the way,
     as its ``bearing_range`` tells; tags are read as ``likelihood`` tells. ``places`` (M,): which place each
-    particle stands for; then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by default.
+    particle stands for; then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by
+    default.
     ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``,
     ``rounds_per_radian`` of a turn in place: inventory rounds of each antenna.
     """
@@ -135,7 +136,7 @@ def expected_gain(
             tables, at[1:-1], rounds, stops, scans, seed, likelihood.model.tempering, log_weights
         )
         if sensors is not None and sensors.bearing_range is not None:
-            each = np.asarray(rounds * (sensors.looks_per_metre / rounds_per_metre), dtype=np.float64)
+            each = passed[c][-1] * sensors.looks_per_metre / rounds_per_metre / len(looks)
             expected_sightings.add_log_weights(sensors, at[1:-1], each, stops[:scans], seed, log_weights)
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look

@@ -216,7 +216,7 @@ class NearestTags:
 
     def choose(self, situation: Situation) -> Choice:
         s = situation
-        if s.likelihood is None or not s.candidates:
+        if s.likelihood is None or not len(s.likelihood.tags.points) or not s.candidates:
             return Patrol().choose(s)
         rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
         ends = np.array([p.poses[-1] for p in s.candidates])
@@ -246,7 +246,7 @@ def make_policy(name: str) -> Policy:
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
     """The ways whose first metre is free, up to where the sensor sees the first wall on them, with how far they are free."""
-    keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length) - 1e-9]
+    keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]
 
 
@@ -257,4 +257,4 @@ def _direction(path: Path) -> float:
 
 def _is_straight(path: Path) -> bool:
     x, y = path.poses[-1, :2]
-    return path.kind == "arc" and path.length > AHEAD - 1e-9 and math.hypot(x, y) > path.length - 1e-6
+    return path.kind == "arc" and path.length > 0.0 and math.hypot(x, y) > path.length - 1e-6

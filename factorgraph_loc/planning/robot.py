@@ -50,7 +50,6 @@ class SimulatedRobot:
         self.pose = np.array(start, dtype=float)
         self.t = 0.0
         self.metres = 0.0
-        self.blocked = False
         self._settings = settings
         self._space = space
         self.proximity = ProximitySensor(space, settings.sight)
@@ -89,7 +88,6 @@ class SimulatedRobot:
 
     def drive(self, path: Array, metres: float) -> Iterator[Report]:
         """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""
-        self.blocked = False
         for told in self._told(path, metres):
             n1, n2, n3 = self._noise.standard_normal(3)
             root = math.sqrt(math.hypot(told[0], told[1]))
@@ -99,7 +97,6 @@ class SimulatedRobot:
             moved = np.array((dx, dy, (told[2] - drifted) / (1.0 + self._scale_of_turns)))
             there = se2.compose(self.pose, moved)
             if root > 0.0 and not self._is_free(there):
-                self.blocked = True
                 return
             self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
             yield from self._passed(told)

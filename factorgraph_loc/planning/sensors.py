@@ -23,8 +23,8 @@ class Sensors:
     """What a robot looks with on its way through ``world``, whose map is taken as exact. ``odometry``: noise of its motion.
 
     The other models are None where there is no such sensor. ``rounds_per_metre``: inventory rounds of each antenna;
-    ``looks_per_metre``: of the other sensors; ``metres_per_radian``: that take as long as a turn in place. Landmarks are seen up to
-    ``max_range`` [m], at most ``max_points`` points up to ``max_depth`` [m], neither through walls.
+    ``looks_per_metre``: of the other sensors; ``metres_per_radian``: that take as long as a turn in place. Landmarks are seen as
+    ``sightings`` tells but for the rate, at most ``max_points`` points up to ``max_depth`` [m], neither through walls.
     """
 
     world: World
@@ -35,7 +35,7 @@ class Sensors:
     rounds_per_metre: float = ROUNDS_PER_METRE
     metres_per_radian: float = ROUNDS_PER_RADIAN / ROUNDS_PER_METRE
     looks_per_metre: float = _SIGHTINGS.rate / SPEED
-    max_range: float = _SIGHTINGS.max_range
+    sightings: SightingSettings = _SIGHTINGS
     max_depth: float = _PIXELS.max_depth
     max_points: int = _PIXELS.max_points
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from factorgraph_loc.files import FileModel
 
@@ -16,7 +16,9 @@ Dimension = Literal["x", "y", "heading"]
 
 class PolicySettings(FileModel):
     """How the next way is chosen. ``horizon`` [m]: length of arcs and straight runs; ``far`` [m]: of the longest ways to places.
-    ``replan`` [m]: how far the robot goes before it chooses anew. ``per_metre`` and ``per_second``: what a way costs, in nats.
+    ``replan`` [m]: how far the robot goes at least before it chooses anew: half of a longer arc, and all of a way to a place, which
+    would be turned back from for less. ``per_metre`` and ``per_second``: what a near way costs, in nats; of far ones the seconds
+    cost as much.
     ``samples``: particles of the belief that the expectation is taken over. ``dimensions``: whose entropy counts.
     ``expectation``: over scans that are drawn, or, of a belief in one place, by Fisher's information in closed form."""
 
@@ -27,7 +29,14 @@ class PolicySettings(FileModel):
     expectation: Literal["sampled", "fisher"] = "sampled"
     per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
-    dimensions: Annotated[tuple[Dimension, ...], Field(min_length=1)] = ("x", "y", "heading")
+    dimensions: tuple[Dimension, ...] = ("x", "y", "heading")
+
+    @field_validator("dimensions")
+    @classmethod
+    def _with_position(cls, value: tuple[Dimension, ...]) -> tuple[Dimension, ...]:
+        if value not in (("x", "y"), ("x", "y", "heading")):
+            raise ValueError("expected x, y or x, y, heading")
+        return value
 
 
 class ActiveSettings(FileModel):

@@ -23,6 +23,20 @@ def sighting_stream(
 ) -> BearingRangeStream:
     """What the sensor reports at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in view and not behind a wall."""
     points, names = world.positions(), list(world.landmarks)
+    n, k = in_sight(model, world, poses, settings)
+    ranges, bearings = bearing_range.predict(model, poses[n], points[k])
+    sigma = bearing_range.sigmas(model, ranges)
+    noise = sigma * rng.standard_normal((len(n), 2))
+    # a range is above zero whatever the noise
+    ranges = np.maximum(ranges + noise[:, 0], 1e-3)
+    return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
+
+
+def in_sight(
+    model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which of ``poses`` (N, 3) see which landmarks: places (K,) in both."""
+    points = world.positions()
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors[:, None], points[None])
     distance = np.hypot(local[..., 0], local[..., 1])
@@ -30,13 +44,7 @@ def sighting_stream(
     near = (distance <= settings.max_range) & (np.abs(direction) <= settings.field_of_view / 2.0)
     n, k = np.nonzero(near)
     visible = ~crosses(world, sensors[n, :2], points[k])
-    n, k = n[visible], k[visible]
-    ranges, bearings = bearing_range.predict(model, poses[n], points[k])
-    sigma = bearing_range.sigmas(model, ranges)
-    noise = sigma * rng.standard_normal((len(n), 2))
-    # a range is above zero whatever the noise
-    ranges = np.maximum(ranges + noise[:, 0], 1e-3)
-    return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
+    return n[visible], k[visible]
 
 
 def crosses(world: World, a: Array, b: Array) -> NDArray[np.bool_]:

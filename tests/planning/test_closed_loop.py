@@ -105,7 +105,11 @@ def test_an_enclosed_robot_waits_and_gives_up(monkeypatch: pytest.MonkeyPatch, p
 
 @pytest.mark.parametrize(
     ("start", "message"),
-    [((0.05, 3.0, 0.0), "start .* m from one"), ((-5.0, 3.0, 0.0), "start"), ((3.0, 3.0, 0.0), None)],
+    [
+        ((0.05, 3.0, 0.0), "start .* m from one"),
+        ((-5.0, 3.0, 0.0), "start"),
+        ((3.0, 3.0, 0.0), None),
+    ],
 )
 def test_a_start_in_a_wall_is_an_error(start: tuple[float, float, float], message: str | None) -> None:
     simulation = preset("warehouse", {"world": {"width": 10.0, "depth": 10.0}})
@@ -115,6 +119,11 @@ def test_a_start_in_a_wall_is_an_error(start: tuple[float, float, float], messag
         return
     with pytest.raises(InputError, match=message):
         run_active(simulation, "random", "active_mcl", 1, settings)
+
+
+def test_a_start_in_a_block_of_rooms_is_an_error() -> None:
+    with pytest.raises(InputError, match="in something solid"):
+        run_active(preset("symmetric"), "random", "active_mcl", 1, ActiveSettings(start=(9.0, 4.0, 0.0)))
 
 
 @pytest.mark.parametrize(
@@ -169,3 +178,39 @@ def test_landmarks_are_seen_too(estimator: str) -> None:
     run = run_active(world, "information", estimator, 1006, ActiveSettings(max_metres=20.0))
     assert run.localized
     assert run.metres < 5.0
+
+
+def test_landmarks_alone_are_enough() -> None:
+    world = preset("symmetric", {"world": {"landmarks": 40, "tags": 0}})
+    run = run_active(world, "information", "active_mcl", 1006, ActiveSettings(max_metres=20.0))
+    assert run.localized
+    assert run.metres < 5.0
+
+
+def test_a_robot_that_sees_less_than_a_metre_still_drives() -> None:
+    settings = ActiveSettings(sight=0.8, max_metres=3.0, particles=200, policy=PolicySettings(horizon=0.9))
+    for policy in ("patrol", "random", "information"):
+        run = run_active(preset("symmetric"), policy, "active_mcl", 2, settings)
+        assert run.localized or run.metres > 2.9
+
+
+@pytest.mark.parametrize("changes", [{"rounds_per_second": 20.0}, {"sightings": {"rate": 11.0}}])
+def test_sensors_faster_than_the_robot_are_refused(changes: dict) -> None:
+    with pytest.raises(InputError, match="expected at most 10, the rate"):
+        run_active(preset("symmetric", changes), "random", "active_mcl", 1)
+
+
+def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of odometry come five times as often as scans: what is known by them is in the belief that the policy sees."""
+    seen = []
+    choose = closed_loop._Loop._choose
+
+    def watched(loop):
+        out = choose(loop)
+        seen.append((loop._estimator.estimate().t, loop._robot.t))
+        return out
+
+    monkeypatch.setattr(closed_loop._Loop, "_choose", watched)
+    run_active(preset("symmetric"), "information", "active_mcl", 3, ActiveSettings(max_metres=5.0, particles=200))
+    assert len(seen) > 3
+    assert all(known == now for known, now in seen)

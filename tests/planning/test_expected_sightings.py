@@ -12,7 +12,7 @@ from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.settings import RACKHAM_RIG
+from factorgraph_loc.simulation.settings import RACKHAM_RIG, SightingSettings
 from factorgraph_loc.world import Landmark, World
 from factors import bearing_range
 from factors.rfid_likelihood import RfidLikelihood, TagArray
@@ -54,7 +54,7 @@ def test_weights_are_those_of_the_sensor_model():
     out = np.zeros((1, 3), dtype=np.float32)
     stops = np.ones(1, dtype=np.int64)
     expected_sightings.add_log_weights(
-        replace(sensors, bearing_range=model), poses[None], np.array((1e8,)), stops, np.uint64(0), out
+        replace(sensors, bearing_range=model), poses[None], 1e8, stops, np.uint64(0), out
     )
     ranges, bearings = bearing_range.predict(model, poses[0], sensors.world.positions())
     told = bearing_range.log_likelihood(model, poses, sensors.world.positions(), ranges, bearings)
@@ -77,6 +77,10 @@ def test_what_is_far_or_behind_a_wall_tells_nothing():
     assert gain(sensors_of((4.8, 3.0))) > nothing + 0.5
     assert gain(sensors_of((4.8, 3.0), walls=wall)) == pytest.approx(nothing)
     assert gain(sensors_of((40.0, 3.0))) == pytest.approx(nothing)
+    # to the front alone: this one is on the left
+    ahead = replace(sensors_of((0.0, 4.0)), sightings=SightingSettings(field_of_view=1.0))
+    assert gain(ahead) == pytest.approx(nothing)
+    assert gain(sensors_of((0.0, 4.0))) > nothing + 0.5
 
 
 def test_bearings_wrap():
@@ -84,6 +88,5 @@ def test_bearings_wrap():
     sensors = sensors_of((-2.0, 0.0))
     poses = np.array(((0.0, 0.0, 0.01), (0.0, 0.0, -0.01), (0.0, 0.0, math.pi / 2.0)))
     out = np.zeros((1, 3), dtype=np.float32)
-    looks = np.ones(1)
-    expected_sightings.add_log_weights(sensors, poses[None], looks, np.ones(1, dtype=np.int64), np.uint64(0), out)
+    expected_sightings.add_log_weights(sensors, poses[None], 1.0, np.ones(1, dtype=np.int64), np.uint64(0), out)
     assert out[0, 1] > -10.0 > out[0, 2]

@@ -9,7 +9,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Mode
 from factorgraph_loc.files import parse_model
-from factorgraph_loc.planning.paths import primitives, waypoint_paths
+from factorgraph_loc.planning.paths import look_around, primitives, waypoint_paths
 from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
@@ -120,6 +120,30 @@ def test_of_two_places_a_far_one_that_tells_them_apart_is_chosen():
     assert make_policy("information").choose(replace(s, modes=modes[:1])).path is not ways[0]
 
 
+def test_of_two_headings_at_one_place_a_far_tag_tells():
+    """In the middle of a hall, looking one way or the other; a tag stands 15 m ahead of one."""
+    tags = np.array(((20.0, 35.0, 1.2),))
+    middles = np.array(((20.0, 20.0, math.pi / 2.0), (20.0, 20.0, -math.pi / 2.0)))
+    particles = middles[np.arange(500) % 2] + np.random.default_rng(0).standard_normal((500, 3)) * (0.1, 0.1, 0.02)
+    modes = tuple(Mode(0.5, m, np.diag((0.01, 0.01, 4e-4))) for m in middles)
+    ways = waypoint_paths(SPACE, middles[0], np.array(((20.0, 34.0), (34.0, 20.0))))
+    paths = (*primitives(3.0), *ways)
+    s = replace(situation(paths, np.full(len(paths), 3.0), tags), particles=particles, modes=modes)
+    assert make_policy("information").choose(s).path is ways[0]
+
+
+def test_a_far_tag_that_both_places_would_read_alike_tells_nothing():
+    """The modes are known to 0.2 m only: that the way ends 0.1 m beside the one of them and not the other is no difference."""
+    tags = np.array(((20.0, 20.0, 1.2),))
+    middles = np.array(((8.0, 20.0, 0.0), (32.0, 20.1, math.pi)))
+    particles = middles[np.arange(500) % 2] + np.random.default_rng(0).standard_normal((500, 3)) * (0.2, 0.2, 0.05)
+    modes = tuple(Mode(0.5, m, np.diag((0.04, 0.04, 0.0025))) for m in middles)
+    ways = waypoint_paths(SPACE, middles[0], np.array(((19.0, 20.0),)))
+    paths = (*primitives(3.0), *ways)
+    s = replace(situation(paths, np.full(len(paths), 3.0), tags), particles=particles, modes=modes)
+    assert make_policy("information").choose(s).path.kind == "patrol"
+
+
 def test_the_expectation_in_closed_form_goes_where_tags_are():
     s = situation()
     settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
@@ -131,8 +155,18 @@ def test_the_expectation_in_closed_form_goes_where_tags_are():
     assert not np.allclose(drawn.values, choice.values, atol=1e-6)
 
 
+def test_they_go_where_landmarks_are():
+    """Without a tag: two landmarks to the left, 9 m away, that are seen from 6 m."""
+    world = World(landmarks={"A": {"x": 19.0, "y": 29.0}, "B": {"x": 21.0, "y": 29.0}})
+    sensors = Sensors.of(world, parse_model(Rig, RACKHAM_RIG, "rig"))
+    none = RfidLikelihood(MODEL, TagArray(np.empty((0, 3)), np.empty(0)))
+    choice = make_policy("information").choose(replace(situation(), likelihood=none, sensors=sensors))
+    assert abs(direction(choice) - math.pi / 2.0) < 0.8
+
+
 def test_random_takes_all_ways():
-    s = situation()
+    s = situation((*primitives(6.0), look_around()))
+    assert all(make_policy("random").choose(s).metres > 0.0 for _ in range(200))  # a turn too is driven
     chosen = {id(make_policy("random").choose(s).path) for _ in range(1000)}
     assert len(chosen) > 0.9 * len(s.candidates)
 
