@@ -9,7 +9,7 @@ here.
 They begin evenly over free space. A scan is weighed a share at a time, with resampling from a kernel density in between
 (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4). Their
 number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). Where tags are read that none
-of them expects, they begin anew (sensor resetting: Lenser, Veloso, ICRA 2000).
+of them expects, all begin anew (after sensor resetting: Lenser, Veloso, ICRA 2000, which replaces a share).
 """
 
 from __future__ import annotations

@@ -52,8 +52,8 @@ def run_active(
 ) -> ActiveRun:
     """Drive from an unknown start until the place is known, or until the robot gives up.
 
-    Runs of one seed share world, start, and all draws of noise, whatever the policy and the estimator. InputError names a wrong
-    policy, estimator or start.
+    Runs of one seed share world, start, and the sequences that noise is drawn from, whatever the policy and the estimator.
+    InputError names a wrong policy, estimator or start, and a sensor that is faster than the robot's control.
     """
     settings = settings or ActiveSettings()
     if simulation.faults != FaultSettings():

@@ -5,7 +5,7 @@ after, less what the way costs. ``paper_literal``: the same with the sign as it 
 which picks what tells least. ``random``, ``patrol`` and ``nearest_tags`` are what to compare with.
 
 All are given the same ways, those of which the robot's proximity sensor finds the first metre free, and where the robot has not
-turned around yet that turn.
+turned around yet that turn. What leads to places far off is left to those that compare.
 """
 
 from __future__ import annotations

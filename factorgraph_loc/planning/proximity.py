@@ -1,6 +1,6 @@
 """What a robot's proximity sensor finds: how far it could go in each of some directions.
 
-It keeps the robot off the walls, and tells the particles where they cannot be: a crossing, a dead end and a long corridor look
+It tells the particles where they cannot be: a crossing, a dead end and a long corridor look
 different, whatever the tags. The lengths of one look are not as independent as their model has it, of which the map of cells and
 the walls' own shape are in error alike: each look counts as few (:data:`TEMPERING`).
 """
@@ -16,7 +16,7 @@ from factorgraph_loc.simulation.free_space import FreeSpace
 from factors.se2 import Array
 
 SIGMA = 0.3  # m
-UNEXPECTED = 0.05  # share of lengths that have nothing to do with the map
+UNEXPECTED = 0.05  # of the Gaussian's peak: what a length counts for that has nothing to do with the map
 TEMPERING = 0.25
 
 
@@ -39,7 +39,7 @@ class ProximitySensor:
         return np.asarray(np.clip(true + SIGMA * rng.standard_normal(len(true)), 0.0, self._sight))
 
     def log_likelihood(self, poses: Array, lengths: Array) -> Array:
-        """Of ``lengths`` (D,) at poses (M, 3), up to a constant: a Gaussian each, and a few that are anything (Thrun, Burgard, Fox,
-        "Probabilistic Robotics", 2005, section 6.3.1)."""
+        """Of ``lengths`` (D,) at poses (M, 3), up to a constant: a Gaussian each, above a floor for what is anything (after
+        Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 6.3.1, but not normalised)."""
         errors = (self.expected(poses) - lengths) / SIGMA
         return np.asarray(TEMPERING * np.log((1.0 - UNEXPECTED) * np.exp(-0.5 * errors**2) + UNEXPECTED).sum(axis=1))

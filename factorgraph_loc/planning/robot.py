@@ -32,8 +32,8 @@ class SimulatedRobot:
     """The robot at its true place; see the module.
 
     Its wheels err as :func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry` says: what it is told is what they report,
-    and what it does is what differs. Draws belong to the number of the odometry's row and of the inventory round, so that
-    robots of one seed have the same luck wherever they drive.
+    and what it does is what differs. Steps, inventory rounds and looks draw from sequences of their own, so that
+    robots of one seed have the same luck as long as they drive alike.
     """
 
     def __init__(
