@@ -6,7 +6,7 @@ from benchmarking.report import Options, Report
 
 from active_benchmark.runs import compared, goal
 
-SEEDS = 30
+SEEDS = 10
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
 POLICIES = ("information", "random", "patrol")
 

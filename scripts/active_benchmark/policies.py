@@ -6,7 +6,7 @@ from benchmarking.report import Options, Report
 
 from active_benchmark.runs import compared, goal
 
-SEEDS = 100
+SEEDS = 200
 POLICIES = ("information", "random", "patrol", "nearest_tags", "paper_literal")
 
 
