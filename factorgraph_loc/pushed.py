@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.measurements import (
@@ -47,7 +48,9 @@ WIDTHS = {"pixels": 2}
 @dataclass(frozen=True)
 class RfidRead:
     """A tag that was read: by the antenna of that name, its EPC; ``t`` [s]: when, None for the end of the round. ``rssi`` [dBm],
-    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN where unknown."""
+    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN where unknown. ``round``: in which of the
+    rounds that are pushed together, as its place in their list of antennas, from 0. None where only the antenna is known: a tag
+    answers once in a round, so that the first read of a tag by an antenna is of its first round, the next of its next."""
 
     antenna: str
     epc: str
@@ -55,6 +58,7 @@ class RfidRead:
     rssi: float = math.nan
     phase: float = math.nan
     frequency: float = math.nan
+    round: int | None = None
 
 
 def sensor_of(m: Odometry | Exteroceptive) -> str:
@@ -67,21 +71,45 @@ def sensor_of(m: Odometry | Exteroceptive) -> str:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """The scan of rounds that ended at ``t``, in which ``antennas`` listened; InputError if another one read."""
+    """The scan of rounds that ended at ``t``, in which ``antennas`` listened; InputError if a read is of another antenna, or of
+    another one's round."""
     names, rows = tuple(antennas), tuple(reads)
-    for read in rows:
-        if read.antenna not in names:
-            raise bad_field(f"RfidScan at {t:.3f} s", "antenna", read.antenna, f"one that listened: {', '.join(names)}")
     return RfidScan(
         t,
         names,
-        np.array([names.index(read.antenna) for read in rows], dtype=np.int64),
+        _rounds(f"RfidScan at {t:.3f} s", t, names, rows),
         tuple(read.epc for read in rows),
         np.array([0.0 if read.t is None else t - read.t for read in rows]),
         np.array([read.rssi for read in rows]),
         np.array([read.phase for read in rows]),
         np.array([read.frequency for read in rows]),
     )
+
+
+def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
+    """Which of the rounds each read (R,) belongs to.
+
+    Where a read does not tell it, that is the first round of its antenna in which the tag was not read yet, by the order of time,
+    and the last one if there are more reads than rounds.
+    """
+    out = np.full(len(reads), -1, dtype=np.int64)
+    for i, read in enumerate(reads):
+        if read.antenna not in names:
+            raise bad_field(where, "antenna", read.antenna, f"one that listened: {', '.join(names)}")
+        if read.round is None:
+            continue
+        own = [k for k, name in enumerate(names) if name == read.antenna]
+        if read.round not in own:
+            expected = f"one of antenna {read.antenna}: {', '.join(map(str, own))}"
+            raise bad_field(where, "round", read.round, expected)
+        out[i] = read.round
+    taken = {(read.epc, int(k)) for read, k in zip(reads, out, strict=True) if k >= 0}
+    untold = [i for i in range(len(reads)) if out[i] < 0]
+    for i in sorted(untold, key=lambda i: t if (at := reads[i].t) is None else at):
+        mine = [k for k, name in enumerate(names) if name == reads[i].antenna]
+        out[i] = next((k for k in mine if (reads[i].epc, k) not in taken), mine[-1])
+        taken.add((reads[i].epc, int(out[i])))
+    return out
 
 
 def checked(m: M) -> M:

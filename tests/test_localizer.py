@@ -24,7 +24,7 @@ from factorgraph_loc.measurements import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.pushed import RfidRead
+from factorgraph_loc.pushed import RfidRead, scan_of
 from factorgraph_loc.rig import Rig
 from factors import se2
 
@@ -350,6 +350,40 @@ def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):
     localizer = started(log)
     with pytest.raises(InputError, match="antenna is 'left', expected one that listened: front, back"):
         localizer.push_reads(1.0, ["front", "back"], [RfidRead("left", "e1")])
+
+
+def reads_of(antennas, reads):
+    """The antenna and the tag of each round that read it, as estimators count them: once a round."""
+    m = scan_of(1.0, antennas, reads)
+    rounds = set(zip(m.antenna.tolist(), m.tags, strict=True))
+    return sorted((m.antennas[k], tag) for k, tag in rounds)
+
+
+def test_a_tag_that_is_read_twice_was_read_in_two_rounds():
+    front, left = RfidRead("front", "e1"), RfidRead("left", "e1")
+    twice = ["front", "left", "front"]
+    assert reads_of(twice, [front, front]) == [("front", "e1")] * 2
+    assert reads_of(twice, [front, left, front]) == [("front", "e1")] * 2 + [("left", "e1")]
+    assert reads_of(twice, [front, RfidRead("front", "e2")]) == [("front", "e1"), ("front", "e2")]
+    # more reads than rounds: no round can have read it more than once
+    assert reads_of(twice, [front] * 5) == [("front", "e1")] * 2
+
+
+def test_a_read_tells_its_round():
+    first, last = RfidRead("front", "e1", t=0.9), RfidRead("front", "e1", t=0.8, round=0)
+    m = scan_of(1.0, ["front", "left", "front"], [first, last])
+    assert m.antenna.tolist() == [2, 0]
+    # in the order of time, whatever the order of the rows
+    m = scan_of(1.0, ["front", "front"], [RfidRead("front", "e1", t=0.9), RfidRead("front", "e1", t=0.5)])
+    assert m.antenna.tolist() == [1, 0]
+    told_twice = [RfidRead("front", "e1", round=1), RfidRead("front", "e1", round=1)]
+    assert reads_of(["front", "front"], told_twice) == [("front", "e1")]
+
+
+@pytest.mark.parametrize("number", [1, 3, -1, 0.5])
+def test_a_round_of_another_antenna_is_refused(number):
+    with pytest.raises(InputError, match=rf"round is {number}, expected one of antenna front: 0, 2"):
+        scan_of(1.0, ["front", "left", "front"], [RfidRead("front", "e1", round=number)])
 
 
 def test_reads_are_those_of_a_scan(log):
