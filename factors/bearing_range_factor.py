@@ -19,7 +19,7 @@ from factors.bearing_range import (
     whitened,
     whitened_all,
 )
-from factors.displaced import carried, delayed, displaced
+from factors.displaced import carried, common_error, delayed, displaced
 from factors.se2 import Array
 
 
@@ -29,7 +29,9 @@ class BearingRangeFactor:
 
     ``points`` (K, 2): where the landmarks are; ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise.
     ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, known from odometry;
-    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``twist`` (3,): the robot's velocity then.
+    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. All landmarks of the look have this error in
+    common; ``in_look``: how many they are, if those of other factors share it too, else K. ``twist`` (3,): the robot's velocity
+    then.
 
     The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
     constants (P,); then, where ``free``, the position (2,) of the one landmark, in place of ``points``.
@@ -45,6 +47,7 @@ class BearingRangeFactor:
     estimated: tuple[int, ...] = ()
     free: bool = False
     twist: Array | None = None
+    in_look: int | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
@@ -87,8 +90,8 @@ class BearingRangeFactor:
         if self.point_covariances is not None:
             spread = carried(by_point, self.point_covariances)
         if self.offset_covariance is not None:
-            own = carried(by_pose, self.offset_covariance)
-            spread = own if spread is None else spread + own
+            common = common_error(by_pose, self.offset_covariance, self.in_look)
+            spread = common if spread is None else spread + common
         return displaced(error, blocks, offset, spread)
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:

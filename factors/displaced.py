@@ -27,6 +27,12 @@ def carried(jacobian: Array, covariance: Array) -> Array:
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
 
 
+def common_error(jacobian: Array, covariance: Array, count: int | None = None) -> Array:
+    """The covariance (K, 2, 2) of each of ``count`` sightings, by default K, that have one error of this ``covariance`` (d, d) in
+    common: as many times as large as that of one alone, so that together they do not seem to be rid of it."""
+    return (len(jacobian) if count is None else count) * carried(jacobian, covariance)
+
+
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
     """The ``offset`` (3,) of a sighting that came so much later, of a robot with the velocity ``twist`` (3,)."""
     if twist is None or seconds == 0.0:

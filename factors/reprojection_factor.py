@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from factors import pixel_kernels, se2
-from factors.displaced import carried, delayed, displaced
+from factors.displaced import carried, common_error, delayed, displaced
 from factors.reprojection import (
     PARAMETERS,
     TIME_OFFSET,
@@ -130,8 +130,7 @@ class ReprojectionFactor:
         if self.point_covariances is not None:
             spread = carried(scale * by_point, self.point_covariances)
         if self.offset_covariance is not None:
-            # all points have this error in common: together they must not seem to be rid of it
-            common = len(error) * carried(by_pose, self.offset_covariance)
+            common = common_error(by_pose, self.offset_covariance)
             spread = common if spread is None else spread + common
         return displaced(error, blocks, offset, spread)
 

@@ -108,6 +108,17 @@ class KnownLandmarks:
             None if offset is None else offset.covariance,
             estimated=self._estimated,
             twist=twist,
+            in_look=None if offset is None else self._count(m),
+        )
+
+    def _count(self, m: BearingRange) -> int:
+        """How many landmarks of a measurement are used: those of the map with either value, others with both."""
+        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
+        return sum(
+            not (no_range and no_bearing)
+            if name in self._positions
+            else self._maps_others and not (no_range or no_bearing)
+            for name, no_range, no_bearing in lacks
         )
 
     def report(self, t: float, factor: BearingRangeFactor, update: Update) -> None:

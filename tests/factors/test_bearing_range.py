@@ -184,6 +184,36 @@ def test_jacobian_of_the_factor_is_the_numerical_one(model, pose, seed, displace
         np.testing.assert_allclose(block[:, j], (after - before) / (2 * step), rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize(("around", "most"), [(0.001, 1.01), (np.pi, 1.5)])
+def test_landmarks_of_one_look_do_not_average_the_odometry_error_away(split, around, most):
+    """Twenty landmarks, seen 0.1 m of odometry error after the keyframe, cannot place it any better than that.
+
+    Close together they tell what their joint covariance says; in different directions they may tell less, but never more.
+    """
+    angles = np.linspace(-around, around, 20, endpoint=False)
+    ring = 5.0 * np.column_stack((np.cos(angles), np.sin(angles)))
+    model = BearingRangeModel(range_sigma=0.05, bearing_sigma=0.01, robust=100.0)
+    offset, noise = np.array((0.5, 0.0, 0.0)), np.diag((0.1, 0.1, 0.02)) ** 2
+    ranges, bearings = predict(model, offset, ring)
+    rows = [[i] for i in range(20)] if split else [list(range(20))]
+    information = prior = np.linalg.inv(np.diag((3.0, 3.0, 0.001)) ** 2)
+    for i in rows:
+        seen = ring[i], ranges[i], bearings[i]
+        factor = BearingRangeFactor(model, *seen, offset, noise, in_look=20 if split else None)
+        _, (jacobian,) = factor.linearize([np.zeros(3)])
+        information = information + jacobian.T @ jacobian
+    # by the joint covariance of all forty values: the error of the odometry is one
+    stacked = whitened(model, offset, ring, ranges, bearings)[1].reshape(-1, 3)
+    stacked_back = stacked @ se2.adjoint(se2.inverse(offset))
+    told = stacked_back.T @ np.linalg.inv(np.eye(40) + stacked @ noise @ stacked.T) @ stacked_back
+    exact = np.sqrt(np.diag(np.linalg.inv(prior + told)))
+    found = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert exact[0] == pytest.approx(0.1, rel=0.05)
+    assert np.all(found >= 0.999 * exact)
+    assert np.all(found <= most * exact)
+
+
 @given(poses, points)
 def test_residuals_are_those_of_gtsams_factors(pose, point):
     model = BearingRangeModel(range_sigma=0.3, bearing_sigma=0.05)
