@@ -31,7 +31,7 @@ from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
-from factorgraph_loc.readers import Dataset, describe, load, write_log, write_native
+from factorgraph_loc.readers import Dataset, describe, load, read_log, write_log, write_native
 from factorgraph_loc.readers.native import require_new
 from factorgraph_loc.rig import write_rig
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
@@ -50,7 +50,6 @@ __all__ = [
     "features",
     "images",
     "info",
-    "load",
     "map",
     "report",
     "run",
@@ -85,7 +84,7 @@ def info(log: LogLike) -> Inspection:
 def convert(log: LogLike, out: str | Path, *, format: Literal["csv", "parquet"] = "csv") -> None:
     """Write a log in the native format into a new folder, with tables of ``format``, or, where ``out`` ends with .bag, .mcap or
     .db3, as a ROS bag."""
-    write_log(_one(log), Path(out), format=format)
+    write_log(_one(log), out, format=format)
 
 
 def run(
@@ -315,18 +314,13 @@ def _one(log: LogLike) -> Log:
     """A log, or the one that a name stands for."""
     if isinstance(log, Log):
         return log
-    loaded = load(str(log))
-    if len(loaded) > 1:
-        raise InputError(
-            f"{log} stands for {len(loaded)} logs, expected one: {', '.join(found.name for found in loaded)}"
-        )
-    return loaded[0]
+    return read_log(log)
 
 
 def _all(logs: LogLike | Sequence[LogLike]) -> list[Log]:
     """Logs, and those that names stand for."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
-    return [one for log in several for one in ([log] if isinstance(log, Log) else load(str(log)))]
+    return [one for log in several for one in ([log] if isinstance(log, Log) else load(log))]
 
 
 def _score(log: Log) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from factors.rfid import GridModel
 LARGEST = 20.0  # of a logit: beyond it a probability is 0 or 1 to nine digits, and nothing could ever move it
 
 
-def read_grid(path: Path) -> GridModel:
+def read_grid(path: str | Path) -> GridModel:
     """Read a grid; logits that are infinite (a probability of exactly 0 or 1) are taken as very large ones.
 
     InputError names what is missing or has a wrong shape.
@@ -43,9 +43,9 @@ def read_grid(path: Path) -> GridModel:
     return GridModel(bounded, float(origin[0]), float(origin[1]), float(found["cell"].item()), heights)
 
 
-def write_grid(grid: GridModel, path: Path) -> None:
+def write_grid(grid: GridModel, path: str | Path) -> None:
     """Write a grid at once or not at all."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
             logits=grid.logits,

@@ -253,8 +253,9 @@ class Rig(FileModel):
         return 0.0 if settings is None else float(settings.time_offset)
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: str | Path) -> Rig:
     """Read ``NAME.rig.toml``; InputError names file, key and what is expected. Grids are looked for beside it."""
+    path = Path(path)
     return placed(parse_model(Rig, read_toml(path), path), path.parent)
 
 
@@ -266,8 +267,9 @@ def placed(rig: Rig, folder: Path) -> Rig:
     return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
 
-def write_rig(rig: Rig, path: Path) -> None:
+def write_rig(rig: Rig, path: str | Path) -> None:
     """Write ``NAME.rig.toml``, and its grids beside it."""
+    path = Path(path)
     for model in (rig.rfid.models if rig.rfid else {}).values():
         if isinstance(model, GridSettings) and model.path().resolve() != (path.parent / model.file).resolve():
             write_grid(model.model(), path.parent / model.file)

@@ -53,12 +53,12 @@ class Trajectory:
         return out
 
 
-def read_tum(path: Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
+def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
     """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
 
     InputError names file and row of what is not so, and of a stamp that is not after the one before.
     """
-    rows, t_ns, poses = read_tum_rows(path)
+    rows, t_ns, poses = read_tum_rows(Path(path))
     stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
     if len(stuck):
         i = int(stuck[0])
@@ -99,7 +99,7 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
     return np.array(rows, dtype=np.int64), np.array(stamps, dtype=np.int64), np.column_stack((x, y, heading))
 
 
-def write_tum(trajectory: Trajectory, path: Path, t0_ns: int = 0) -> None:
+def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
     """Write a TUM file with absolute stamps in decimal seconds."""
     rows = []
     for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
@@ -107,7 +107,7 @@ def write_tum(trajectory: Trajectory, path: Path, t0_ns: int = 0) -> None:
         sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
         qz, qw = np.sin(heading / 2.0), np.cos(heading / 2.0)
         rows.append(f"{sign}{whole}.{fraction:09d} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
-    write_text(path, "".join(rows))
+    write_text(Path(path), "".join(rows))
 
 
 def nanoseconds(stamp: str) -> int:

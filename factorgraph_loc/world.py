@@ -109,8 +109,9 @@ class World(FileModel):
         return np.array([(m.x, m.y) for m in self.landmarks.values()]).reshape(-1, 2)
 
 
-def read_world(path: Path) -> World:
+def read_world(path: str | Path) -> World:
     """Read ``NAME.world.toml``; InputError names file, key and what is expected."""
+    path = Path(path)
     return parse_world(read_toml(path), path, path.parent)
 
 
@@ -175,9 +176,10 @@ def _tags(path: Path, rows: Sequence[int], epcs: Sequence[str], numbers: Mapping
     return tags
 
 
-def write_world(world: World, path: Path) -> None:
+def write_world(world: World, path: str | Path) -> None:
     """Write ``NAME.world.toml``, the tags beside it as ``NAME.tags.csv``, or in the same file where one has a covariance, and the
     points as ``NAME.points.parquet``."""
+    path = Path(path)
     content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
     base = path.name.removesuffix(".toml").removesuffix(".world")
     if world.tags and all(tag.covariance is None for tag in world.tags.values()):

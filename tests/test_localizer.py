@@ -10,22 +10,23 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.prior import resolve_prior
-from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.measurements import (
+from factorgraph_loc import (
     BearingRange,
     CameraFrame,
     IncrementOdometry,
+    InputError,
     PixelSightings,
+    RfidRead,
     RfidScan,
+    Rig,
     Tick,
     Twist,
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.pushed import RfidRead, scan_of
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.pushed import scan_of
 from factors import se2
 
 SENSORS = ("odometry", "rfid", "bearing_range")

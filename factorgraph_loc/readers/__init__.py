@@ -1,6 +1,6 @@
 """Readers: one module per log format, and ``load``, which finds the right one."""
 
-from factorgraph_loc.readers.load import load
+from factorgraph_loc.readers.load import load, read_log
 from factorgraph_loc.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
 from factorgraph_loc.readers.native import write_native
 from factorgraph_loc.readers.registry import READERS
@@ -14,6 +14,7 @@ __all__ = [
     "describe",
     "load",
     "manifests",
+    "read_log",
     "read_manifest",
     "verify",
     "write_log",

@@ -41,13 +41,13 @@ class _Source:
 
 
 def load(
-    log: str,
+    log: str | Path,
     *,
     data_root: Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
-    rig: Path | None = None,
-    world: Path | None = None,
+    rig: str | Path | None = None,
+    world: str | Path | None = None,
 ) -> list[Log]:
     """The logs that ``log`` names.
 
@@ -57,7 +57,7 @@ def load(
     below the manifest's own folder, by default the environment's FGLOC_DATA. InputError names what is wrong in one line.
     """
     given = dict(options or {})
-    source = _find(log, data_root, reader)
+    source = _find(str(log), data_root, reader)
     choices = {key: _choices(value) for key, value in source.options.items()}
     # the command line gives a list as text with commas
     choices |= {
@@ -80,6 +80,22 @@ def load(
         _read(replaced, dict(zip(choices, values, strict=True)), naming)
         for values in itertools.product(*choices.values())
     ]
+
+
+def read_log(
+    log: str | Path,
+    *,
+    data_root: Path | None = None,
+    reader: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    rig: str | Path | None = None,
+    world: str | Path | None = None,
+) -> Log:
+    """The one log that ``log`` names, which is what :func:`load` takes; InputError if it names several."""
+    logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
+    if len(logs) > 1:
+        raise InputError(f"{log} stands for {len(logs)} logs, expected one: {', '.join(found.name for found in logs)}")
+    return logs[0]
 
 
 def _choices(value: Any) -> list[Any]:

@@ -196,13 +196,14 @@ def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
 
 
-def write_native(log: Log, folder: Path, format: Literal["csv", "parquet"] = "csv") -> None:
+def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv") -> None:
     """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
     written, and of a start's deviations in x and y only the larger one. Images are links to those of ``log`` where the file
     system has links; features that were found in images, motion in space and a second camera cannot be written: InputError.
     """
+    folder = Path(folder)
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))

@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.rig import write_rig
-from factorgraph_loc.world import write_world
 
 ROOT = Path(__file__).parents[2]
 REPLAY, NODE = ROOT / "scripts/example_live", ROOT / "scripts/ros2_node_example"
@@ -30,8 +28,8 @@ def log():
 @pytest.fixture
 def robot(log, tmp_path, monkeypatch):
     """A folder with a robot's rig and map, in which we are."""
-    write_rig(log.rig, tmp_path / "robot.rig.toml")
-    write_world(log.world, tmp_path / "hall.world.toml")
+    fgloc.write_rig(log.rig, tmp_path / "robot.rig.toml")
+    fgloc.write_world(log.world, tmp_path / "hall.world.toml")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
