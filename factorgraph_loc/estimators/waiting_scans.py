@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from factorgraph_loc.estimators import tags
 from factorgraph_loc.estimators.base import Diagnostics
@@ -42,9 +43,13 @@ class WaitingScans:
 
     def update(self, m: RfidScan, looks: Looks, pose: Array, covariance: Array) -> TagUpdate | None:
         """What the :meth:`factors` of a scan make of a pose (3,) with body-frame covariance (3, 3); they wait from now on. None in
-        a silence, which is no evidence."""
-        factors = self.factors(m, looks)
-        update = tags.updated(factors, pose, covariance)
+        a silence, which is no evidence.
+
+        What is told of the innovation, and the evidence, are those of what was read and not read: other places are judged by that
+        alone, in a :class:`~factorgraph_loc.estimators.seeker.Seeker`.
+        """
+        detection, *strengths = factors = self.factors(m, looks)
+        update = tags.updated([detection], pose, covariance)
         self._diagnostics.innovation("rfid", m.t, update.nis, update.dof)
         lasted = self._silence.lasts
         if self._silence.add(int(looks.hits.sum()), update.evidence):
@@ -53,6 +58,9 @@ class WaitingScans:
                 self._diagnostics.events.append((m.t, Silence.EVENT))
             return None
         self._waiting += factors
+        if strengths:
+            placed = tags.updated(strengths, update.pose, update.covariance)
+            update = replace(update, pose=placed.pose, covariance=placed.covariance)
         return update
 
     def update_by_phases(

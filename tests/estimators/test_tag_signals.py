@@ -10,6 +10,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.tag_signals import TagSignals
 from factorgraph_loc.estimators.tags import KnownTags
+from factorgraph_loc.estimators.waiting_scans import WaitingScans
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.rfid_settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
@@ -87,6 +88,23 @@ def test_sensors_that_are_not_asked_for_tell_nothing():
     kept = signals(("odometry", "rfid"))
     assert not kept.keep(scan(0.0, "a"))
     assert kept.strengths(scan(0.0, "a")) is None
+
+
+def test_strengths_place_the_robot_but_are_no_evidence():
+    """Other places are judged by what was read and not read: what the track is judged by must be the same."""
+    rfid = RfidSettings(antennas={"ahead": AntennaSettings()}, rssi=STRENGTH)
+    pose, covariance = np.zeros(3), np.diag((0.3, 0.3, 0.2)) ** 2
+    found = {}
+    for sensors in (SENSORS[:2], SENSORS[:3]):
+        setup = Setup(Rig(rfid=rfid), WORLD, sensors, np.random.default_rng(1))
+        scans, m = WaitingScans(setup, Diagnostics()), scan(0.5, "a", rssi=-45.0)
+        looks = scans.tags.looks(m)
+        found[sensors] = scans.update(m, looks, pose, covariance)
+    without, with_strength = found.values()
+    assert with_strength.evidence == pytest.approx(without.evidence)
+    assert with_strength.surprise == pytest.approx(without.surprise)
+    # twice as strong as from where the robot was thought to be: nearer to the tag
+    assert with_strength.pose[0] > without.pose[0] + 1e-3
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
