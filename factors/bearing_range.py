@@ -21,6 +21,7 @@ from factors.se2 import Array
 # the constants of a sensor that can be estimated: those of its model, and how much later it saw than its stamp says [s]
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
+EXACT = np.empty((0, 2, 2))  # covariances of points that are known exactly
 MINIMUM_COSINE = 0.1  # no sensor that measures depth sees farther to the side
 
 
@@ -282,18 +283,26 @@ def log_likelihood(
     ranges: Array,
     bearings: Array,
     parameters: Array | None = None,
+    point_covariances: Array | None = None,
 ) -> Array:
     """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3).
 
     ``parameters`` (N, 6): changes of :data:`PARAMETERS`, as in :func:`recalibrated`, of each pose's own sensor.
+    ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise, at each pose by what they do to range and bearing
+    from there.
     """
     changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
     constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
     noise = (model.range_sigma, model.range_sigma_relative, model.bearing_sigma)
     squared = np.empty((len(poses), len(points)))
-    _squared(poses, constants, model.mounting[2], noise, model.depth, points, ranges, bearings, squared)
-    loss: Array = np.sum(robust_loss(squared, model.robust), axis=-1)
-    return -loss
+    sensor = (model.mounting[2], noise, model.depth)
+    if point_covariances is None:
+        _squared(poses, constants, *sensor, points, ranges, bearings, EXACT, squared, np.empty((0, 0)))
+        return -np.asarray(np.sum(robust_loss(squared, model.robust), axis=-1))
+    widths = np.empty_like(squared)
+    spreads = np.ascontiguousarray(point_covariances, dtype=float)
+    _squared(poses, constants, *sensor, points, ranges, bearings, spreads, squared, widths)
+    return -np.asarray(np.sum(robust_loss(squared, model.robust) + widths, axis=-1))
 
 
 @numba.njit(cache=True)
@@ -306,9 +315,15 @@ def _squared(
     points: Array,
     ranges: Array,
     bearings: Array,
+    spreads: Array,
     squared: Array,
+    widths: Array,
 ) -> None:
-    """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5)."""
+    """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5).
+
+    Where points have ``spreads`` (K, 2, 2), with the noise that is wider by these, and ``widths`` (N, K): the logarithm of by how
+    much, in standard deviations of range and bearing together.
+    """
     range_sigma, range_sigma_relative, bearing_sigma = noise
     for i in range(len(poses)):
         c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
@@ -318,5 +333,21 @@ def _squared(
         for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
             sx, sy = c * dx + s * dy - x, c * dy - s * dx - y
-            errors = _seen(sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k])
-            squared[i, k] = errors[0] ** 2 + errors[1] ** 2
+            range_error, bearing_error, distance, vx, vy, weight = _seen(
+                sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
+            )
+            squared[i, k] = range_error**2 + bearing_error**2
+            if len(spreads):
+                # by the point, in the robot's axes: the range grows along v, the bearing across the line of sight
+                by_range = range_scale * weight
+                by_bearing = 0.0 if math.isnan(bearings[k]) else 1.0 / (distance * bearing_sigma)
+                ax, ay = by_range * (c * vx - s * vy), by_range * (s * vx + c * vy)
+                bx, by = by_bearing * (-s * sx - c * sy) / distance, by_bearing * (c * sx - s * sy) / distance
+                xx, xy, yy = spreads[k, 0, 0], spreads[k, 0, 1], spreads[k, 1, 1]
+                rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
+                rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
+                bb = 1.0 + bx * (xx * bx + xy * by) + by * (xy * bx + yy * by)
+                determinant = rr * bb - rb * rb
+                mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
+                squared[i, k] = mixed / determinant
+                widths[i, k] = 0.5 * math.log(determinant)

@@ -13,6 +13,7 @@ from factors.bearing_range import (
     TIME_OFFSET,
     BearingRangeModel,
     located,
+    log_likelihood,
     recalibrated,
     robust_loss,
     robust_weight,
@@ -60,6 +61,12 @@ class BearingRangeFactor:
         """The robust loss."""
         error, _ = self.whitened(values)
         return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
+
+    def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
+        """The log-likelihood (N,) of ``poses`` (N, 3) at the time of the look, up to a constant, each with its own ``parameters``
+        (N, 6) of the sensor; see :func:`~factors.bearing_range.log_likelihood`."""
+        seen = self.points, self.ranges, self.bearings
+        return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances)
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""

@@ -82,7 +82,7 @@ class LandmarkTracker:
     def log_likelihood(self, seen: BearingRangeFactor, cloud: Cloud) -> Array:
         """Of the particles (N,), each with its own constants."""
         changes = self._constants.full(cloud.constants[:, self._part], len(bearing_range.PARAMETERS))
-        return bearing_range.log_likelihood(seen.model, cloud.poses, seen.points, seen.ranges, seen.bearings, changes)
+        return seen.log_likelihood(cloud.poses, changes)
 
     def averaged(self, seen: BearingRangeFactor, cloud: Cloud) -> Cloud:
         """The same cloud with its averages of the likelihood, over many and over few stamps, after this one."""

@@ -36,7 +36,7 @@ from factorgraph_loc.measurements import BearingRange, RfidScan
 from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.simulation.free_space import CELL, FreeSpace
 from factorgraph_loc.trajectory import Trajectory
-from factors import bearing_range, se2
+from factors import se2
 from factors.odometry import Increment
 from factors.se2 import Array
 
@@ -107,10 +107,7 @@ class ActiveMcl(Filter):
     def _update(self, m: BearingRange) -> None:
         seen = self._landmarks.factor(m)
         if seen is not None:
-            self._state = self._tempered(
-                self._state,
-                lambda poses: bearing_range.log_likelihood(seen.model, poses, seen.points, seen.ranges, seen.bearings),
-            )
+            self._state = self._tempered(self._state, seen.log_likelihood)
 
     def _scan(self, m: RfidScan) -> None:
         self._state = self._weighed(self._state, m)

@@ -181,3 +181,22 @@ def test_a_heading_rate_bias_is_learnt_by_all_that_estimate_it():
 
 
 FOUR = np.array([(6.0, 0.0), (0.0, 6.0), (-6.0, 0.0), (0.0, -6.0)])
+
+
+@pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother"])
+def test_one_look_is_no_better_than_the_map(name):
+    """Five landmarks, each surveyed to 0.3 m, tell x and y to 0.3 / sqrt(5) m, however good the sensor is.
+
+    5000 particles tell a standard deviation to 1 % (one sigma); the noise of sensor and prior adds less than 2 %.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, 5, endpoint=False)
+    places = 4.0 * np.column_stack((np.cos(angles), np.sin(angles)))
+    landmarks = {f"l{i}": Landmark(x=x, y=y, sigma=0.3) for i, (x, y) in enumerate(places.tolist())}
+    rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.03, bearing_sigma=0.01, robust=100.0))
+    estimator = make(name, rig, World(landmarks=landmarks))
+    estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag((1.0, 1.0, 0.3)) ** 2))
+    estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
+    estimator.process(BearingRange(0.0, tuple(landmarks), np.full(5, 4.0), se2.wrap(angles)))
+    found = np.sqrt(np.diag(estimator.estimate().covariance))
+    np.testing.assert_allclose(found[:2], 0.3 / np.sqrt(5.0), rtol=0.08)
+    assert found[2] == pytest.approx(0.3 / 4.0 / np.sqrt(5.0), rel=0.1)

@@ -274,6 +274,27 @@ def test_each_particle_has_the_likelihood_of_its_own_sensor(model, seed):
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
 
+@given(models, st.integers(0, 10_000))
+def test_the_likelihood_of_particles_knows_how_sure_the_map_is(model, seed):
+    rng = np.random.default_rng(seed)
+    seen, particles = rng.uniform(-8.0, 8.0, (4, 2)), rng.uniform(-3.0, 3.0, (3, 3))
+    ranges, bearings = rng.uniform(0.2, 9.0, 4), rng.uniform(-3.1, 3.1, 4)
+    ranges[1] = bearings[2] = np.nan
+    roots = rng.normal(size=(4, 2, 2))
+    spreads = roots @ roots.transpose(0, 2, 1)
+    spreads[3] = 0.0
+    expected = []
+    for particle in particles:
+        error = residuals(model, particle, seen, ranges, bearings)
+        by_point = jacobians(model, particle, seen)[1] / sigmas(model, ranges)[..., None]
+        by_point[1, 0] = by_point[2, 1] = 0.0
+        noise = np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(noise), error)
+        expected.append(-np.sum(robust_loss(squared, model.robust) + 0.5 * np.linalg.slogdet(noise)[1]))
+    found = log_likelihood(model, particles, seen, ranges, bearings, None, spreads)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+
+
 def test_a_custom_factor_that_fails_is_silent_and_says_so():
     factor = BearingRangeFactor(BearingRangeModel(), np.array(((1.0, 2.0),)), np.array((2.0,)), np.array((0.1,)))
     failures: list[str] = []
