@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from factorgraph_loc.calibration.tag_looks import TagLooks
 from factorgraph_loc.calibration.tag_refinement import reach
 from factorgraph_loc.calibration.tag_search import Found, search
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.base import Diagnostics, LearntPoint, PosePrior
+from factorgraph_loc.estimators.marginals import IndeterminateError
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, Values, landmark_key, pose_key
@@ -147,8 +149,12 @@ class _Way:
 
     def result(self, found: list[Found]) -> TagSlam:
         tags = np.flatnonzero(self.mapped & ~self._known).tolist()
-        covariances = self._problem().covariances(self._values, [landmark_key(i) for i in tags])
-        learnt = {i: LearntPoint(self._values[landmark_key(i)], covariances[landmark_key(i)]) for i in tags}
+        keys = [landmark_key(i) for i in tags]
+        try:
+            covariances = self._problem().covariances(self._values, keys).by_key
+        except IndeterminateError as error:
+            raise RunFailedError(f"{len(tags)} tags were located, but the reads do not determine how well") from error
+        learnt = {i: LearntPoint(self._values[key], covariances[key]) for i, key in zip(tags, keys, strict=True)}
         return TagSlam(self.t, self._poses(), learnt, self._facing, found)
 
     def _poses(self) -> Array:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.base import (
     Belief,
     Diagnostics,
@@ -23,6 +24,7 @@ from factorgraph_loc.estimators.base import (
 )
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt, between_keyframes
 from factorgraph_loc.estimators.kept import Kept
+from factorgraph_loc.estimators.marginals import IndeterminateError, blamed, damped
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.estimators.problem import Problem
@@ -34,6 +36,9 @@ from factorgraph_loc.estimators.variables import (
     SENSOR_KEY,
     Node,
     Values,
+    index_of,
+    is_point,
+    is_pose,
     landmark_key,
     pose_key,
 )
@@ -73,6 +78,7 @@ class KeyframeGraph(ABC):
         self._keyframes: Kept[Keyframe] = Kept()
         self._keyframe_times: Kept[float] = Kept()
         self._ticks: list[TickAt] = []
+        self._damping = 0.0  # the largest that covariances were computed with
         self._t = -math.inf
         self._prior: PosePrior | None = None
         # of the newest keyframe: pose and body-frame covariance
@@ -252,10 +258,41 @@ class KeyframeGraph(ABC):
 
     def _settle(self, problem: Problem, values: Values) -> Array:
         """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""
-        covariances = problem.covariances(values, values)
+        try:
+            found = problem.covariances(values, values)
+        except IndeterminateError as error:
+            raise self._unsolved(error) from error
+        self._report_damping(found.damping)
         for key in self._constants:
-            self._constants[key], self._spreads[key] = values[key], covariances[key]
-        return np.array([covariances[k.key] for k in self._keyframes])
+            self._constants[key], self._spreads[key] = values[key], found.by_key[key]
+        return np.array([found.by_key[k.key] for k in self._keyframes])
+
+    def _report_damping(self, damping: float) -> None:
+        if damping > self._damping:
+            self._damping = damping
+            self.diagnostics.events.append((self._t, damped(damping)))
+
+    def _unsolved(self, error: RuntimeError) -> RunFailedError:
+        """What a user is told where the graph cannot be solved: when, and which variable is to blame."""
+        return RunFailedError(f"the graph cannot be solved at {self._t:.3f} s: {self._reason(error)}")
+
+    def _reason(self, error: RuntimeError) -> str:
+        """An error of the solver, or of GTSAM's, in one line."""
+        key = blamed(error)
+        if key is None:
+            return str(error).strip().splitlines()[0]
+        return f"the measurements do not determine {self._named(key)}"
+
+    def _named(self, key: int) -> str:
+        """A variable in words."""
+        if is_pose(key):
+            return f"the pose at {self._keyframe_times[index_of(key)]:.3f} s"
+        names = {ODOMETRY_KEY: "odometry", SENSOR_KEY: "sensor of landmarks", CAMERA_KEY: "camera"}
+        if key in names:
+            return f"the constants of the {names[key]}"
+        if is_point(key):
+            return f"point {index_of(key)}"
+        return f"the landmark {list(self._places)[index_of(key)]}"
 
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""

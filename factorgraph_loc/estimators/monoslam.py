@@ -243,8 +243,7 @@ class Monoslam(Filter):
         noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
         self._report(m, residual, innovation, sights.noise)
         tempering = np.ones(len(residual))
-        if isinstance(m, CameraFrame):
-            tempering[len(match.mapped) :] = eye.model.tempering
+        tempering[len(match.mapped) :] = match.tempering
         delta, root, spread = zero, np.empty(0), np.empty(0)
         for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
             if i:

@@ -30,8 +30,9 @@ FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree on a place wi
 @dataclass(frozen=True)
 class Match:
     """Pixels (K, 2) that are taken, of the points ``mapped`` of the state, then of ``points`` (P, 3) of the map with covariances
-    ``spreads`` (P, 3, 3). ``taken``: rows of the image that they stand in, rejected ones too. ``expected``: points of the state
-    that should have been found. ``wanted``: 0 where so little was expected that nothing follows if nothing is found."""
+    ``spreads`` (P, 3, 3) and a likelihood of the exponent ``tempering``. ``taken``: rows of the image that they stand in, rejected
+    ones too. ``expected``: points of the state that should have been found. ``wanted``: 0 where so little was expected that nothing
+    follows if nothing is found."""
 
     pixels: Array
     mapped: tuple[int, ...]
@@ -40,6 +41,7 @@ class Match:
     taken: frozenset[int]
     expected: tuple[int, ...]
     wanted: int
+    tempering: float = 1.0
 
 
 class Looker:
@@ -123,7 +125,8 @@ class Looker:
         known, wanted = self._known(m, state, eye)
         ours = self._agreeing(m.pixels, ours, state, eye)
         in_map = {f for f, _ in known}
-        return self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
+        match = self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
+        return replace(match, tempering=eye.model.tempering)
 
     def relocated(self, m: PixelSightings | CameraFrame, eye: Eye) -> CameraPose | None:
         """Where the camera is by this image and the map alone; None where that does not tell."""

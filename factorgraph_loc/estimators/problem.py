@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from factorgraph_loc.estimators.marginals import Covariances, covariances
 from factorgraph_loc.estimators.variables import Values, gather, retract, to_gtsam
 from factors.graph import Factor, jacobian_factor
-from factors.se2 import Array
 
 MAX_ITERATIONS = 100
 CONVERGED_GAIN = 1e-6  # of the cost
@@ -69,7 +69,7 @@ class Problem:
                 continue
             moved = {key: retract(key, value, step.at(key)) for key, value in values.items()}
             new_cost = self.cost(moved)
-            if new_cost > cost:
+            if not (math.isfinite(new_cost) and new_cost <= cost):
                 damping *= 10.0
                 continue
             gained = cost - new_cost
@@ -79,14 +79,14 @@ class Problem:
         return Solution(values, cost, iteration)
 
     def cost(self, values: Values) -> float:
-        """The robust cost, infinite where one of GTSAM's factors throws."""
-        ours = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
-        if not self._graph.size():
-            return ours
-        try:
-            return ours + float(self._graph.error(to_gtsam(values)))
-        except RuntimeError:
-            return math.inf
+        """The robust cost, infinite where one of GTSAM's factors throws and where it is not a number."""
+        cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
+        if self._graph.size():
+            try:
+                cost += float(self._graph.error(to_gtsam(values)))
+            except RuntimeError:
+                return math.inf
+        return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised with their robust weights."""
@@ -97,7 +97,6 @@ class Problem:
             graph.push_back(self._graph.linearize(to_gtsam(values)))
         return graph
 
-    def covariances(self, values: Values, keys: Iterable[int]) -> dict[int, Array]:
-        """Marginal covariances of variables at a solution, poses in the body frame."""
-        marginals = gtsam.Marginals(self.linearize(values), to_gtsam(values))
-        return {key: marginals.marginalCovariance(key) for key in keys}
+    def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
+        """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""
+        return covariances(self.linearize(values), {key: len(value) for key, value in values.items()}, list(keys))

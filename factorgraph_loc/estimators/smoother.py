@@ -17,9 +17,9 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.kept import Kept
+from factorgraph_loc.estimators.marginals import IndeterminateError, covariances
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window, read_all
@@ -92,9 +92,12 @@ class Smoother(RelocatingGraph):
             values = {k.key: self._solver.value(k.key) for k in self._keyframes}
             return self._optimum(values | {key: self._solver.value(key) for key in self._constants})
         else:
-            for key in self._constants:
-                self._constants[key], self._spreads[key] = self._marginal(key)
-            estimates = [*self._left, *(self._marginal(k.key) for k in self._keyframes[len(self._left) :])]
+            try:
+                for key in self._constants:
+                    self._constants[key], self._spreads[key] = self._marginal(key)
+                estimates = [*self._left, *(self._marginal(k.key) for k in self._keyframes[len(self._left) :])]
+            except RuntimeError as error:
+                raise self._unsolved(error) from error
         return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
 
     def _optimum(self, start: Values) -> tuple[Array, Array]:
@@ -105,13 +108,15 @@ class Smoother(RelocatingGraph):
         return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
 
     def _begin(self, first: Keyframe) -> None:
-        self._filtered.append((self._pose, self._covariance))
-        self._start_again(first)
+        self._begin_again(first)
 
     def _begin_again(self, newest: Keyframe) -> None:
         del self._filtered[newest.index :]
         self._filtered.append((self._pose, self._covariance))
-        self._start_again(newest)
+        try:
+            self._start_again(newest)
+        except RuntimeError as error:
+            raise self._unsolved(error) from error
 
     def _pose_of(self, keyframe: int) -> Array:
         return self._filtered[keyframe][0]
@@ -155,8 +160,8 @@ class Smoother(RelocatingGraph):
             self._check_jump(newest)
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
-            self.diagnostics.events.append((newest.t, f"solver rebuilt: {str(error).strip().splitlines()[0]}"))
-            self._rebuild(newest, error)
+            self.diagnostics.events.append((newest.t, f"solver rebuilt: {self._reason(error)}"))
+            self._rebuild(newest)
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
@@ -181,15 +186,23 @@ class Smoother(RelocatingGraph):
             if key in (ODOMETRY_KEY, SENSOR_KEY) or is_point(key):
                 value = self._solver.value(key)
                 if not np.all(np.isfinite(value)):
-                    raise RuntimeError("the solution is not finite")
+                    raise IndeterminateError(key)
                 self._constants[key] = value
             else:
                 self._constants[key], self._spreads[key] = self._marginal(key)
 
     def _marginal(self, key: int) -> tuple[Array, Array]:
-        value, covariance = self._solver.value(key), self._solver.covariance(key)
-        if not np.all(np.isfinite(value)) or not np.all(np.isfinite(covariance)):
-            raise RuntimeError("the solution is not finite")
+        value = self._solver.value(key)
+        if not np.all(np.isfinite(value)):
+            raise IndeterminateError(key)
+        try:
+            covariance = self._solver.covariance(key)
+        except RuntimeError:
+            covariance = np.full(1, np.nan)
+        if not np.all(np.isfinite(covariance)):
+            found = covariances(*self._solver.linear(), (key,))
+            self._report_damping(found.damping)
+            covariance = found.by_key[key]
         return value, covariance
 
     def _leave(self, now: float, constants: Iterable[int]) -> None:
@@ -225,20 +238,22 @@ class Smoother(RelocatingGraph):
                 self._departed[0][key], self._departed[1][key] = self._constants[key], self._spreads[key]
             del self._constants[key], self._spreads[key]
 
-    def _rebuild(self, newest: Keyframe, error: RuntimeError) -> None:
-        """A new solver after the old one failed, from what that told before; then without what may throw."""
+    def _rebuild(self, newest: Keyframe) -> None:
+        """A new solver after the old one failed, from what that told before; then without what may throw. RunFailedError where
+        nothing helps."""
+        failure = RuntimeError()
         near = read_all(self._last, [*(k.key for k in self._keyframes), *self._constants])
         for throws in (True, False, False):
             try:
                 self._start_again(newest, near, throws=throws)
-            except RuntimeError as again:
-                error = again
+            except RuntimeError as error:
+                failure = error
             else:
                 return
             if not throws and newest.nodes:
                 self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", len(newest.nodes))
                 newest.nodes.clear()
-        raise RunFailedError(f"the graph cannot be solved at {newest.t:.3f} s: {error}") from error
+        raise self._unsolved(failure) from failure
 
     def _start_again(self, newest: Keyframe, near: Mapping[int, Array] = NOWHERE, throws: bool = False) -> None:
         """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that

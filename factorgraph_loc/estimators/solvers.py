@@ -7,7 +7,8 @@ are few variables, and callbacks are cheap.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Protocol, cast
 
 import gtsam
@@ -39,6 +40,9 @@ class Solver(Protocol):
     def estimates(self) -> gtsam.Values:
         """Estimates of all variables, to be :func:`read_all` if they are needed."""
 
+    def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
+        """All factors, linearised where the solver has them, and the sizes of their variables by key."""
+
 
 class FullHistory:
     """Everything stays in the graph."""
@@ -57,7 +61,8 @@ class FullHistory:
             else:
                 new.append(_Linear(node, graph.size(), self._point(node.keys, values)))
                 graph.add(new[-1].linearize())
-        slots = self._isam.update(graph, to_gtsam(values)).getNewFactorsIndices()
+        with _gtsam():
+            slots = self._isam.update(graph, to_gtsam(values)).getNewFactorsIndices()
         for linear in new:
             linear.slot = slots[linear.slot]
         self._ours += new
@@ -73,6 +78,9 @@ class FullHistory:
 
     def estimates(self) -> gtsam.Values:
         return self._isam.calculateEstimate()
+
+    def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
+        return _linear(self._isam)
 
     def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
         """Values of the variables: as given in ``values``, else as the solver estimates them."""
@@ -93,7 +101,8 @@ class FullHistory:
                 changed.append(linear)
                 graph.add(linear.linearize())
         if changed:
-            new = self._isam.update(graph, gtsam.Values(), slots).getNewFactorsIndices()
+            with _gtsam():
+                new = self._isam.update(graph, gtsam.Values(), slots).getNewFactorsIndices()
             for linear, slot in zip(changed, new, strict=True):
                 linear.slot = slot
 
@@ -115,7 +124,8 @@ class Window:
         # what is constant never leaves the window, points do when they are seen no more
         stamps |= dict.fromkeys((key for key in self._sizes if not is_point(key)), t)
         stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
-        self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
+        with _gtsam():
+            self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
     def value(self, key: int) -> Array:
         return read(self._smoother, key)
@@ -125,6 +135,9 @@ class Window:
 
     def estimates(self) -> gtsam.Values:
         return self._smoother.calculateEstimate()
+
+    def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
+        return _linear(self._smoother.getISAM2())
 
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""
@@ -162,6 +175,21 @@ class _Linear:
             elif np.abs(change).max() > MOVED:
                 return True
         return False
+
+
+@contextmanager
+def _gtsam() -> Iterator[None]:
+    """Whatever GTSAM throws as RuntimeError."""
+    try:
+        yield
+    except (IndexError, ValueError) as error:
+        raise RuntimeError(str(error)) from error
+
+
+def _linear(isam: gtsam.ISAM2) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
+    at = isam.getLinearizationPoint()
+    sizes = {key: 3 if is_pose(key) else len(at.atVector(key)) for key in at.keys()}  # noqa: SIM118
+    return isam.getFactorsUnsafe().linearize(at), sizes
 
 
 def read_all(values: gtsam.Values, keys: Iterable[int]) -> Values:

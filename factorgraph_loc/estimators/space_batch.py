@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators.base import PoseEstimate, PosePrior
+from factorgraph_loc.estimators.marginals import IndeterminateError, covariances, damped
 from factorgraph_loc.estimators.monoslam import Monoslam, MonoslamSettings
 from factorgraph_loc.estimators.monoslam_sighting import Match
 from factorgraph_loc.estimators.monoslam_state import Eye, squared
@@ -40,24 +41,27 @@ class SpaceBatchSettings(MonoslamSettings):
 
 @dataclass(frozen=True)
 class _Image:
-    """What one camera saw at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3)."""
+    """What one camera saw at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); ``tempering``:
+    exponent of their likelihood."""
 
     t: float
     eye: Eye
     pixels: Array
     points: Array
     spreads: Array | None
+    tempering: float
 
     def linearize(self, pose: gtsam.Pose3) -> tuple[Array, Array]:
         """Whitened, robustly weighted residual (2K,) and Jacobian (2K, 6) by the pose."""
         error, whitener, jacobian = self._whitened(pose)
-        weight = np.sqrt(huber_weight(np.sum(error**2, axis=1), self.eye.model.robust))
+        weight = np.sqrt(self.tempering * huber_weight(np.sum(error**2, axis=1), self.eye.model.robust))
         return (weight[:, None] * error).ravel(), (weight[:, None, None] * (whitener @ jacobian)).reshape(-1, 6)
 
     def cost(self, pose: gtsam.Pose3) -> float:
-        """The robust loss."""
+        """The robust loss, tempered."""
         sights = self.eye.known(_robot(pose), self.points, self.spreads)
-        return float(np.sum(huber_loss(squared(sights.pixels - self.pixels, sights.noise), self.eye.model.robust)))
+        losses = huber_loss(squared(sights.pixels - self.pixels, sights.noise), self.eye.model.robust)
+        return self.tempering * float(np.sum(losses))
 
     def _whitened(self, pose: gtsam.Pose3) -> tuple[Array, Array, Array]:
         sights = self.eye.known(_robot(pose), self.points, self.spreads)
@@ -108,21 +112,32 @@ class SpaceBatch(Monoslam):
         images = [(int(np.searchsorted(t, image.t)), image) for image in self._images.values()]
         motion = self._motion_graph(t)
         values, linear = _solved(motion, images, values)
-        marginals = gtsam.Marginals(linear, values)
         ticks = np.unique(np.array(self._ticks))
         rows = np.searchsorted(t, ticks).tolist()
+        spreads = self._covariances(linear, rows, t)
         poses = [values.atPose3(i) for i in rows]
         return Trajectory3(
             ticks,
             np.array([pose.translation() for pose in poses]).reshape(-1, 3),
             np.array([pose.rotation().matrix() for pose in poses]).reshape(-1, 3, 3),
-            np.array([marginals.marginalCovariance(i) for i in rows]).reshape(-1, 6, 6),
+            np.array([spreads[i] for i in rows]).reshape(-1, 6, 6),
         )
+
+    def _covariances(self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array) -> dict[int, Array]:
+        """The covariances (6, 6) of the poses ``rows``, of those at ``t``; RunFailedError where they are not determined."""
+        try:
+            found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
+        except IndeterminateError as error:
+            what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
+            raise RunFailedError(f"space_batch: the measurements do not determine {what}") from error
+        if found.damping:
+            self.diagnostics.events.append((float(t[-1]), damped(found.damping)))
+        return found.by_key
 
     def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
         if len(match.pixels):
             key = (m.t, isinstance(m, PixelSightings) and m.right)
-            self._images[key] = _Image(m.t, eye, match.pixels, match.points, match.spreads)
+            self._images[key] = _Image(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
     def _motion_graph(self, t: Array) -> gtsam.NonlinearFactorGraph:
         assert self._prior is not None
@@ -174,7 +189,7 @@ def _solved(
             found = cost(moved)
         except RuntimeError:  # of a system that is too badly conditioned to be solved
             found = math.inf
-        if found > best:
+        if not (math.isfinite(found) and found <= best):
             damping *= 10.0
             if damping > MAX_DAMPING:
                 break

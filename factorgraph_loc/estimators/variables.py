@@ -49,6 +49,11 @@ def is_pose(key: int) -> bool:
     return key >> _CHARACTER == _POSE
 
 
+def index_of(key: int) -> int:
+    """The number of a pose, landmark or point."""
+    return key & ((1 << _CHARACTER) - 1)
+
+
 @dataclass(frozen=True)
 class Node:
     """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),

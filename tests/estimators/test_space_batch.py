@@ -12,7 +12,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import space
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log, RightSightingStream, SightingStream, TwistStream, cut
+from factorgraph_loc.log import FeatureStream, Log, RightSightingStream, SightingStream, TwistStream, cut
+from factorgraph_loc.measurements import CameraFrame
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.readers import load
 from factorgraph_loc.rig import Rig, TwistSettings
@@ -67,6 +68,31 @@ def carried(seed):
     return Log("carried", RIG, world, streams, reference3=truth)
 
 
+def with_features(log, tempering):
+    """What the left camera sees has no name, but looks like what was seen of the same point from the start."""
+    rng = np.random.default_rng(12)
+    looks = rng.standard_normal((len(POINTS), 64)).astype(np.float32)
+    rows, seen = np.arange(len(POINTS)), log.streams["sightings"]
+    points = replace(
+        PointMap.of([f"p{i}" for i in rows], POINTS),
+        feature="colour",
+        owners=rows,
+        descriptors=looks,
+        seen_from=np.zeros((len(rows), 3)),
+        sizes=np.full(len(rows), 5.0),
+    )
+    t, frames = np.unique(seen.t), []
+    for stamp in t.tolist():
+        at = np.flatnonzero(seen.t == stamp)
+        which = np.array([int(seen.point[i][1:]) for i in at])
+        pixels = np.column_stack((seen.u[at], seen.v[at]))
+        frames.append(CameraFrame(stamp, "colour", pixels, np.full(len(at), 5.0), looks[which], which))
+    camera = log.rig.camera.model_copy(update={"tempering": tempering})
+    rig = log.rig.model_copy(update={"sensors": ("twist", "camera"), "camera": camera})
+    streams = {"twist": log.streams["twist"], "camera": FeatureStream(t, frames)}
+    return replace(log, rig=rig, world=World(points=points), streams=streams)
+
+
 def estimated(log, name, sensors=None, **settings):
     return run(log, RunConfig(name, settings, sensors))
 
@@ -83,6 +109,15 @@ def test_the_batch_is_where_the_smoothed_filter_is():
     apart = space.pose_errors(smoothed, batch)
     sigmas = np.sqrt(np.array([np.diag(c) for c in batch.covariances]))
     assert np.quantile(np.abs(apart) / sigmas, 0.95) < 0.3
+    ratio = np.array([np.diag(c) for c in smoothed.covariances]) / sigmas**2
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+
+
+def test_features_of_a_map_are_tempered_in_the_batch_as_in_the_filter():
+    log = with_features(carried(1), 0.05)
+    smoothed, batch = estimated(log, "monoslam").final_space, estimated(log, "space_batch").final_space
+    sigmas = np.sqrt(np.array([np.diag(c) for c in batch.covariances]))
+    assert np.quantile(np.abs(space.pose_errors(smoothed, batch)) / sigmas, 0.95) < 0.3
     ratio = np.array([np.diag(c) for c in smoothed.covariances]) / sigmas**2
     assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
 

@@ -1,0 +1,102 @@
+"""Marginal covariances of a linear graph, also of one that hardly determines some of its variables.
+
+Cholesky loses half of the digits, and takes a long chain of dead reckoning for indeterminate; QR keeps them (Golub, van Loan,
+"Matrix Computations", section 5.3). Where that fails too each variable is held by a share of its own information, the damping.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors.se2 import Array
+
+DAMPINGS = (0.0, 1e-10, 1e-7)
+_NEAR = re.compile(r"variable\s+(\d+)")  # in what GTSAM says of an indeterminate system
+
+
+class IndeterminateError(RuntimeError):
+    """A graph does not determine its variables; ``key``: one of these, None where that is not known."""
+
+    def __init__(self, key: int | None) -> None:
+        super().__init__("the solution is not determined")
+        self.key = key
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Marginal covariances (d, d) by key, and the relative ``damping`` that they were computed with."""
+
+    by_key: dict[int, Array]
+    damping: float
+
+
+def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
+    """Marginal covariances of the variables ``keys``; IndeterminateError where no damping helps. ``sizes``: of all variables."""
+    found = _solved(graph, keys, robust=False)
+    if isinstance(found, dict):
+        return Covariances(found, 0.0)
+    for damping in DAMPINGS:
+        found = _solved(_damped(graph, sizes, damping) if damping else graph, keys, robust=True)
+        if isinstance(found, dict):
+            return Covariances(found, damping)
+    raise found
+
+
+def damped(damping: float) -> str:
+    """What the diagnostics say of a damping."""
+    return f"covariances: the graph hardly determines them, relative damping of {damping:g}"
+
+
+def blamed(error: RuntimeError) -> int | None:
+    """The variable that ours or one of GTSAM's errors names, None where it names none."""
+    if isinstance(error, IndeterminateError):
+        return error.key
+    near = _NEAR.search(str(error))
+    return None if near is None else int(near.group(1))
+
+
+def _solved(
+    graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
+) -> dict[int, Array] | IndeterminateError:
+    order = gtsam.Ordering.OrderingType.COLAMD
+    found: dict[int, Array] = {}
+    try:
+        if not robust:
+            tree = graph.eliminateMultifrontal(order)
+            found = {key: np.asarray(tree.marginalCovariance(key)) for key in keys}
+        else:
+            tree = graph.eliminateMultifrontal(order, gtsam.EliminateQR)
+            for key in keys:
+                conditional = tree.marginalFactor(key, gtsam.EliminateQR)  # owns what R() shows
+                root = np.linalg.inv(conditional.R())
+                found[key] = np.asarray(root @ root.T, dtype=float)
+    except RuntimeError as error:
+        return IndeterminateError(blamed(error))
+    except np.linalg.LinAlgError:
+        return IndeterminateError(key)
+    for key, covariance in found.items():
+        if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
+            return IndeterminateError(key)
+    return found
+
+
+def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
+    """The graph, and a prior on each variable of the share ``damping`` of what its own factors tell of it."""
+    told = {key: np.zeros(size) for key, size in sizes.items()}
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        diagonal, first = np.diag(factor.information()), 0
+        for key in factor.keys():  # noqa: SIM118
+            told[key] += diagonal[first : first + sizes[key]]
+            first += sizes[key]
+    out = gtsam.GaussianFactorGraph()
+    out.push_back(graph)
+    for key, information in told.items():
+        held = np.sqrt(damping * information)
+        out.add(gtsam.JacobianFactor(key, np.diag(held), np.zeros(len(held)), gtsam.noiseModel.Unit.Create(len(held))))
+    return out
