@@ -56,11 +56,12 @@ class GrowthSettings(FileModel):
 
 
 class OdometryNoise(FileModel):
-    """How the error grows: along the track [m], across it [m], in heading [rad]."""
+    """How the error grows: along the track [m], across it [m], in heading [rad]. What is not given is that of wheels of which
+    nothing is known, indoors."""
 
-    along: GrowthSettings = GrowthSettings(per_distance=0.05)
-    lateral: GrowthSettings = GrowthSettings(per_distance=0.02)
-    heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05)
+    along: GrowthSettings = GrowthSettings(per_distance=0.08, per_rotation=0.02, per_time=0.01)
+    lateral: GrowthSettings = GrowthSettings(per_distance=0.04, per_rotation=0.02, per_time=0.01)
+    heading: GrowthSettings = GrowthSettings(per_distance=0.06, per_rotation=0.1, per_time=0.005)
 
 
 class OdometryUncertainty(FileModel):

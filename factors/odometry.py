@@ -5,6 +5,10 @@ of two poses of that chain.
 
 Noise: variances of along-track, lateral and heading error each grow linearly with distance, rotation and time, so that the
 result does not depend on how finely a path is cut into pieces.
+
+A robot at rest is a measurement of its own: while the wheels report no motion its velocity is zero, what grows with time does
+not grow, and the pose diffuses by the least noise alone. No odometry is better than that noise, whatever the model says: an
+increment without noise would make a graph that cannot be solved.
 """
 
 import math
@@ -19,8 +23,10 @@ from factors import se2
 from factors.odometry_kernels import Noise, linearize, recalibrate, relative, whitener
 from factors.se2 import Array
 
-MINIMUM_POSITION_VARIANCE = 1e-8  # of a robot at rest, whose covariance must still be one that can be inverted
+# of an increment that takes no time, whose covariance must still be one that can be inverted
+MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
+LEAST_POSITION, LEAST_HEADING = 1e-3, 2e-4  # m, rad per sqrt(s): the least noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +79,7 @@ class OdometryModel:
         growths = (self.along, self.lateral, self.heading)
         sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
         sigmas += [self.unknown_distance, self.unknown_rotation]
-        least = MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE
+        least = MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE, LEAST_POSITION**2, LEAST_HEADING**2
         return (float(self.direction), *(float(s) ** 2 for s in sigmas), *least)
 
 
@@ -82,16 +88,23 @@ class Increment:
     """Relative motion between two times.
 
     ``delta`` (3,): pose of the end in the frame of the start. ``covariance`` (3, 3): of the body-frame perturbation at the
-    end. ``duration`` [s].
+    end. ``duration`` [s], and ``still`` [s], how much of it the robot was at rest.
     """
 
     delta: Array
     covariance: Array
     duration: float
+    still: float = 0.0
+
+    @property
+    def moving(self) -> float:
+        """How long [s] the robot moved."""
+        return self.duration - self.still
 
 
 class ChainState(NamedTuple):
-    """Where the odometry is at a time: pose in its own frame, path [m], turned angle [rad], time without odometry [s]."""
+    """Where the odometry is at a time: pose in its own frame, path [m], turned angle [rad], time without odometry [s],
+    time at rest [s]."""
 
     t: float
     x: float
@@ -100,6 +113,7 @@ class ChainState(NamedTuple):
     path: float
     turn: float
     unknown: float
+    still: float = 0.0
 
 
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
@@ -119,16 +133,17 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
     """The increment under changed parameters, and its Jacobian.
 
     ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional
-    heading-rate bias [rad/s], additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of
-    its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant curvature.
+    heading-rate bias [rad/s] while the robot moves, additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the
+    Jacobian (..., 3, 4) of its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant
+    curvature.
     """
     arc = se2.log(increment.delta)
     parameters = np.asarray(parameters, dtype=float)
     if parameters.ndim == 1:
-        delta, jacobian = recalibrate(arc, increment.duration, parameters)
+        delta, jacobian = recalibrate(arc, increment.moving, parameters)
         return delta, jacobian
     x, y, phi = arc.tolist()
-    by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.duration, math.hypot(x, y)]])
+    by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.moving, math.hypot(x, y)]])
     changed = arc + parameters @ by_parameter.T
     return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
 
@@ -167,5 +182,5 @@ class OdometryFactor:
             return self._increment.delta, np.zeros((3, 0))
         parameters = np.zeros(len(PARAMETERS))
         parameters[self._estimated] = values[2]
-        delta, jacobian = recalibrate(self._arc, self._increment.duration, parameters)
+        delta, jacobian = recalibrate(self._arc, self._increment.moving, parameters)
         return delta, np.ascontiguousarray(jacobian[:, self._estimated])

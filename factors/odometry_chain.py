@@ -3,6 +3,8 @@
 Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9).
 Commanded velocities act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
 
+While the wheels report that the robot stands, it does: noise and bias of a gyro do not turn it.
+
 The step from knot to knot is compiled: an estimator takes hundreds of rows a second, a calibration integrates whole logs
 many times.
 """
@@ -20,9 +22,13 @@ from factors.se2 import Array
 # columns of a row: when it takes effect, its kind, and its values
 _ROW = 5
 _VELOCITY, _INCREMENT, _GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
-# columns of a knot: state at the time of a row, the velocity in the robot's frame then, and the velocity that it tends to
-_T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _VX, _VY, _W, _UX, _UY, _UW = range(13)
-_KNOT, _STATE = 13, 7
+# columns of a knot: state at the time of a row, the velocity in the robot's frame then, the velocity that it tends to, and
+# whether the wheels stand
+_T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS = range(15)
+_KNOT, _STATE = 15, 8
+
+# m/s and rad/s, beyond the biases: what is reported at rest; a gyro, that the robot does not turn although its wheels stand
+_REST, _GYRO_REST = 1e-3, 0.02
 
 # scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
 _Constants = tuple[
@@ -81,7 +87,7 @@ class OdometryChain:
         return ChainState(*_state(self._knots, self._count, t, self._constants[2]))
 
     def states(self, t: Array) -> Array:
-        """The states (M, 7) at times (M,): t, x, y, heading, path, turn, unknown, as in :class:`ChainState`."""
+        """The states (M, 8) at times (M,): t, x, y, heading, path, turn, unknown, still, as in :class:`ChainState`."""
         out = np.empty((len(t), _STATE))
         _states(self._knots, self._count, np.asarray(t, dtype=float), self._constants[2], out)
         return out
@@ -153,25 +159,34 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
             previous = knots[i - 1]
             duration = t - previous[_T]
             if duration > 0.0:  # else it has no time to happen in
-                forward, sideways = a / duration - speed_bias, b / duration
+                forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
+                stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
+                if stands:
+                    forward = sideways = turn = 0.0
+                previous[_STANDS] = stands
                 previous[_UX] = scale_distance * (c * forward - s * sideways)
                 previous[_UY] = scale_distance * (s * forward + c * sideways)
                 speed = math.hypot(previous[_UX], previous[_UY])
-                previous[_UW] = scale_rotation * (phi / duration - heading_rate_bias) + heading_drift * speed
+                previous[_UW] = scale_rotation * turn + heading_drift * speed
             _move(previous, duration, 0.0, duration, knot)
             knot[_UNKNOWN] += max(0.0, duration - hold)
         else:
             previous = knots[i - 1]
             _move(previous, t - previous[_T], lag, hold, knot)
         if kind == _VELOCITY:
-            speed = scale_distance * (a - speed_bias)
-            turn = scale_rotation * (b - heading_rate_bias)
+            stands = abs(a - speed_bias) <= _REST and abs(b - heading_rate_bias) <= _REST
+            knot[_STANDS] = stands
+            speed = 0.0 if stands else scale_distance * (a - speed_bias)
+            turn = 0.0 if stands else scale_rotation * (b - heading_rate_bias)
             speed = math.copysign(max(0.0, abs(speed) - turn_slowdown * abs(turn)), speed)
             knot[_UX], knot[_UY] = speed * c, speed * s
             if not use_gyro:
                 knot[_UW] = turn + heading_drift * abs(speed)
+            elif stands and abs(knot[_UW]) <= _GYRO_REST:
+                knot[_UW] = knot[_W] = 0.0
         elif kind == _GYRO:
-            knot[_UW] = knot[_W] = a - gyro_bias
+            turn = a - gyro_bias
+            knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
 
 
 @numba.njit(cache=True)
@@ -179,7 +194,9 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
     """The knot ``duration`` seconds on: the motion goes on for at most ``hold`` of them, then it is unknown."""
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)
+    rests = knot[_STANDS] and uw == 0.0
     if lag > 0.0:
+        rests = rests and max(abs(knot[_VX]), abs(knot[_VY]), abs(knot[_W])) <= _REST
         decay = math.exp(-moving / lag)
         settling = lag * (1.0 - decay)
         behind_x, behind_y, behind_w = knot[_VX] - ux, knot[_VY] - uy, knot[_W] - uw
@@ -191,7 +208,7 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
         out[_VX], out[_VY], out[_W] = ux, uy, uw
     if duration > hold:
         out[_VX] = out[_VY] = out[_W] = 0.0
-    out[_UX], out[_UY], out[_UW] = ux, uy, uw
+    out[_UX], out[_UY], out[_UW], out[_STANDS] = ux, uy, uw, knot[_STANDS]
     a, b = _arc_coefficients(dtheta)
     c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
     chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
@@ -202,23 +219,24 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
     out[_PATH] = knot[_PATH] + math.hypot(dx, dy)
     out[_TURN] = knot[_TURN] + abs(dtheta)
     out[_UNKNOWN] = knot[_UNKNOWN] + duration - moving
+    out[_STILL] = knot[_STILL] + (moving if rests else 0.0)
 
 
 @numba.njit(cache=True)
 def _state(
     knots: Array, count: int, t: float, settling: tuple[float, float]
-) -> tuple[float, float, float, float, float, float, float]:
-    """t, x, y, heading, path, turn and unknown at ``t``, from the last knot before it."""
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
     if count == 0:
-        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t
+        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, _T], t, side="right") - 1
     if i < 0:
         k = knots[0]
-        return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[_T] - t)
+        return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[_T] - t), k[_STILL]
     k = np.empty(_KNOT)
     lag, hold = settling
     _move(knots[i], t - knots[i, _T], lag, hold, k)
-    return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN]
+    return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN], k[_STILL]
 
 
 @numba.njit(cache=True)

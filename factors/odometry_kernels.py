@@ -12,22 +12,24 @@ from factors.se2 import Array
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
 
 # direction of travel; variances per distance, rotation and time, of what is along, lateral and of the heading; those per time
-# without odometry, of position and of heading, and the least ones
+# without odometry, of position and of heading; the least ones, and the least ones per time
 Noise = tuple[float, ...]
-State = tuple[float, float, float, float, float, float, float]
+State = tuple[float, float, float, float, float, float, float, float]
 
 
 @numba.njit(cache=True)
-def relative(noise: Noise, start: State, end: State) -> tuple[Array, Array, float]:
-    """As of :func:`factors.odometry.relative_motion`: pose (3,), covariance (3, 3) and duration, of two states of a chain (t, x, y,
-    heading, path, turn, unknown)."""
+def relative(noise: Noise, start: State, end: State) -> tuple[Array, Array, float, float]:
+    """As of :func:`factors.odometry.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, of two states of a
+    chain (t, x, y, heading, path, turn, unknown, still)."""
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrapped(end[3] - start[3])
     distance, rotation, duration = abs(end[4] - start[4]), abs(end[5] - start[5]), abs(end[0] - start[0])
-    unknown = max(0.0, end[6] - start[6])
-    along = noise[1] * distance + noise[2] * rotation + noise[3] * duration + noise[10] * unknown
-    lateral = noise[4] * distance + noise[5] * rotation + noise[6] * duration + noise[10] * unknown
-    heading = noise[7] * distance + noise[8] * rotation + noise[9] * duration + noise[11] * unknown
+    unknown, still = max(0.0, end[6] - start[6]), min(duration, abs(end[7] - start[7]))
+    # what grows with time does so while the robot moves; no odometry is better than the least noise
+    moving, least_position, least_heading = duration - still, noise[14] * duration, noise[15] * duration
+    along = max(noise[1] * distance + noise[2] * rotation + noise[3] * moving, least_position) + noise[10] * unknown
+    lateral = max(noise[4] * distance + noise[5] * rotation + noise[6] * moving, least_position) + noise[10] * unknown
+    heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
     # the start as seen from the end, turned by 90 degrees: how the end moves when the heading changes at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y
@@ -40,7 +42,7 @@ def relative(noise: Noise, start: State, end: State) -> tuple[Array, Array, floa
     covariance[0, 1] = covariance[1, 0] = ahead * aside * (along - lateral) + heading * nx * ny / 3.0
     covariance[0, 2] = covariance[2, 0] = heading * nx / 2.0
     covariance[1, 2] = covariance[2, 1] = heading * ny / 2.0
-    return np.array((x, y, turned)), covariance, duration
+    return np.array((x, y, turned)), covariance, duration, still
 
 
 @numba.njit(cache=True)
@@ -63,10 +65,10 @@ def carried(covariance: Array, delta: Array, noise: Array) -> Array:
 
 
 @numba.njit(cache=True)
-def recalibrated(delta: Array, duration: float, changes: Array) -> Array:
+def recalibrated(delta: Array, moving: float, changes: Array) -> Array:
     """The increment ``delta`` (3,) alone of :func:`factors.odometry.recalibrated`."""
     x, y, phi = log(delta[0], delta[1], delta[2])
-    turn = phi + changes[1] * phi - changes[2] * duration + changes[3] * math.hypot(x, y)
+    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
     return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
 
 
@@ -88,18 +90,18 @@ def whitener(covariance: Array) -> Array:
 
 
 @numba.njit(cache=True)
-def recalibrate(twist: Array, duration: float, changes: Array) -> tuple[Array, Array]:
-    """See :func:`factors.odometry.recalibrated`, of which ``twist`` (3,) is the logarithm of the increment."""
+def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
+    """See :func:`factors.odometry.recalibrated`, of which ``twist`` (3,) is the logarithm of the increment, ``moving`` its time."""
     x, y, phi = twist[0], twist[1], twist[2]
     way = math.hypot(x, y)
     cx, cy = x + changes[0] * x, y + changes[0] * y
-    turn = phi + changes[1] * phi - changes[2] * duration + changes[3] * way
+    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * way
     p, q = arc(turn)
     jacobian = _right_jacobian(cx, cy, turn)
     by_changes = np.zeros((3, 4))
     for i in range(3):
         by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y
-        by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * duration
+        by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * moving
         by_changes[i, 3] = jacobian[i, 2] * way
     return np.array((p * cx - q * cy, q * cx + p * cy, wrapped(turn))), by_changes
 

@@ -92,14 +92,17 @@ def _growth(sigmas: Array) -> dict[str, Growth]:
 def _bases(windows: Windows, model: OdometryModel) -> Array:
     """Covariances (M, 11, 3, 3) by unit variances: three drivers of each error, then position and heading of the reference."""
     start, end = windows.states(model)
-    drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, duration
+    drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
+    drivers[:, 2] -= end[:, 7] - start[:, 7]
+    moved = drivers[:, 2] > 0.0
     floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
     known = replace(model, unknown_distance=0.0, unknown_rotation=0.0)
     out = np.zeros((len(start), 11, 3, 3))
     for i, error in enumerate(ERRORS):
         alone = {e: Growth(per_time=1.0 if e == error else 0.0) for e in ERRORS}
         unit = windows.covariances(with_noise(known, alone)) - floor
-        unit /= drivers[:, 2, None, None]
+        unit[moved] /= drivers[moved, 2, None, None]
+        unit[~moved] = 0.0
         out[:, 3 * i : 3 * i + 3] = drivers[:, :, None, None] * unit[:, None]
     out[:, 9] = 2.0 * np.diag((1.0, 1.0, 0.0))
     out[:, 10] = 2.0 * np.diag((0.0, 0.0, 1.0))

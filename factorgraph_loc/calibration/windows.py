@@ -35,7 +35,7 @@ class Windows:
         return first, second
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """States of the odometry (M, 7) at both ends."""
+        """States of the odometry (M, 8) at both ends."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 

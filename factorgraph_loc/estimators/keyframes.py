@@ -190,9 +190,7 @@ class KeyframeGraph(ABC):
         if ODOMETRY_KEY not in self._constants:
             return increment
         changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
-        return Increment(
-            recalibrated(increment.delta, increment.duration, changes), increment.covariance, increment.duration
-        )
+        return replace(increment, delta=recalibrated(increment.delta, increment.moving, changes))
 
     def _constant_priors(self) -> tuple[Values, Values]:
         """Means and covariances of the sensors' constants before any measurement."""

@@ -80,9 +80,9 @@ class Motion:
         if changes is None:
             return deltas
         moved, later = se2.log(deltas), t - start.t
-        ways = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1])
+        ways, moving = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1]), later - (states[:, 7] - start.still)
         moved[:, :2] *= 1.0 + changes[0]
-        moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * later + changes[3] * ways
+        moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
         return np.asarray(se2.exp(moved))
 
     def twist(self, t: float) -> Array:

@@ -40,7 +40,7 @@ def test_a_log_at_once_is_what_its_rows_give_one_by_one(simulate):
     for row in zip(odometry.t.tolist(), odometry.v.tolist(), odometry.w.tolist(), strict=True):
         chain.add_velocity(*row)
     times = np.linspace(-1.0, 61.0, 200)
-    rows = [(s.t, s.x, s.y, s.heading, s.path, s.turn, s.unknown) for s in map(chain.state, times.tolist())]
+    rows = [(s.t, s.x, s.y, s.heading, s.path, s.turn, s.unknown, s.still) for s in map(chain.state, times.tolist())]
     np.testing.assert_allclose(integrated(log, model).states(times), rows, atol=1e-9)
 
 

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from factors import se2
 from factors.graph import read_pose
 from factors.odometry import (
+    LEAST_HEADING,
+    LEAST_POSITION,
     Growth,
     Increment,
     OdometryFactor,
@@ -23,6 +25,7 @@ from factors.odometry_chain import OdometryChain
 NOISY = OdometryModel(
     along=Growth(0.1, 0.02, 0.01), lateral=Growth(0.03, 0.01, 0.0), heading=Growth(0.05, 0.1, 0.002), direction=0.1
 )
+NOISY_IN_TIME = OdometryModel(along=Growth(per_time=0.1), lateral=Growth(per_time=0.1), heading=Growth(per_time=0.2))
 
 
 def velocities(model, rows, **options):
@@ -102,6 +105,65 @@ def test_gyro_replaces_the_rotation_of_the_wheels():
     chain.add_velocity(0.0, 1.0, 9.0)
     chain.add_yaw_rate(0.0, 0.6)
     np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
+
+
+def test_at_rest_the_pose_diffuses_by_the_least_noise_alone():
+    chain = velocities(NOISY_IN_TIME, [(0.0, 0.5, 0.1), (1.0, 0.0, 0.0), (61.0, 0.5, 0.0)], horizon=100.0)
+    rest = chain.relative(chain.state(1.0), chain.state(2.5))  # the hold of a velocity ends then
+    np.testing.assert_allclose(rest.delta, 0.0, atol=1e-12)
+    assert rest.still == pytest.approx(1.5)
+    least = np.array((LEAST_POSITION, LEAST_POSITION, LEAST_HEADING)) ** 2
+    np.testing.assert_allclose(np.diag(rest.covariance), 1.5 * least, rtol=0.2)
+    driven = chain.relative(chain.state(0.0), chain.state(1.0))
+    assert driven.still == 0.0
+    assert driven.covariance[2, 2] > 0.1**2
+
+
+def test_increments_of_nothing_are_a_rest_and_others_none():
+    chain = OdometryChain(NOISY_IN_TIME)
+    for i in range(10):
+        chain.add_increment(0.1 * i, 0.05 if i > 5 else 0.0, 0.0, 0.0)
+    assert chain.relative(chain.state(0.0), chain.state(0.5)).still == pytest.approx(0.5)
+    assert chain.relative(chain.state(0.5), chain.state(0.9)).still == 0.0
+
+
+def test_what_is_reported_at_rest_is_a_rest():
+    model = OdometryModel(speed_bias=-0.02, heading_rate_bias=0.003)
+    chain = velocities(model, [(0.0, -0.02, 0.003), (1.0, 0.0, 0.003)])
+    assert chain.relative(chain.state(0.0), chain.state(1.0)).still == pytest.approx(1.0)
+    assert chain.relative(chain.state(1.0), chain.state(2.0)).still == 0.0
+
+
+def test_a_robot_that_runs_out_after_a_command_to_stop_is_not_yet_at_rest():
+    chain = velocities(OdometryModel(lag=0.2), [(0.1 * i, 0.5 if i < 10 else 0.0, 0.0) for i in range(40)])
+    assert chain.relative(chain.state(1.0), chain.state(1.5)).still == 0.0
+    assert chain.relative(chain.state(3.0), chain.state(3.5)).still == pytest.approx(0.5)
+
+
+def test_a_gyro_turns_no_robot_at_rest_unless_it_tells_more_than_its_noise():
+    chain = OdometryChain(OdometryModel(), use_gyro=True)
+    for i in range(40):
+        chain.add_velocity(0.1 * i, 0.0, 0.0)
+        chain.add_yaw_rate(0.1 * i + 0.01, 0.01 if i < 20 else 0.3)
+    rest = chain.relative(chain.state(0.0), chain.state(1.9))
+    assert rest.delta[2] == 0.0
+    assert rest.still == pytest.approx(1.9)
+    turn = chain.relative(chain.state(2.05), chain.state(3.05))  # in place, though the wheels do not say so
+    assert turn.delta[2] == pytest.approx(0.3)
+    assert turn.still == 0.0
+
+
+def test_a_rate_bias_does_not_turn_a_robot_at_rest():
+    chain = velocities(OdometryModel(), [(0.0, 0.5, 0.0), (1.0, 0.0, 0.0)])
+    whole = chain.relative(chain.state(0.0), chain.state(2.0))
+    delta, _ = recalibrated(whole, np.array((0.0, 0.0, 0.1, 0.0)))
+    assert delta[2] == pytest.approx(-0.1)
+
+
+def test_no_odometry_is_without_noise():
+    chain = velocities(OdometryModel(), [(0.0, 0.5, 0.3)])
+    covariance = chain.relative(chain.state(0.0), chain.state(1.0)).covariance
+    assert np.linalg.eigvalsh(covariance)[0] > 0.5 * LEAST_HEADING**2
 
 
 @given(st.integers(1, 40), st.floats(0.05, 1.0), st.floats(-0.6, 0.6))
