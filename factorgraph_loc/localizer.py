@@ -208,7 +208,7 @@ class Localizer:
                 f"after a pause"
             )
         if isinstance(m, IncrementOdometry):
-            if m.t <= self._newest_increment:
+            if m.t < self._newest_increment:
                 raise InputError(
                     f"{where}: follows one at {self._newest_increment:.3f} s, expected increments in order of time"
                 )

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factors import se2
 from factors.odometry_kernels import Noise, linearize, recalibrate, relative, whitener
@@ -146,6 +147,18 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
     by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.moving, math.hypot(x, y)]])
     changed = arc + parameters @ by_parameter.T
     return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
+
+
+def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:
+    """Which rows (M,) are the last of their stamps ``t`` (N,), which never go back, and the motions (M, 3) since the one before of
+    these: ``moves`` (N, 3) of equal stamps follow one another."""
+    last = np.flatnonzero(np.append(np.diff(t) > 0, True)[: len(t)])
+    first = np.append(0, last[:-1] + 1)[: len(last)]
+    out = np.array(moves[first], dtype=float)
+    for row in np.setdiff1d(np.arange(len(t)), first).tolist():
+        place = int(np.searchsorted(last, row))
+        out[place] = se2.compose(out[place], moves[row])
+    return last, out
 
 
 def between_factor(from_key: int, to_key: int, increment: Increment) -> gtsam.NonlinearFactor:

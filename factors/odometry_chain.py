@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from factors import se2
-from factors.odometry import ChainState, Increment, OdometryModel
+from factors.odometry import ChainState, Increment, OdometryModel, composed
 from factors.odometry_kernels import relative
 from factors.se2 import Array
 
@@ -67,8 +67,14 @@ class OdometryChain:
         return self._insert(t + self.model.delay, _VELOCITY, v, w, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
-        """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row."""
-        return self._insert(t, _INCREMENT, *se2.log(np.array((dx, dy, dtheta))).tolist())
+        """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row; at the stamp of that
+        one it goes on from there, and both are one motion."""
+        move, n = np.array((dx, dy, dtheta), dtype=float), self._count
+        if n and self._rows[n - 1, 0] == t and self._rows[n - 1, 1] == _INCREMENT:
+            self._rows[n - 1, 2:] = se2.log(se2.compose(se2.exp(self._rows[n - 1, 2:]), move))
+            _integrate(self._rows, self._knots, n - 1, n, self._constants)
+            return True
+        return self._insert(t, _INCREMENT, *se2.log(move).tolist())
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
         """A gyro's row [rad/s], held from ``t`` until the next; it replaces the rotation that the wheels tell."""
@@ -79,8 +85,9 @@ class OdometryChain:
         self._extend(t + self.model.delay, _VELOCITY, np.column_stack((v, w, np.zeros(len(t)))))
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
-        """Rows (N,) at once, in time order and after all others."""
-        self._extend(t, _INCREMENT, se2.log(np.column_stack((dx, dy, dtheta))))
+        """Rows (N,) at once, in time order and after all others; of equal stamps they are one motion."""
+        last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
+        self._extend(t[last], _INCREMENT, se2.log(moves))
 
     def state(self, t: float) -> ChainState:
         """The state of the chain at ``t``; before the first kept knot the robot is taken to stand, its motion unknown."""

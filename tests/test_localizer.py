@@ -409,6 +409,18 @@ def test_offsets_of_the_clocks_are_added(log):
     assert shifted.estimate().pose == pytest.approx(plain.estimate().pose)
 
 
+@pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
+@pytest.mark.parametrize("pulled", [False, True])
+def test_increments_of_one_stamp_follow_one_another(log, name, pulled):
+    localizer = fgloc.Localizer(Rig(), log.world, name)
+    localizer.initialize((0.0, 0.0, 0.0), t=0.0)
+    for t, dx in ((0.0, 0.0), (1.0, 1.0), (1.0, 1.0), (2.0, 1.0)):
+        localizer.push(IncrementOdometry(t, dx, 0.0, 0.0))
+        if pulled:
+            localizer.estimate()
+    assert localizer.estimate().pose == pytest.approx((3.0, 0.0, 0.0))
+
+
 def test_images_need_a_camera():
     localizer = fgloc.Localizer(Rig(name="blind"))
     with pytest.raises(InputError, match=r"image at 1.000 s: the rig blind has no \[camera\]"):

@@ -9,6 +9,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.trajectory import Integers
+from factors.odometry import composed
 from factors.se2 import Array
 
 MAX_LATE_NS = 500_000_000  # what estimators still put in at its time
@@ -31,15 +32,31 @@ def require_above_zero(source: object, rows: Integers, field: str, values: Array
 
 def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
     """Indices (M,) of the rows to keep of a stream that must not go back in time: of equal stamps (N,) the last."""
+    _require_order(source, rows, t_ns)
+    keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
+    if dropped := len(t_ns) - len(keep):
+        warnings.append(f"{source}: {dropped} rows have the stamp of the row after them and are left out")
+    return keep
+
+
+def increments_in_order(
+    source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[str]
+) -> tuple[Integers, Array]:
+    """Stamps (M,) and motions (M, 3) since the one before: ``moves`` (N, 3) of equal stamps (N,) are composed."""
+    _require_order(source, rows, t_ns)
+    last, out = composed(t_ns, moves)
+    if joined := len(t_ns) - len(last):
+        warnings.append(f"{source}: {joined} increments have the stamp of the row before them and go on from it")
+    return t_ns[last], out
+
+
+def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
+    """InputError at the first row whose stamp is older than the one before it."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
         expected = f"a stamp not before that of the row before, {int(t_ns[i - 1])} ns"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
-    keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
-    if dropped := len(t_ns) - len(keep):
-        warnings.append(f"{source}: {dropped} rows have the stamp of the row after them and are left out")
-    return keep
 
 
 def arrivals(

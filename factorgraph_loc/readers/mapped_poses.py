@@ -50,14 +50,14 @@ def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tup
     if ("left" in mapped.fields) != (options.track is not None):
         raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
     t_ns, columns = _columns(mapped, options.clock_offset)
+    if "dx" in columns:
+        moves = np.column_stack((columns["dx"], columns["dy"], columns["dtheta"]))
+        return *checks.increments_in_order(path, mapped.rows, t_ns, moves, warnings), True
     keep = checks.in_order(path, mapped.rows, t_ns, warnings)
     t_ns = t_ns[keep]
     kept = {name: values[keep] for name, values in columns.items()}
     if "v" in kept:
         return t_ns, np.column_stack((kept["v"], kept["w"])), False
-    if "dx" in kept:
-        moves = np.column_stack((kept["dx"], kept["dy"], kept["dtheta"]))
-        return t_ns, moves, True
     if options.track is not None:
         left, right = np.diff(kept["left"]), np.diff(kept["right"])
         arc, turn = (left + right) / 2.0, (right - left) / options.track

@@ -162,14 +162,16 @@ def make_stream(sensor: str, table: Table, t0_ns: int, warnings: list[str]) -> S
             return make_pixels(table, t0_ns, warnings)
     for field, values in table.numbers.items():
         checks.require_finite(table.path, table.rows, field, values)
+    if "dx" in table.numbers:
+        moves = np.column_stack([table.numbers[field] for field in INCREMENTS[1:]])
+        t_ns, moves = checks.increments_in_order(table.path, table.rows, table.t_ns, moves, warnings)
+        return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
     keep = checks.in_order(table.path, table.rows, table.t_ns, warnings)
     t = checks.seconds(table.t_ns[keep], t0_ns)
     kept = {field: values[keep] for field, values in table.numbers.items()}
     if sensor == "imu":
         return YawRateStream(t, kept["w"])
-    if "v" in kept:
-        return VelocityStream(t, kept["v"], kept["w"])
-    return IncrementStream(t, kept["dx"], kept["dy"], kept["dtheta"])
+    return VelocityStream(t, kept["v"], kept["w"])
 
 
 def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRangeStream:

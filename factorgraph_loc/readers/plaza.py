@@ -103,11 +103,12 @@ def beacon_name(number: float) -> str:
 
 def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> IncrementStream:
     """The odometry, led by a row without motion at ``t0_ns``: without it the duration of the first one is not known."""
-    table, t_ns = kept_in_order(source, table, warnings)
+    moves = np.column_stack((table[:, 1], np.zeros(len(table)), table[:, 2]))
+    t_ns, moves = checks.increments_in_order(source, rows_of(table), nanoseconds(table[:, 0]), moves, warnings)
     if t_ns[0] > t0_ns:
-        table = np.vstack((np.zeros(3), table))
+        moves = np.vstack((np.zeros(3), moves))
         t_ns = np.concatenate(([t0_ns], t_ns))
-    return IncrementStream(checks.seconds(t_ns, t0_ns), table[:, 1], np.zeros(len(table)), table[:, 2])
+    return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
 
 
 def ranges(source: str, table: Array, t0_ns: int, warnings: list[str]) -> BearingRangeStream:

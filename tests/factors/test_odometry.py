@@ -58,6 +58,37 @@ def test_increments_with_the_same_biases_go_the_same_way():
     np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_increments_of_one_stamp_are_one_motion(at_once):
+    t = np.array((0.0, 0.0, 1.0, 1.0, 1.0, 2.0))
+    moves = np.array(
+        ((9.0, 0.0, 0.0), (9.0, 0.0, 0.0), (1.0, 0.0, 0.5), (0.5, 0.2, 0.0), (0.0, 0.0, -0.2), (1.0, 0.0, 0.0))
+    )
+    model = OdometryModel(along=Growth(per_distance=0.1), heading=Growth(per_rotation=0.1))
+    chain, plain = OdometryChain(model), OdometryChain(model)
+    if at_once:
+        chain.add_increments(t, *moves.T)
+    else:
+        for stamp, move in zip(t.tolist(), moves.tolist(), strict=True):
+            assert chain.add_increment(stamp, *move)
+    whole = se2.compose(se2.compose(moves[2], moves[3]), moves[4])
+    for stamp, move in ((0.0, np.zeros(3)), (1.0, whole), (2.0, moves[5])):
+        plain.add_increment(stamp, *move)
+    for start, end in ((0.0, 1.0), (0.3, 0.8), (0.0, 2.0)):
+        found, expected = (c.relative(c.state(start), c.state(end)) for c in (chain, plain))
+        np.testing.assert_allclose(found.delta, expected.delta, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-15)
+
+
+def test_an_increment_of_the_stamp_before_corrects_what_was_believed_then():
+    chain = OdometryChain(OdometryModel())
+    chain.add_increment(0.0, 0.0, 0.0, 0.0)
+    chain.add_increment(1.0, 1.0, 0.0, 0.0)
+    before = chain.state(1.0)
+    chain.add_increment(1.0, 1.0, 0.0, 0.0)
+    assert chain.relative(before, chain.state(1.0)).delta[0] == pytest.approx(1.0)
+
+
 def test_delay_and_lag_follow_the_step_response():
     delay, lag = 0.1, 0.2
     chain = velocities(OdometryModel(delay=delay, lag=lag), [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0)])

@@ -82,10 +82,10 @@ def test_plaza_ranges_are_put_in_order(read_plaza):
     assert "1 rows see a landmark that a later row sees" in log.warnings[1]
 
 
-def test_plaza_duplicate_odometry_the_last_wins(read_plaza):
+def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
     log = read_plaza(DR=np.array([[10.1, 0.5, 0.0], [10.1, 0.25, 0.0]]))
-    np.testing.assert_array_equal(log.streams["odometry"].dx, (0.0, 0.25))
-    assert ":DR: 1 rows" in log.warnings[0]
+    np.testing.assert_array_equal(log.streams["odometry"].dx, (0.0, 0.75))
+    assert ":DR: 1 increments have the stamp of the row before them" in log.warnings[0]
 
 
 PLAZA_BAD = {

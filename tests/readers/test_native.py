@@ -163,6 +163,18 @@ def test_duplicate_stamps_the_last_wins(native, one):
     assert "odometry.csv: 3 rows have the stamp of the row after them" in log.warnings[0]
 
 
+def test_increments_of_one_stamp_are_one_motion(native, one):
+    """Each metre of the file is a metre of the log, whatever its stamp; a turn in between counts too."""
+    rows = "t_ns,dx,dy,dtheta\n0,0,0,0\n1000,1,0,0\n1000,1,0,0.5\n2000,1,0,0\n2000,0,1,0\n2000,0,0,-0.5\n"
+    (native / "odometry.csv").write_text(rows)
+    log = one(native)
+    odometry = log.streams["odometry"]
+    assert len(odometry.t) == 3
+    moves = np.column_stack((odometry.dx, odometry.dy, odometry.dtheta))
+    np.testing.assert_allclose(moves, ((0, 0, 0), (2, 0, 0.5), (1, 1, -0.5)), atol=1e-12)
+    assert "odometry.csv: 3 increments have the stamp of the row before them and go on from it" in log.warnings[0]
+
+
 def test_duplicate_sightings_the_last_wins(native, one):
     with (native / "bearing_range.csv").open("a") as file:
         file.write("1600000000,A,3,\n1600000000,B,4,\n")
