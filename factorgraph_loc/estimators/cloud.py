@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.base import Mode
 from factors import se2
 from factors.se2 import Array
@@ -17,6 +18,7 @@ MINIMUM_VARIANCE = 1e-10
 MODES = 5  # at most
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
 BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
+LEAST = 1e-3  # of the whole likelihood, that is taken at least: there is an end to what no particle explains
 CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is looked for
 
 
@@ -119,7 +121,8 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles."""
+    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles; not less than
+    :data:`LEAST`, so that a likelihood is taken in a few hundred shares at most."""
 
     def effective(share: float) -> float:
         return effective_size(normalised(log_weights + share * likelihood))
@@ -130,7 +133,22 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
     for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
         low, high = (middle, high) if effective(middle) >= enough else (low, middle)
-    return max(low, SMALLEST * left)
+    return max(low, SMALLEST * left, min(left, LEAST))
+
+
+def weighable(likelihood: Array, t: float) -> Array:
+    """A log-likelihood (N,) of time ``t`` by which particles can be weighed: one for which it is no number is impossible.
+
+    RunFailedError if none is possible.
+    """
+    possible = np.isfinite(likelihood)
+    if possible.all():
+        return likelihood
+    if not possible.any():
+        raise RunFailedError(
+            f"at {t:.3f} s the likelihood of a measurement is a finite number for none of the particles"
+        )
+    return np.where(possible, likelihood, -np.inf)
 
 
 def effective_size(log_weights: Array) -> float:

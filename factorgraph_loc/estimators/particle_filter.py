@@ -23,7 +23,7 @@ from pydantic import Field
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
-from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments
+from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
 from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
@@ -256,21 +256,22 @@ class ParticleFilter(Filter):
 
     def _weigh(self, log_likelihood: Callable[[Cloud], Array]) -> float:
         """Weigh the particles by the likelihood, by a share of it at a time if it leaves too few effective ones: they are resampled
-        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of its mean."""
-        likelihood = log_likelihood(self._state)
+        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of its mean.
+        RunFailedError if it is not finite for any of them."""
         mean, left = 0.0, 1.0
         while True:
             cloud = self._state
+            likelihood = weighable(log_likelihood(cloud), self._t)
             share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
             weighed = cloud.log_weights + share * likelihood
             log_weights = normalised(weighed)
-            mean += float(weighed[0] - log_weights[0])
+            heaviest = int(np.argmax(weighed))
+            mean += float(weighed[heaviest] - log_weights[heaviest])
             self._state = replace(cloud, log_weights=log_weights)
             left -= share
             if left <= 0.0:
                 return mean
             self._resample()
-            likelihood = log_likelihood(self._state)
 
     def _resample(self) -> None:
         chosen = systematic(self._state.weights, self._rng, self._settings.particles)

@@ -16,7 +16,7 @@ import numpy as np
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Mode, PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
+from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
 from factorgraph_loc.estimators.motion import Motion
 from factors import se2
 from factors.odometry import ChainState
@@ -87,7 +87,7 @@ class Seeker:
         else:
             self._predict(self._cloud, self._odometry, odometry)
         self._odometry = odometry
-        self._weigh(looks)
+        self._weigh(looks, odometry.t)
         self._hypotheses = None
         read = np.flatnonzero(looks.hits.any(axis=0))
         self._scans_with_reads += len(read) > 0
@@ -131,12 +131,12 @@ class Seeker:
         noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
         self._cloud = replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
 
-    def _weigh(self, looks: Looks) -> None:
+    def _weigh(self, looks: Looks, t: float) -> None:
         left = 1.0
         while left > 0.0:
             cloud = self._cloud
             assert cloud is not None
-            likelihood = self._likelihood.log_likelihood(cloud.poses, looks)
+            likelihood = weighable(self._likelihood.log_likelihood(cloud.poses, looks), t)
             share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
             weighed = cloud.log_weights + share * likelihood
             highest = float(weighed.max())

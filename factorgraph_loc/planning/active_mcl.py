@@ -27,7 +27,7 @@ from scipy.special import logsumexp
 
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic
+from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.registry import Setup
@@ -133,7 +133,7 @@ class ActiveMcl(Filter):
         """Weighed by a likelihood, a share at a time."""
         left = 1.0
         while left > 0.0:
-            found = log_likelihood(cloud.poses)
+            found = weighable(log_likelihood(cloud.poses), self._t)
             enough = ENOUGH * effective_size(cloud.log_weights)
             share = largest_share(cloud.log_weights, found, left, enough)
             cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * found))

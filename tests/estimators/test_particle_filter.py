@@ -5,7 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.cloud import Cloud, systematic
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.estimators.cloud import Cloud, largest_share, systematic
+from factorgraph_loc.estimators.particle_filter import ParticleFilter, ParticleFilterSettings
+from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -182,3 +186,28 @@ def test_recorded_start_and_kidnapping(data_root):
     result = run(carried, UNKNOWN)
     assert events(result) == ["localized", "lost", "recovered"]
     assert errors(result.causal(), carried.reference).position[-50:].max() < 0.5
+
+
+@pytest.mark.parametrize("nowhere", [np.nan, -np.inf])
+def test_a_likelihood_that_is_no_number_comes_to_an_end(log, nowhere):
+    """Particles for which it is none are impossible; where that are all, the run fails in one line."""
+    setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
+    filter = ParticleFilter(setup, ParticleFilterSettings(particles=200))
+    filter.initialize(PosePrior(2.5, np.zeros(3), np.eye(3)))
+    filter._weigh(lambda cloud: np.where(cloud.poses[:, 0] > 0.0, 0.0, nowhere))
+    cloud = filter._state
+    assert np.isfinite(filter.estimate().pose).all()
+    assert cloud.weights[cloud.poses[:, 0] > 0.0].sum() > 0.9
+    with pytest.raises(
+        RunFailedError, match=r"^at 2.500 s the likelihood of a measurement is a finite number for none"
+    ):
+        filter._weigh(lambda cloud: np.full(len(cloud.poses), nowhere))
+
+
+def test_what_no_particle_explains_is_taken_in_few_shares():
+    """A likelihood so steep that each share leaves but one particle."""
+    left, count = 1.0, 0
+    while left > 0.0:
+        left -= largest_share(np.full(50, -np.log(50.0)), -1e9 * np.arange(50.0), left, 25.0)
+        count += 1
+    assert count < 500
