@@ -22,6 +22,7 @@ from factorgraph_loc.evaluation.inspect_camera import (
     summarize_images,
     summarize_pixels,
 )
+from factorgraph_loc.evaluation.inspect_motion import motion_problems
 from factorgraph_loc.evaluation.inspect_rfid import RfidSummary, rfid_problems, summarize_rfid
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.world import World
@@ -90,6 +91,7 @@ def inspect(log: Log) -> Inspection:
     problems += [_gaps(name, summary.gaps) for name, summary in streams.items() if summary.gaps]
     if reference is not None and reference.gaps:
         problems.append(_gaps("reference", reference.gaps))
+    problems += motion_problems(log)
     problems += [f"landmark {name} of the map is never seen" for name in unseen]
     problems += [f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()]
     problems += [str(suspect) for suspect in suspects]

@@ -10,7 +10,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, nearest
 from factorgraph_loc.log import IncrementStream, VelocityStream, YawRateStream
-from factorgraph_loc.readers import checks
+from factorgraph_loc.readers import checks, motions
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_poses import POSES, Poses
@@ -64,7 +64,7 @@ class PoseMotion:
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
         """Absolute stamps (N,) and the stream, whose own count from the first."""
         t_ns, poses = self._poses.in_order(warnings)
-        return t_ns, increments(t_ns, se2.between(poses[:-1], poses[1:]))
+        return t_ns, increments(t_ns, motions.between_poses(self._poses.rows.source, t_ns, poses, warnings))
 
 
 class TwistMotion:
@@ -125,9 +125,9 @@ class WheelMotion:
         if self._column == "velocity":
             v, w = radius * (left + right) / 2.0, radius * (right - left) / track
             return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
-        turned_left, turned_right = np.diff(left), np.diff(right)
-        arc = radius * (turned_left + turned_right) / 2.0
-        turn = radius * (turned_right - turned_left) / track
+        ways, scales = radius * np.column_stack((left, right)), np.full(2, radius)
+        left, right = motions.between_ways(self._rows.source, t_ns, ways, scales, warnings).T
+        arc, turn = (left + right) / 2.0, (right - left) / track
         return t_ns, increments(t_ns, se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn))))
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, SPEED, ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import IncrementStream, VelocityStream
-from factorgraph_loc.readers import checks
+from factorgraph_loc.readers import checks, motions
 from factorgraph_loc.readers.space_poses import headings_of, read_kitti
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows
 from factors import se2
@@ -22,6 +22,7 @@ Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION))
 ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
+LEAST_AROUND = 300.0  # no robot turns by so many radians from one row to the next
 UNITS = {"v": SPEED, "w": RATE, "heading": ANGLE, "dtheta": ANGLE, **dict.fromkeys(QUATERNION, PURE)}
 
 
@@ -59,11 +60,13 @@ def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tup
     if "v" in kept:
         return t_ns, np.column_stack((kept["v"], kept["w"])), False
     if options.track is not None:
-        left, right = np.diff(kept["left"]), np.diff(kept["right"])
+        ways = np.column_stack((kept["left"], kept["right"]))
+        scales = np.array([_scale(options, name) for name in ("left", "right")])
+        left, right = motions.between_ways(path, t_ns, ways, scales, warnings).T
         arc, turn = (left + right) / 2.0, (right - left) / options.track
         return t_ns, _after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
     poses = _planar(path, mapped.rows[keep], kept)
-    return t_ns, _after_rest(se2.between(poses[:-1], poses[1:])), True
+    return t_ns, _after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
 
 
 def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int) -> IncrementStream | VelocityStream:
@@ -104,11 +107,22 @@ def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]
     return mapped.stamps("t", offset), columns
 
 
+def _scale(options: OdometryFile, field: str) -> float:
+    """Metres per unit of a column: per tick, where it is what an encoder counts."""
+    unit = options.units.get(field, 1.0)
+    return LENGTH.get(unit, 1.0) if isinstance(unit, str) else float(unit)
+
+
 def _planar(path: Path, rows: Integers, columns: dict[str, Array]) -> Array:
     if "qw" in columns:
         heading = headings_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
     else:
         heading = columns.get("heading", np.zeros(len(rows)))
+        around = np.abs(np.diff(heading, prepend=heading[0]))
+        if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
+            i = degrees[0]
+            expected = 'radians; it seems to go around at 360: units.heading = "deg"'
+            raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
 
 

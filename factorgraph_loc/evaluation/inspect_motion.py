@@ -1,0 +1,187 @@
+"""Whether what tells of the same motion agrees: odometry, gyro, reference and sightings, in time, in sign and in unit.
+
+Turn rates (of a reference without heading: speeds) are compared at shifts of time. Sightings are compared with where the reference
+says that their landmarks are, at shifts of time too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream, YawRateStream
+from factors import bearing_range, se2
+from factors.odometry_chain import OdometryChain
+from factors.se2 import Array
+
+STEP = 0.05  # s between times and between shifts that are compared
+WINDOW = 0.2  # s over which a rate is taken, at least
+FARTHEST = 2.5  # s of shift
+LARGE = 0.15  # s: of a shift that is told
+SLOWEST = 1.0  # s between poses of a reference that tells rates
+FEWEST = 200  # times, and sightings, that are compared
+MOVES = 0.03  # rad/s and m/s: root mean square of rates, at least
+ALIKE = 0.6  # correlation of the same motion, at least
+BETTER = 0.7  # what is left unexplained at a shift that is told, at most, of what is at none
+DEGREES = (20.0, 150.0)  # times radians
+COVERED = 0.9  # share of a log whose reference is whole
+MOST = 2000  # sightings that are compared
+
+
+@dataclass(frozen=True)
+class Match:
+    """``shift`` [s]: how much later the one is stamped than the other; ``slope``: how many times as much it tells."""
+
+    shift: float
+    slope: float
+
+
+def motion_problems(log: Log) -> list[str]:
+    """Lines on sensors and a reference that do not fit the odometry, and on a reference that is shorter than it."""
+    stream = log.streams.get("odometry")
+    if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
+        return []
+    lines = _coverage(log, stream)
+    t = np.arange(stream.t[0], stream.t[-1], STEP) + log.rig.time_offset("odometry")
+    states = _integrated(log, stream).states(t)
+    heading, way = states[:, 3], states[:, 4]
+    gyro = log.streams.get("imu")
+    if isinstance(gyro, YawRateStream) and len(gyro.t) > 1:
+        turned = np.append(0.0, np.cumsum(gyro.w[:-1] * np.diff(gyro.t)))
+        told = np.interp(t, gyro.t + log.rig.time_offset("imu"), turned, left=np.nan, right=np.nan)
+        lines += _compared("imu", "the gyro", match(_rates(heading, WINDOW), _rates(told, WINDOW)))
+    reference = log.reference
+    pause = np.inf if reference is None or len(reference.t) < 2 else float(np.median(np.diff(reference.t)))
+    if reference is None or pause > SLOWEST:
+        return lines
+    window, poses = max(WINDOW, 2.0 * pause), reference.at(t, max_gap=3.0 * pause)
+    if reference.has_heading:
+        known = np.isfinite(poses[:, 2])
+        told = np.full(len(t), np.nan)
+        told[known] = np.unwrap(poses[known, 2])
+        lines += _compared("odometry", "the reference", match(_rates(heading, window), _rates(told, window)))
+    else:
+        found = match(_rates(way, window), _speeds(poses[:, :2], window))
+        lines += _compared("odometry", "the reference", found and Match(found.shift, 1.0))
+    return lines + _sightings(log)
+
+
+def match(rates: Array, others: Array) -> Match | None:
+    """How much later ``others`` (N,) tell what ``rates`` (N,) tell, at times ``STEP`` apart; None if they do not tell the same.
+
+    The slope is negative where they have the opposite sign. A shift that explains hardly more than none is none.
+    """
+    if np.count_nonzero(np.isfinite(rates) & np.isfinite(others)) < FEWEST:
+        return None
+    count = round(FARTHEST / STEP)
+    shifts = np.arange(-count, count + 1)
+    found = np.array([_correlation(rates, others, int(k)) for k in shifts])
+    best, none = int(np.argmax(np.abs(found[:, 0]))), count
+    if abs(found[best, 0]) < ALIKE:
+        return None
+    left = 1.0 - found[:, 0] ** 2
+    if abs(shifts[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
+        best = none
+    return Match(float(shifts[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
+
+
+def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
+    """Correlation and slope of ``others``, ``shift`` steps later, by ``rates``; zeros where neither moves."""
+    a = rates[max(0, -shift) : len(rates) - max(0, shift)]
+    b = others[max(0, shift) : len(others) - max(0, -shift)]
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    if len(a) < FEWEST or np.sqrt(np.mean(a**2)) < MOVES:
+        return 0.0, 0.0
+    aa, ab, bb = float(a @ a), float(a @ b), float(b @ b)
+    return (ab / np.sqrt(aa * bb), ab / aa) if bb > 0.0 else (0.0, 0.0)
+
+
+def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
+    """Lines on how a match differs from one of the same clock, sign and unit; ``sensor``: whose time_offset would mend it."""
+    if found is None:
+        return []
+    lines = []
+    if found.slope < 0.0:
+        lines.append(f"{name} turns the other way than the odometry: angles are counter-clockwise, seen from above")
+    size = abs(found.slope)
+    if DEGREES[0] < size < DEGREES[1]:
+        lines.append(f"{name} turns {size:.0f} times as much as the odometry: is it in degrees?")
+    elif DEGREES[0] < 1.0 / size < DEGREES[1]:
+        lines.append(f"the odometry turns {1.0 / size:.0f} times as much as {name}: is it in degrees?")
+    if found.shift:
+        # what is stamped too late gets a negative offset, and the odometry is too early where the other is too late
+        offset = -found.shift if sensor == "imu" else found.shift
+        lines.append(_off(name, found.shift, f"{sensor}.time_offset = {offset:+.2f}"))
+    return lines
+
+
+def _off(name: str, shift: float, mends: str) -> str:
+    late = "later" if shift > 0.0 else "earlier"
+    than = "the reference" if name == "bearing_range" else "the odometry"
+    return f"{name} is stamped about {abs(shift):.2f} s {late} than {than}: {mends} in the rig"
+
+
+def _integrated(log: Log, stream: VelocityStream | IncrementStream) -> OdometryChain:
+    chain = OdometryChain(log.rig.odometry_model(), horizon=np.inf)
+    t = stream.t + log.rig.time_offset("odometry")
+    if isinstance(stream, VelocityStream):
+        chain.add_velocities(t, stream.v, stream.w)
+    else:
+        chain.add_increments(t, stream.dx, stream.dy, stream.dtheta)
+    return chain
+
+
+def _rates(values: Array, window: float) -> Array:
+    """How fast values (N,) grow, over a window about each time; NaN at the ends."""
+    half = max(1, round(window / STEP / 2.0))
+    out = np.full(len(values), np.nan)
+    out[half : len(values) - half] = (values[2 * half :] - values[: len(values) - 2 * half]) / (2 * half * STEP)
+    return out
+
+
+def _speeds(places: Array, window: float) -> Array:
+    """The same of places (N, 2), without direction."""
+    return np.asarray(np.hypot(_rates(places[:, 0], window), _rates(places[:, 1], window)))
+
+
+def _coverage(log: Log, stream: VelocityStream | IncrementStream) -> list[str]:
+    if log.reference is None:
+        return []
+    first, last = float(stream.t[0]), float(stream.t[-1])
+    begin, end = max(first, float(log.reference.t[0])), min(last, float(log.reference.t[-1]))
+    if end - begin >= COVERED * (last - first):
+        return []
+    if end <= begin:
+        return ["the reference has no pose while there is odometry"]
+    return [f"the reference covers {begin:.1f} to {end:.1f} s of the odometry's {first:.1f} to {last:.1f} s"]
+
+
+def _sightings(log: Log) -> list[str]:
+    """A line, if sightings of mapped landmarks fit the reference better at another time."""
+    stream, reference = log.streams.get("bearing_range"), log.reference
+    if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.bearing_range is None:
+        return []
+    rows = np.array([i for i, name in enumerate(stream.landmark) if name in log.world.landmarks], dtype=np.int64)
+    if len(rows) < FEWEST:
+        return []
+    rows = rows[:: max(1, len(rows) // MOST)]
+    marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
+    places = np.array([(mark.x, mark.y) for mark in marks])
+    model, t = log.rig.bearing_range.model(), stream.t[rows] + log.rig.time_offset("bearing_range")
+    count = round(FARTHEST / STEP)
+    shifts = STEP * np.arange(-count, count + 1)
+    costs = []
+    for shift in shifts.tolist():
+        ranges, bearings = bearing_range.predict(model, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
+        off = [np.abs(stream.range[rows] - ranges) / model.range_sigma]
+        if reference.has_heading:
+            off.append(np.abs(se2.wrap(stream.bearing[rows] - bearings)) / model.bearing_sigma)
+        told = [kept for one in off if len(kept := one[np.isfinite(one)]) >= FEWEST // 2]
+        costs.append(sum(float(np.median(one)) for one in told) if told else np.inf)
+    best = int(np.argmin(costs))
+    if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[count]:
+        return []
+    shift = float(shifts[best])
+    return [_off("bearing_range", shift, f"bearing_range.time_offset = {-shift:+.2f}")]

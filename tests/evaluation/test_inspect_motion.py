@@ -1,0 +1,115 @@
+"""What `inspect` says about sensors and references that do not fit the odometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.inspect import inspect
+from factorgraph_loc.evaluation.inspect_motion import motion_problems
+from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream, YawRateStream
+from factorgraph_loc.rig import BearingRangeSettings, OdometrySettings, Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World
+from factors import bearing_range, se2
+
+SETTINGS = BearingRangeSettings(range_sigma=0.1, bearing_sigma=0.03)
+PLACES = {"a": (0.0, 0.0), "b": (6.0, 1.0), "c": (3.0, 7.0)}
+
+
+@pytest.fixture
+def log():
+    """Two minutes of a robot that turns to and fro, stops and goes, with a gyro and sightings; all have noise."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 120.0, 0.05)
+    v = np.where(t % 20.0 < 14.0, 0.4 + 0.1 * np.sin(t), 0.0)
+    w = 0.4 * np.sin(0.7 * t) * (v > 0.0)
+    poses = np.zeros((len(t), 3))
+    for i in range(1, len(t)):
+        poses[i] = se2.compose(poses[i - 1], se2.exp(0.05 * np.array((v[i - 1], 0.0, w[i - 1]))))
+    seen = np.repeat(np.arange(0, len(t), 5), len(PLACES))
+    marks = np.tile(list(PLACES.values()), (len(seen) // len(PLACES), 1))
+    ranges, bearings = bearing_range.predict(SETTINGS.model(), poses[seen], marks)
+    ranges, bearings = ranges + 0.1 * rng.standard_normal(len(seen)), bearings + 0.03 * rng.standard_normal(len(seen))
+    return Log(
+        name="drive",
+        rig=Rig(bearing_range=SETTINGS),
+        world=World(landmarks={name: Landmark(x=x, y=y) for name, (x, y) in PLACES.items()}),
+        streams={
+            "odometry": VelocityStream(t, v, w + 0.02 * rng.standard_normal(len(t)) * (v > 0.0)),
+            "imu": YawRateStream(t, w + 0.02 * rng.standard_normal(len(t)) + 0.01),
+            "bearing_range": BearingRangeStream(t[seen], list(PLACES) * (len(seen) // len(PLACES)), ranges, bearings),
+        },
+        reference=Trajectory(t[::2], poses[::2]),
+    )
+
+
+def later(log, **shifts):
+    """The log with streams that are stamped later, by name."""
+    streams = {k: replace(s, t=s.t + shifts.get(k, 0.0)) for k, s in log.streams.items()}
+    return replace(log, streams=streams)
+
+
+def test_a_log_that_fits_has_no_problems(log):
+    assert motion_problems(log) == []
+
+
+@pytest.mark.parametrize("shift", [-1.5, -0.2, 0.2, 0.6, 2.0])
+@pytest.mark.parametrize("sensor", ["imu", "bearing_range"])
+def test_a_clock_that_is_off_is_told_with_what_mends_it(log, sensor, shift):
+    off = later(log, **{sensor: shift})
+    (line,) = motion_problems(off)
+    assert line.startswith("the gyro" if sensor == "imu" else sensor)
+    assert f"{abs(shift):.2f} s {'later' if shift > 0 else 'earlier'}" in line
+    assert f"{sensor}.time_offset = {-shift:+.2f}" in line
+    assert line in inspect(off).problems
+
+
+@pytest.mark.parametrize("has_heading", [True, False])
+@pytest.mark.parametrize("shift", [-0.3, 1.0])
+def test_a_reference_by_another_clock_is_told(log, shift, has_heading):
+    reference = Trajectory(log.reference.t + shift, log.reference.poses, has_heading=has_heading)
+    alone = replace(log, reference=reference, streams={"odometry": log.streams["odometry"]})
+    (line,) = motion_problems(alone)
+    assert f"odometry.time_offset = {shift:+.2f}" in line
+    mended = replace(alone, rig=Rig(odometry=OdometrySettings(time_offset=shift)))
+    assert motion_problems(mended) == []
+
+
+def test_headings_that_run_clockwise_are_told(log):
+    reference = Trajectory(log.reference.t, se2.wrap(log.reference.poses * (1.0, 1.0, -1.0)))
+    lines = motion_problems(replace(log, reference=reference, streams={"odometry": log.streams["odometry"]}))
+    assert lines == [
+        "the reference turns the other way than the odometry: angles are counter-clockwise, seen from above"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "line"),
+    [
+        ("imu", "the gyro turns 57 times as much as the odometry: is it in degrees?"),
+        ("odometry", "the odometry turns 57 times as much as the gyro: is it in degrees?"),
+    ],
+)
+def test_turn_rates_in_degrees_are_told(log, sensor, line):
+    stream = log.streams[sensor]
+    streams = log.streams | {sensor: replace(stream, w=np.rad2deg(stream.w))}
+    assert line in motion_problems(replace(log, streams=streams))
+
+
+def test_a_reference_that_is_shorter_than_the_log_is_told(log):
+    part = replace(log, reference=Trajectory(log.reference.t[200:500], log.reference.poses[200:500]))
+    assert "the reference covers 20.0 to 49.9 s of the odometry's 0.0 to 120.0 s" in motion_problems(part)
+    beside = replace(log, reference=Trajectory(log.reference.t + 1000.0, log.reference.poses))
+    assert "the reference has no pose while there is odometry" in motion_problems(beside)
+
+
+def test_noise_at_rest_tells_nothing(log):
+    rng = np.random.default_rng(2)
+    t = log.streams["odometry"].t
+    still = {
+        "odometry": VelocityStream(t, np.zeros(len(t)), np.zeros(len(t))),
+        "imu": YawRateStream(t, 0.005 * rng.standard_normal(len(t))),
+    }
+    poses = 0.001 * rng.standard_normal((len(t), 3))
+    assert motion_problems(replace(log, streams=still, reference=Trajectory(t, poses))) == []
