@@ -90,6 +90,16 @@ class Learnt:
     points: PointMap | None = None
 
 
+@dataclass(frozen=True)
+class Written:
+    """What :class:`Diagnostics` held at a time, or what was added since: rows of ``nis``, and counts of the rest."""
+
+    nis: Mapping[str, int]
+    residuals: Mapping[str, int]
+    ignored: Mapping[str, int]
+    rejected: Mapping[str, int]
+
+
 @dataclass
 class Diagnostics:
     """Counts and consistency figures of a run.
@@ -117,6 +127,39 @@ class Diagnostics:
 
     def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
         self.nis.setdefault(sensor, []).append((t, nis, dof))
+
+    def mark(self) -> Written:
+        """What there is now, for :meth:`since`."""
+        rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
+        return Written(rows, values, dict(self.ignored), dict(self.rejected))
+
+    def since(self, mark: Written) -> Written:
+        """What was added since then."""
+        now = self.mark()
+        return Written(
+            _added(mark.nis, now.nis),
+            _added(mark.residuals, now.residuals),
+            _added(mark.ignored, now.ignored),
+            _added(mark.rejected, now.rejected),
+        )
+
+    def take_back(self, written: Written) -> None:
+        """Take out what was last added, as what it tells of will be taken once more: a measurement counts once, however often an
+        estimator goes back in time. What was ``late`` stays, and so do ``events``, which did happen."""
+        for lists, counts in ((self.nis, written.nis), (self.residuals, written.residuals)):
+            for name, count in counts.items():
+                del lists[name][max(0, len(lists[name]) - count) :]
+                if not lists[name]:
+                    del lists[name]
+        for totals, counts in ((self.ignored, written.ignored), (self.rejected, written.rejected)):
+            for name, count in counts.items():
+                totals[name] -= count
+                if not totals[name]:
+                    del totals[name]
+
+
+def _added(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
+    return {name: count - before.get(name, 0) for name, count in after.items() if count > before.get(name, 0)}
 
 
 class Estimator(Protocol):

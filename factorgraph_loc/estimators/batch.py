@@ -73,6 +73,7 @@ class Batch(GraduatedGraph):
         super().__init__(setup, settings)
         self._widest = settings.widest_loss
         self._guesses: Values = {}
+        self._guess_spreads: Values = {}  # of keyframes
         self._ahead: SmootherAhead | None = None
         if self._unknown is not None:
             self._ahead = SmootherAhead(setup, settings)
@@ -116,28 +117,30 @@ class Batch(GraduatedGraph):
         return self._optimum(self._constant_priors()[0] | self._guesses)
 
     def _begin(self, first: Keyframe) -> None:
-        self._guesses[first.key] = self._pose
+        self._refine(first, (self._pose, self._covariance))
 
     def _begin_again(self, newest: Keyframe) -> None:
         kept = {k.key for k in self._keyframes}
         self._guesses = {key: value for key, value in self._guesses.items() if key in kept or key in self._constants}
-        self._guesses[newest.key] = self._pose
+        self._refine(newest, (self._pose, self._covariance))
 
-    def _pose_of(self, keyframe: int) -> Array:
-        return self._guesses[pose_key(keyframe)]
+    def _guess_of(self, keyframe: int) -> Guess:
+        key = pose_key(keyframe)
+        return self._guesses[key], self._guess_spreads[key]
 
     def _current(self, key: int) -> Array:
         return self._guesses[key]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        self._pose, self._covariance = addition.values[keyframe.key], spread
         self._guesses |= addition.values
+        self._pose, self._covariance = addition.values[keyframe.key], spread
+        self._guess_spreads[keyframe.key] = spread
 
     def _refine(self, newest: Keyframe, guess: Guess) -> None:
-        self._guesses[newest.key] = guess[0]
+        self._guesses[newest.key], self._guess_spreads[newest.key] = guess
 
     def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         self._guesses |= addition.values
         if guess is not None:
             self._pose, self._covariance = guess
-            self._guesses[keyframe.key] = self._pose
+            self._refine(keyframe, guess)

@@ -7,12 +7,21 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEstimate, PosePrior, gaussian_belief
+from factorgraph_loc.estimators.base import (
+    Belief,
+    Diagnostics,
+    Learnt,
+    PoseEstimate,
+    PosePrior,
+    Written,
+    gaussian_belief,
+)
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.files import FileModel
@@ -39,11 +48,25 @@ class FilterSettings(FileModel):
     smooth: bool = True
 
 
+@dataclass(frozen=True)
+class _Taken:
+    """A measurement with what there was before it: the filter's state, time and odometry, and how many records and ticks; and what
+    the diagnostics say of it."""
+
+    measurement: Exteroceptive | Tick
+    state: Any
+    t: float
+    odometry: ChainState
+    records: int
+    ticks: int
+    written: Written
+
+
 class Filter(ABC):
     """A recursive estimator: predicts along the odometry to each measurement's time, then updates.
 
     The state is replaced, never changed in place, so that a checkpoint costs nothing: a late measurement goes back to the
-    checkpoint before its time and takes the events since then once more.
+    checkpoint before its time and takes those since then once more.
     """
 
     deterministic = True
@@ -62,14 +85,14 @@ class Filter(ABC):
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._ticks: list[float] = []
         self._records: list[Any] = []
-        self._events: deque[tuple[Exteroceptive | Tick, tuple[Any, ...]]] = deque()
+        self._taken: deque[_Taken] = deque()  # the last ones, as far back as one may be late
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian."""
         self._t = prior.t
         self._odometry = self._motion.state(prior.t)
         self._state = self._start(prior)
-        self._events.clear()
+        self._taken.clear()
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
@@ -83,7 +106,7 @@ class Filter(ABC):
             self._begin(measurement)
         elif measurement.t >= self._t:
             self._take(measurement)
-        elif measurement.t < self._t - self._max_delay or not self._events:
+        elif measurement.t < self._t - self._max_delay or not self._taken:
             self._drop_late(measurement)
         else:
             self._take_late(measurement)
@@ -108,8 +131,9 @@ class Filter(ABC):
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
         del self._records[:records], self._ticks[:ticks]
-        # checkpoints tell how many there were
-        self._events = deque((m, (*rest, r - records, k - ticks)) for m, (*rest, r, k) in self._events)
+        self._taken = deque(
+            replace(taken, records=taken.records - records, ticks=taken.ticks - ticks) for taken in self._taken
+        )
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
@@ -157,10 +181,8 @@ class Filter(ABC):
             self.diagnostics.ignore("before the start")
 
     def _take(self, m: Exteroceptive | Tick) -> None:
-        checkpoint = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
-        self._events.append((m, checkpoint))
-        while self._events[0][0].t < m.t - self._max_delay:
-            self._events.popleft()
+        before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+        mark = self.diagnostics.mark()
         if m.t > self._t:
             odometry = self._motion.state(m.t)
             self._predict(self._motion.relative(self._odometry, odometry))
@@ -174,13 +196,16 @@ class Filter(ABC):
         else:
             self._look(m)
         self._records.append(self._record())
+        self._taken.append(_Taken(m, *before, self.diagnostics.since(mark)))
+        while self._taken[0].measurement.t < m.t - self._max_delay:
+            self._taken.popleft()
 
     def _take_late(self, late: Exteroceptive | Tick) -> None:
         again: list[Exteroceptive | Tick] = []
-        while self._events and self._t > late.t:
-            m, checkpoint = self._events.pop()
-            again.append(m)
-            self._go_back(checkpoint)
+        while self._taken and self._t > late.t:
+            last = self._taken.pop()
+            again.append(last.measurement)
+            self._go_back(last)
         if self._t > late.t:
             self._drop_late(late)
         else:
@@ -196,9 +221,10 @@ class Filter(ABC):
         elif isinstance(m, PixelSightings | CameraFrame):
             self.diagnostics.drop_late("camera", len(m.pixels))
 
-    def _go_back(self, checkpoint: tuple[Any, ...]) -> None:
-        self._state, self._t, self._odometry, records, ticks = checkpoint
-        del self._records[records:], self._ticks[ticks:]
+    def _go_back(self, taken: _Taken) -> None:
+        self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry
+        del self._records[taken.records :], self._ticks[taken.ticks :]
+        self.diagnostics.take_back(taken.written)
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:

@@ -36,7 +36,7 @@ from factors import reprojection, se2
 from factors.bearing_range import TIME_OFFSET
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment
-from factors.rfid_factor import ROWS, RfidFactor
+from factors.rfid_factor import ROWS
 from factors.rfid_likelihood import Looks
 from factors.se2 import Array
 
@@ -91,8 +91,8 @@ class MeasuringGraph(KeyframeGraph):
         """
 
     @abstractmethod
-    def _pose_of(self, keyframe: int) -> Array:
-        """The causal estimate (3,) of a keyframe."""
+    def _guess_of(self, keyframe: int) -> Guess:
+        """The causal estimate of a keyframe."""
 
     @abstractmethod
     def _current(self, key: int) -> Array:
@@ -148,7 +148,7 @@ class MeasuringGraph(KeyframeGraph):
         offset = self._since(keyframe, m.t).delta if m.t > keyframe.t else np.zeros(3)
         here = looks.moved(offset)
         if keyframe is not self._keyframes[-1]:
-            self._add_late(keyframe, self._scans.factors(m, here), m)
+            self._add_late(keyframe, m, here)
             return
         update = self._scans.update(m, here, self._pose, self._covariance)
         if update is None:
@@ -170,10 +170,11 @@ class MeasuringGraph(KeyframeGraph):
         self._pose, self._covariance = update.pose, update.covariance
         self._refine(self._keyframes[-1], (update.pose, update.covariance))
 
-    def _add_late(self, keyframe: Keyframe, factors: list[RfidFactor], m: RfidScan) -> None:
+    def _add_late(self, keyframe: Keyframe, m: RfidScan, looks: Looks) -> None:
         if not self._is_open(keyframe.index):
             self._drop_late(m)
             return
+        factors = self._scans.late_factors(m, looks, *self._guess_of(keyframe.index))
         nodes = [Node((keyframe.key,), factor, ROWS) for factor in factors]
         keyframe.nodes += nodes
         self._attach(keyframe, Addition([*self._gather(), *nodes]), None)
@@ -215,7 +216,7 @@ class MeasuringGraph(KeyframeGraph):
         """Turn a measurement into factors of ``keyframe``; returned is the guess of its pose, updated by them.
 
         The guess is where the graph linearises first, and what the robust weights are computed at. Without one (the keyframe is
-        an older one) landmarks that are not yet in the graph stay out.
+        an older one) landmarks that are not yet in the graph stay out, and the innovation is that of its causal estimate.
         """
         twist = self._motion.twist(m.t) if TIME_OFFSET in self._sensor_constants.indices else None
         nodes: list[Node] = []
@@ -235,14 +236,16 @@ class MeasuringGraph(KeyframeGraph):
             nodes.append(Node((keyframe.key, *shared, key), factor, 2))
             here = factor.fixed(constants, self._constants[key])
             seen.append(replace(here, point_covariances=self._spreads[key][None]))
-        if guess is not None:
-            if known is not None:
-                self._observed(m.t, known.fixed(constants, None), guess)
-            if seen:
-                factor = landmarks.together(seen)
-                update = robust_update(factor, *guess, ITERATIONS_OF_GUESS)
-                self._landmarks.report(m.t, factor, update)
+        if guess is not None and known is not None:
+            self._observed(m.t, known.fixed(constants, None), guess)
+        if seen:
+            factor = landmarks.together(seen)
+            expected = self._guess_of(keyframe.index) if guess is None else guess
+            update = robust_update(factor, *expected, ITERATIONS_OF_GUESS)
+            self._landmarks.report(m.t, factor, update)
+            if guess is not None:
                 guess = se2.compose(guess[0], se2.exp(update.delta)), update.covariance
+        if guess is not None:
             for name, factor in met:
                 self._meet(name, factor, keyframe, guess, addition)
         keyframe.nodes += nodes
@@ -257,18 +260,18 @@ class MeasuringGraph(KeyframeGraph):
         twist = self._motion.twist(m.t) if self._points.needs_twist else None
         shared = (CAMERA_KEY,) if self._camera_constants.names else ()
         constants = [self._constants[key] for key in shared]
-        pose, covariance = (self._pose_of(keyframe.index), self._covariance) if guess is None else guess
-        predicted = Predicted(pose, covariance, *constants, *(self._spreads[key] for key in shared))
+        expected = self._guess_of(keyframe.index) if guess is None else guess
+        predicted = Predicted(*expected, *constants, *(self._spreads[key] for key in shared))
         factor = self._points.factor(m, predicted, offset, twist)
         if factor is None:
             return guess if guess is None else self._spot_others(keyframe, m, guess, addition)
         node = Node((keyframe.key, *shared), factor, 2 * len(factor.points))
         keyframe.nodes.append(node)
         addition.nodes.append(node)
+        update = pixel_update(factor, *expected, *constants, *(self._spreads[key] for key in shared))
+        self._points.report(m.t, factor, update)
         if guess is None:
             return None
-        update = pixel_update(factor, *guess, *constants, *(self._spreads[key] for key in shared))
-        self._points.report(m.t, factor, update)
         guess = se2.compose(guess[0], se2.exp(update.delta[:3])), update.covariance[:3, :3]
         return self._spot_others(keyframe, m, guess, addition)
 

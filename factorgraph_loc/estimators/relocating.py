@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status
+from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status, Written
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
@@ -40,6 +40,7 @@ from factors.se2 import Array
 
 # m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
 UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
+NOTHING_WRITTEN = Written({}, {}, {}, {})
 SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 
 
@@ -65,7 +66,8 @@ class RelocatingGraph(MeasuringGraph):
         self._sought = KnownLandmarks(setup, Diagnostics())
         self._camera = PixelFinder(self._points, self._motion)
         self._searched: ChainState | None = None
-        self._recent: deque[Exteroceptive | Tick] = deque()
+        # the last measurements, in the order in which they were taken, with what the diagnostics say of them
+        self._recent: deque[tuple[Exteroceptive | Tick, Written]] = deque()
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
@@ -74,7 +76,6 @@ class RelocatingGraph(MeasuringGraph):
         elif self._prior is None:
             self._search(measurement)
         else:
-            self._remember(measurement)
             super().process(measurement)
             if isinstance(measurement, Pixels):
                 self._watch(measurement)
@@ -126,10 +127,23 @@ class RelocatingGraph(MeasuringGraph):
             return seen
         return self._relocalizer.best if self._finder is None else self._finder.best
 
-    def _remember(self, m: Exteroceptive | Tick) -> None:
-        self._recent.append(m)
-        while self._recent[0].t < m.t - DURATION:
+    def _take(self, m: Exteroceptive | Tick) -> None:
+        mark = self.diagnostics.mark()
+        super()._take(m)
+        self._remember(m, self.diagnostics.since(mark))
+
+    def _remember(self, m: Exteroceptive | Tick, written: Written = NOTHING_WRITTEN) -> None:
+        self._recent.append((m, written))
+        while self._recent[0][0].t < m.t - DURATION:
             self._recent.popleft()
+
+    def _take_back(self, t: float) -> list[Exteroceptive | Tick]:
+        """The last measurements from ``t`` on, by their times: forgotten, as they are taken once more."""
+        again = [(m, written) for m, written in self._recent if m.t >= t]
+        self._recent = deque((m, written) for m, written in self._recent if m.t < t)
+        for _, written in reversed(again):
+            self.diagnostics.take_back(written)
+        return sorted((m for m, _ in again), key=lambda m: m.t)
 
     def _search(self, m: Exteroceptive | Tick) -> None:
         """Before the start: see whether what was seen tells one place by now, and start there."""
@@ -140,7 +154,7 @@ class RelocatingGraph(MeasuringGraph):
         self._remember(m)
         if not looked or self._best() is None:
             return
-        replay = sorted(self._recent, key=lambda m: m.t)
+        replay = self._take_back(-math.inf)
         self.diagnostics.events.append((m.t, "localized"))
         t = replay[0].t
         self.initialize(PosePrior(t, self._placed(t), UNKNOWN))
@@ -207,12 +221,12 @@ class RelocatingGraph(MeasuringGraph):
         while not self._is_open(index - 1):
             index += 1
         t = max(since, self._keyframes[index - 1].t)
-        replay = sorted((m for m in self._recent if m.t >= t), key=lambda m: m.t)
+        replay = self._take_back(t)
         t = replay[0].t
         del self._keyframes[index:], self._keyframe_times[index:]
         self._ticks = [tick for tick in self._ticks if tick.keyframe < index and tick.t < t]
         pose = self._placed(t)
-        jump = Increment(se2.between(self._pose_of(index - 1), pose), UNKNOWN, t - self._keyframes[-1].t)
+        jump = Increment(se2.between(self._guess_of(index - 1)[0], pose), UNKNOWN, t - self._keyframes[-1].t)
         keyframe = Keyframe(index, t, self._motion.state(t), jump)
         self._keyframes.append(keyframe)
         self._keyframe_times.append(t)

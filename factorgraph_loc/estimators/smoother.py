@@ -118,8 +118,8 @@ class Smoother(RelocatingGraph):
         except RuntimeError as error:
             raise self._unsolved(error) from error
 
-    def _pose_of(self, keyframe: int) -> Array:
-        return self._filtered[keyframe][0]
+    def _guess_of(self, keyframe: int) -> Guess:
+        return self._filtered[keyframe]
 
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
         guess = addition.values[keyframe.key], spread

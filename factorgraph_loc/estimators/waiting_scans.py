@@ -41,6 +41,14 @@ class WaitingScans:
             factors.append(RfidFactor(self._signals.strength, strengths.moved(looks.offsets[0])))
         return factors
 
+    def late_factors(self, m: RfidScan, looks: Looks, pose: Array, covariance: Array) -> list[RfidFactor]:
+        """The :meth:`factors` of a late scan, which do not wait; its innovation is that of a pose (3,) with body-frame covariance
+        (3, 3)."""
+        detection, *strengths = self.factors(m, looks)
+        update = tags.updated([detection], pose, covariance, iterations=1)
+        self._diagnostics.innovation("rfid", m.t, update.nis, update.dof)
+        return [detection, *strengths]
+
     def update(self, m: RfidScan, looks: Looks, pose: Array, covariance: Array) -> TagUpdate | None:
         """What the :meth:`factors` of a scan make of a pose (3,) with body-frame covariance (3, 3); they wait from now on. None in
         a silence, which is no evidence.

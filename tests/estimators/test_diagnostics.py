@@ -1,0 +1,91 @@
+"""What estimators tell of measurements: each counts once, in time or late, and also where an estimator goes back in time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.registry import Setup, create, settings_of
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import BearingRangeStream, cut, join
+from factorgraph_loc.measurements import RfidScan
+from factorgraph_loc.simulation import named_settings
+from factorgraph_loc.simulation import simulate as simulated
+
+SETTINGS = {"particle_filter": {"particles": 300}, "smoother": {"lag": 5.0}}
+ESTIMATORS = ("ekf", "particle_filter", "smoother", "batch")
+
+
+def looks(log):
+    return np.unique(log.streams["bearing_range"].t)
+
+
+def told(result):
+    return np.sort([t for t, _, _ in result.diagnostics.nis["bearing_range"]])
+
+
+@pytest.fixture(scope="module")
+def late(simulate):
+    """Each third look comes 0.3 s late, after the next one; the landmark x is in no map."""
+    log = simulate(seconds=15.0)
+    seen = log.streams["bearing_range"]
+    stamps = np.unique(seen.t)
+    delayed = np.isin(seen.t, stamps[::3])
+    order = np.argsort(seen.t + 0.3 * delayed, kind="stable")
+    names = ["x" if name == "a" else name for name in seen.landmark]
+    stream = BearingRangeStream(seen.t[order], [names[i] for i in order], seen.range[order], seen.bearing[order])
+    return replace(log, streams={**log.streams, "bearing_range": stream})
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_late_look_counts_once(late, name):
+    result = run(late, RunConfig(name, SETTINGS.get(name, {})))
+    stream = late.streams["bearing_range"]
+    known = {t for t, name in zip(stream.t.tolist(), stream.landmark, strict=True) if name != "x"}
+    assert told(result).tolist() == sorted(known)
+    assert result.diagnostics.ignored == {"landmark not in the map": list(stream.landmark).count("x")}
+    values = sum(n != "x" for n in stream.landmark)
+    assert len(result.diagnostics.residuals["bearing_range.range"]) == values
+    assert result.diagnostics.late == {}
+
+
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_a_look_counts_once_when_a_graph_goes_back(simulate, name):
+    log = simulate(seconds=20.0)
+    kidnapped = join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
+    result = run(kidnapped, RunConfig(name))
+    assert [what.partition(":")[0] for _, what in result.diagnostics.events] == ["lost"]
+    assert told(result).tolist() == looks(kidnapped).tolist()
+
+
+@pytest.mark.parametrize("name", ["smoother", "particle_filter"])
+def test_late_scans_count_once(name):
+    changes = {"drive": {"duration": 12.0}, "world": {"tags": 12}}
+    log = simulated(named_settings("office", changes), 3)
+    setup = Setup(log.rig, log.world, ("odometry", "rfid"), np.random.default_rng(1))
+    estimator = create(name, setup, settings_of(name, {"max_delay": 1.0} | SETTINGS[name]))
+    estimator.initialize(resolve_prior(log, None)[0])
+    rows = list(log.measurements(("odometry", "rfid")))
+    scans = [m for m in rows if isinstance(m, RfidScan)]
+    held = {m.t for m in scans[::4]}
+    for m in sorted(rows, key=lambda m: m.t + 0.7 * (m.t in held and isinstance(m, RfidScan))):
+        estimator.process(m)
+    assert sorted(t for t, _, _ in estimator.diagnostics.nis["rfid"]) == [m.t for m in scans]
+    assert estimator.diagnostics.late == {}
+
+
+def test_what_is_taken_back_leaves_no_trace():
+    diagnostics = Diagnostics()
+    diagnostics.innovation("camera", 1.0, 2.0, 2)
+    diagnostics.ignore("stranger", 2)
+    before = repr(diagnostics)
+    mark = diagnostics.mark()
+    diagnostics.innovation("camera", 2.0, 2.0, 2)
+    diagnostics.innovation("rfid", 2.0, 1.0, 1)
+    diagnostics.residuals.setdefault("camera.u", []).extend((1.0, 2.0))
+    diagnostics.ignore("stranger")
+    diagnostics.reject("astray", 3)
+    diagnostics.take_back(diagnostics.since(mark))
+    assert repr(diagnostics) == before
