@@ -22,6 +22,7 @@ from factorgraph_loc.evaluation import features as feature_scores
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.experiments import run as running
@@ -95,6 +96,7 @@ def run(
     sensors: Sequence[str] | None = None,
     prior: str | None = None,
     seed: int = 0,
+    max_gap: float = MAX_GAP,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -106,7 +108,7 @@ def run(
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
     loaded = _one(log)
-    config = RunConfig(estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed)
+    config = RunConfig(estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap)
     result = running.run(loaded, config, progress)
     if out is None:
         return Run(result, score(result, loaded))
@@ -124,6 +126,7 @@ def compare(
     sensors: Sequence[str] | None = None,
     prior: str | None = None,
     seeds: Iterable[int] = (0,),
+    max_gap: float = MAX_GAP,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -138,7 +141,9 @@ def compare(
         raise InputError(f"settings are given of {others[0]}, which is not run here; run: {', '.join(estimators)}")
     used = None if sensors is None else tuple(sensors)
     chosen = list(seeds)
-    configs = [RunConfig(name, named.get(name, {}), used, prior, seed) for name in estimators for seed in chosen]
+    configs = [
+        RunConfig(name, named.get(name, {}), used, prior, seed, max_gap) for name in estimators for seed in chosen
+    ]
     return comparing.compare(_all(logs), configs, Path(out), jobs=jobs, overwrite=overwrite, progress=progress)
 
 

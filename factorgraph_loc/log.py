@@ -288,7 +288,7 @@ def cut(log: Log, start: float, end: float) -> Log:
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
     """A kidnapped robot: ``second`` begins ``gap`` seconds after the end of ``first``, wherever the robot is then.
 
-    All stamps of ``second`` are shifted alike, those of the reference too; across a gap above 0.1 s that is not scored. The last
+    All stamps of ``second`` are shifted alike, those of the reference too; in a gap between its poses nothing is scored. The last
     velocity of ``first`` is held until the first row of ``second``. The first increment of ``second`` becomes zero: wheels do not
     feel how they are carried. Start, metadata and absolute time are those of ``first``. InputError if rig, map or kind of
     odometry differ, or if ``gap`` is not above zero.

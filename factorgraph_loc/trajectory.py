@@ -37,20 +37,44 @@ class Trajectory:
 
     def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
         """Poses (M, 3) at times ``t`` (M,), along the arc between neighbours; NaN outside and in gaps above ``max_gap``."""
-        t = np.asarray(t, dtype=float)
         out = np.full((len(t), 3), np.nan)
         if len(self.t) == 0:
             return out
-        after = np.clip(np.searchsorted(self.t, t, side="left"), 0, len(self.t) - 1)
-        exact = self.t[after] == t
-        before = np.where(exact, after, np.maximum(after - 1, 0))
-        gap = self.t[after] - self.t[before]
-        valid = (t >= self.t[0]) & (t <= self.t[-1]) & (gap <= max_gap + 1e-9)
-        fraction = np.where(gap > 0.0, (t - self.t[before]) / np.where(gap > 0.0, gap, 1.0), 0.0)
+        before, after, fraction, valid = neighbours(self.t, t, max_gap)
         start = self.poses[before]
         twist = se2.log(se2.between(start, self.poses[after]))
         out[valid] = se2.compose(start, se2.exp(fraction[:, None] * twist))[valid]
         return out
+
+    def covariances_at(self, t: Array, *, max_gap: float = np.inf) -> Array:
+        """Covariances (M, 3, 3) at times ``t`` (M,), averages of those of the neighbours by how near they are; NaN outside and in
+        gaps above ``max_gap``. ValueError for a trajectory without covariances."""
+        if self.covariances is None:
+            raise ValueError("the trajectory has no covariances")
+        out = np.full((len(t), 3, 3), np.nan)
+        if len(self.t) == 0:
+            return out
+        before, after, fraction, valid = neighbours(self.t, t, max_gap)
+        out[valid] = averaged(self.covariances, before, after, fraction)[valid]
+        return out
+
+
+def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
+    """Of times ``t`` (M,) the ``stamps`` (N,), ascending, N > 0, between which they lie: their indices, twice the same where a time
+    is a stamp; what share of the way there; and whether a time lies inside, and not in a gap above ``max_gap``."""
+    t = np.asarray(t, dtype=float)
+    after = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
+    before = np.where(stamps[after] == t, after, np.maximum(after - 1, 0))
+    gap = stamps[after] - stamps[before]
+    valid = (t >= stamps[0]) & (t <= stamps[-1]) & (gap <= max_gap + 1e-9)
+    fraction = np.where(gap > 0.0, (t - stamps[before]) / np.where(gap > 0.0, gap, 1.0), 0.0)
+    return before, after, fraction, valid
+
+
+def averaged(covariances: Array, before: Integers, after: Integers, fraction: Array) -> Array:
+    """Covariances (M, D, D) between neighbours among ``covariances`` (N, D, D): see :func:`neighbours`."""
+    weight = fraction[:, None, None]
+    return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
 
 
 def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:

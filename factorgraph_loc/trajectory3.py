@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory import Integers, Trajectory, averaged, neighbours
 from factors.se2 import Array
 
 
@@ -34,12 +35,25 @@ class Trajectory3:
 
     def at(self, t: Array) -> Trajectory3:
         """The poses at times ``t`` (M,), which must lie between the first and the last stamp: straight between neighbours, turning
-        evenly."""
+        evenly; covariances, if there are any, averaged by how near they are."""
         t = np.asarray(t, dtype=float)
+        before, after, fraction, _ = neighbours(self.t, t, np.inf)
+        covariances = None if self.covariances is None else averaged(self.covariances, before, after, fraction)
         if len(self) == 1:
-            return Trajectory3(t, np.repeat(self.positions, len(t), axis=0), np.repeat(self.rotations, len(t), axis=0))
+            alike = self.rows(np.zeros(len(t), dtype=np.int64))
+            return Trajectory3(t, alike.positions, alike.rotations, covariances)
         positions = np.column_stack([np.interp(t, self.t, self.positions[:, i]) for i in range(3)])
-        return Trajectory3(t, positions, Slerp(self.t, Rotation.from_matrix(self.rotations))(t).as_matrix())
+        rotations = Slerp(self.t, Rotation.from_matrix(self.rotations))(t).as_matrix()
+        return Trajectory3(t, positions, rotations.reshape(-1, 3, 3), covariances)
+
+    def spans(self, t: Array, *, max_gap: float) -> NDArray[np.bool_]:
+        """Which of the times ``t`` (M,) lie between the first and the last stamp, and not in a gap above ``max_gap``."""
+        return neighbours(self.t, t, max_gap)[3]
+
+    def rows(self, which: Integers) -> Trajectory3:
+        """Some of the poses."""
+        covariances = None if self.covariances is None else self.covariances[which]
+        return Trajectory3(self.t[which], self.positions[which], self.rotations[which], covariances)
 
     def planar(self) -> Trajectory:
         """The same seen from above: (x, y) and the direction of the first axis."""

@@ -7,19 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from factorgraph_loc.calibration.consistency import Consistency, Evaluate, inflated, make_consistent
 from factorgraph_loc.calibration.learn import EXTEROCEPTIVE, Knowledge, has_heading, learn, sensing
 from factorgraph_loc.calibration.rfid_rounds import distinct
 from factorgraph_loc.calibration.rfid_tempering import tempered
-from factorgraph_loc.calibration.windows import REFERENCE_GAP
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, RfidStream, VelocityStream
 from factorgraph_loc.rfid_settings import default_models
 from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
 
 Scores = Mapping[str, Any]
 STEPS = 5  # that are told of progress
@@ -65,7 +60,6 @@ def calibrate(
     check(logs)
     report = progress or (lambda _done, _total: None)
     start = sensing(rig or logs[0].rig, logs[0])
-    logs = [_scorable(log) for log in logs]
     before = _scores(logs, start, evaluate) if _is_complete(start) else ()
     report(1, STEPS)
     knowledge = learn(logs, start, grids)
@@ -214,18 +208,6 @@ def _scores(logs: Sequence[Log], rig: Rig, evaluate: Evaluate) -> tuple[Scores, 
     return tuple(evaluate(replace(log, rig=rig)) for log in logs)
 
 
-def _scorable(log: Log) -> Log:
-    """The log with a reference dense enough for scoring, where it can be interpolated."""
-    reference = log.reference
-    assert reference is not None
-    if np.median(np.diff(reference.t)) <= MAX_REFERENCE_GAP + 1e-6:
-        return log
-    t = np.arange(reference.t[0], reference.t[-1], 0.99 * MAX_REFERENCE_GAP)
-    poses = reference.at(t, max_gap=REFERENCE_GAP)
-    good = np.isfinite(poses[:, 0])
-    return replace(log, reference=Trajectory(t[good], poses[good], has_heading=reference.has_heading))
-
-
 def _doubts(knowledge: Knowledge, searches: Sequence[Consistency]) -> tuple[str, ...]:
     """What the reader of the report should look at."""
     doubts = list(knowledge.notes)
@@ -241,7 +223,7 @@ def _doubts(knowledge: Knowledge, searches: Sequence[Consistency]) -> tuple[str,
         )
     for one in searches:
         if one.trial is None:
-            doubts.append("No log has a reference dense enough for scoring: the noise in the rig is the mere scatter.")
+            doubts.append("No log has enough poses of a reference to score: the noise in the rig is the mere scatter.")
         elif not one.reached:
             doubts.append(
                 "No factor on the noise makes the estimator consistent: ANEES over its ideal value is "

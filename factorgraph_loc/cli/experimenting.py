@@ -197,6 +197,8 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     """A line for each label, set of sensors and point of the sweep: of each metric the median, the least and the greatest."""
     from statistics import median
 
+    from factorgraph_loc.evaluation.tables import SCORED, counted
+
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         swept = [f"{k.removeprefix('sweep.')}={v}" for k, v in row.items() if k.startswith("sweep.") and v is not None]
@@ -210,5 +212,6 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
         for metric in metrics:
             values = [row[metric] for row in good if row.get(metric) is not None]
             cells.append(f"{median(values):.3f} ({min(values):.3f} to {max(values):.3f})" if values else "-")
+        cells.append(counted(good) or "-")
         lines.append([name, f"{len(good)} of {len(members)}", *cells])
-    return ["median (least to greatest)", "runs", *metrics], lines
+    return ["median (least to greatest)", "runs", *metrics, SCORED], lines

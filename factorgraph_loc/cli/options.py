@@ -63,6 +63,10 @@ Prior = Annotated[
         autocompletion=completion.prior,
     ),
 ]
+MaxGap = Annotated[
+    float,
+    typer.Option(metavar="SECONDS", help="How far apart estimates may lie between which the score interpolates."),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option(

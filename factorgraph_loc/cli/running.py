@@ -17,6 +17,7 @@ from factorgraph_loc.cli.options import (
     LogName,
     LogNames,
     LogOptions,
+    MaxGap,
     Out,
     Overwrite,
     Prior,
@@ -29,6 +30,7 @@ from factorgraph_loc.cli.options import (
     parse_list,
     parse_settings,
 )
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ COLUMNS = {
     "max [m]": ("position_max", 3),
     "heading RMSE [rad]": ("heading_rmse", 4),
     "ANEES": ("anees", 2),
+    "poses scored": ("scored", 0),
 }
 # and of one of a robot in space
 SPACE_COLUMNS = {
@@ -50,6 +53,7 @@ SPACE_COLUMNS = {
     "max [m]": ("position_max", 3),
     "rotation RMSE [rad]": ("rotation_rmse", 4),
     "ANEES": ("anees", 2),
+    "poses scored": ("scored", 0),
 }
 
 
@@ -66,6 +70,7 @@ def run(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    max_gap: MaxGap = MAX_GAP,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -78,7 +83,7 @@ def run(
     check_free(out, overwrite=overwrite)  # now, not when all is computed
     settings = parse_settings(set_ or (), [estimator])[estimator]
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
-    config = experiment.RunConfig(estimator, settings, parse_list(sensors) if sensors else None, prior, seed)
+    config = experiment.RunConfig(estimator, settings, parse_list(sensors) if sensors else None, prior, seed, max_gap)
     with show.progress(estimator, counted=False) as report:
         result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
@@ -110,6 +115,7 @@ def compare(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    max_gap: MaxGap = MAX_GAP,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -126,7 +132,7 @@ def compare(
     chosen = parse_seeds(seeds)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
     used = parse_list(sensors) if sensors else None
-    configs = [RunConfig(name, settings[name], used, prior, seed) for name in names for seed in chosen]
+    configs = [RunConfig(name, settings[name], used, prior, seed, max_gap) for name in names for seed in chosen]
     with show.progress("runs", counted=True) as report:
         comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
     for failure in comparison.failures:
@@ -167,7 +173,8 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         ]
         show.table(("", *COLUMNS), rows)
     elif not _print_space(scores):
-        typer.echo("there is no reference to score against, or hardly any")
+        hardly = f", or hardly any: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
+        typer.echo(f"there is no reference to score against{hardly}")
     if scores["aligned.position_rmse"] is not None:
         position, heading = (
             show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))

@@ -12,19 +12,21 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.estimators.base import LearntPoint
+from factorgraph_loc.evaluation.pairing import pairs
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.se2 import Array
 
-MAX_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
 FIGURES = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
 
 
-def align(trajectory: Trajectory, reference: Trajectory) -> Array:
+def align(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Array:
     """The pose (3,) of the estimate's frame in the reference's: composed with the estimated poses, it brings their positions onto
-    the reference in least squares. NaN if no pose has a reference."""
-    return align_points(trajectory.poses[:, :2], reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)[:, :2])
+    the reference in least squares, at the stamps that are scored. NaN if there are none."""
+    pair = pairs(trajectory, reference, max_gap)
+    return align_points(pair.poses[:, :2], pair.truth[:, :2])
 
 
 def align_points(points: Array, targets: Array) -> Array:
@@ -42,7 +44,9 @@ def align_points(points: Array, targets: Array) -> Array:
     return np.array((*(target_centre - se2.transform_from(rotation, centre)), angle))
 
 
-def free_map_figures(trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log) -> dict[str, Any]:
+def free_map_figures(
+    trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
+) -> dict[str, Any]:
     """``FIGURES`` of a run with a free map.
 
     ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
@@ -58,9 +62,9 @@ def free_map_figures(trajectory: Trajectory, landmarks: Mapping[str, LearntPoint
     if log.reference is None:
         pose = align_points(positions, truth)
     else:
-        pose = align(trajectory, log.reference)
-        moved = se2.compose(pose, trajectory.poses)
-        error = moved - log.reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)
+        pair = pairs(trajectory, log.reference, max_gap)
+        pose = align_points(pair.poses[:, :2], pair.truth[:, :2])
+        error = se2.compose(pose, pair.poses) - pair.truth
         figures["aligned.position_rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
         if log.reference.has_heading:
             figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, mark_events
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, mark_events, with_pauses
 from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
@@ -48,7 +48,7 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
     dress(axes.values())
     if log.reference is not None:
         for kind, trajectory in track.kinds():
-            _nees(axes[kind], kind, trajectory, log.reference)
+            _nees(axes[kind], kind, trajectory, log.reference, track.max_gap)
         limits = np.array([axes[kind].get_ylim() for kind in ("causal", "final")])
         for kind in ("causal", "final"):
             axes[kind].set_ylim(limits[:, 0].min(), limits[:, 1].max())
@@ -77,7 +77,7 @@ def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]
         return sums[0] / sums[1], sums[1]
 
 
-def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory) -> None:
+def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory, max_gap: float) -> None:
     dof = 3 if reference.has_heading else 2
     axis.set_title(f"{kind} poses")
     axis.set_ylabel("NEES of x, y, heading" if dof == 3 else "NEES of x, y")
@@ -85,13 +85,14 @@ def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Traje
     low, high = chi2.ppf(_TAILS, dof)
     axis.axhspan(low, high, **_BAND)
     axis.axhline(dof, **_IDEAL)
-    nees = np.empty(0) if trajectory is None else errors(trajectory, reference).nees
-    known = np.isfinite(nees)
-    if trajectory is None or not known.any():
+    e = None if trajectory is None else errors(trajectory, reference, max_gap)
+    known = np.empty(0, dtype=bool) if e is None else np.isfinite(e.nees)
+    if e is None or not known.any():
         axis.text(0.5, 0.9, f"no {kind} estimate to score", ha="center", transform=axis.transAxes, color="0.4")
         return
-    mean, _ = running_mean(trajectory.t, np.where(known, nees, 0.0), known.astype(float))
-    _draw(axis, trajectory.t, nees, np.where(known, mean, np.nan), low)
+    t, nees = e.t[known], e.nees[known]
+    mean, _ = running_mean(t, nees, np.ones(len(t)))
+    _draw(axis, t, nees, with_pauses(t, mean), low)
 
 
 def _nis(axis: Axes, sensor: str, rows: Array) -> None:
@@ -105,11 +106,11 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
     low, high = (np.where(np.isnan(mean), np.nan, chi2.ppf(tail, total) / total) for tail in _TAILS)
     axis.fill_between(t, low, high, **_BAND)
     axis.axhline(1.0, **_IDEAL)
-    _draw(axis, t, nis / dof, mean, 0.1)
+    _draw(axis, t, nis / dof, (t, mean), 0.1)
 
 
-def _draw(axis: Axes, t: Array, single: Array, mean: Array, low: float) -> None:
+def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
-    axis.plot(t, mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
+    axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
     # how small the smallest are says nothing
     axis.set_ylim(low / 4.0, 2.0 * max(float(np.nanmax(single)), 20.0 * low))

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.evaluation.result import RunResult
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -31,7 +33,8 @@ class Track:
     """What is plotted of one run.
 
     ``causal`` (None if it never was localized), ``final`` (empty if nothing told the pose); ``update_ms`` (M,) of each update;
-    ``nis``: by sensor, rows (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text.
+    ``nis``: by sensor, rows (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text;
+    ``max_gap`` [s]: between estimates that are interpolated where errors are shown.
     """
 
     causal: Trajectory | None
@@ -39,12 +42,14 @@ class Track:
     update_ms: Array
     nis: Mapping[str, Array] = field(default_factory=dict)
     events: Sequence[tuple[float, str]] = ()
+    max_gap: float = MAX_GAP
 
     @classmethod
     def of(cls, result: RunResult) -> Track:
         """The data of a run."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
-        return cls(result.causal(), result.final, result.timings.update_ms, nis, tuple(result.diagnostics.events))
+        events = tuple(result.diagnostics.events)
+        return cls(result.causal(), result.final, result.timings.update_ms, nis, events, result.max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
         """Both trajectories by name, None where there is nothing to plot."""
@@ -95,6 +100,12 @@ def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
     for i, (t, _) in enumerate(events):
         label = "event (see events.csv)" if i == 0 else None
         axis.axvline(t, color=COLOURS[3], linestyle="--", linewidth=1.0, label=label, zorder=1.5)
+
+
+def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
+    """Times (N,) and values (N, ...) with a row of NaN in each pause, so that no line is drawn across it."""
+    breaks = pauses(t)
+    return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
 def legend(figure: Figure, axes: Iterable[Axes]) -> None:

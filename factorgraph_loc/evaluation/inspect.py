@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.evaluation.inspect_camera import (
     ImageSummary,
     PixelSummary,
@@ -34,6 +33,7 @@ MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
 MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
 MIN_PASSES = 3
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
+_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
 PASS = 10.0  # s; errors of sightings in one pass are not independent, so passes are counted, not sightings
 
 
@@ -144,7 +144,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
         return {}
     model = log.rig.bearing_range.model()
     t = stream.t + log.rig.time_offset("bearing_range")
-    sensors = se2.compose(log.reference.at(t, max_gap=MAX_REFERENCE_GAP), np.array(model.mounting))
+    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP), np.array(model.mounting))
     ranges = stream.range / model.range_scale
     bearings = stream.bearing - model.bearing_bias
     if not log.reference.has_heading:

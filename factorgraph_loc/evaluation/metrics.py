@@ -1,15 +1,16 @@
 """How far a trajectory is from the reference, and whether its covariances say so.
 
-No alignment, as the map's frame is known; where the map was free, aligned figures stand beside the others. The reference is
-taken at the estimates' stamps; where its neighbours lie more than 0.1 s apart there is a gap, and nothing is scored. NEES and its
-bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Relative pose
-error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012, section IV.A, taken over path length instead of
-time.
+No alignment, as the map's frame is known; where the map was free, aligned figures stand beside the others. What is compared with
+what, see :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of
+RGB-D SLAM systems", 2012, section IV.A, taken over path length instead of time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from scipy.stats import chi2
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt
 from factorgraph_loc.evaluation import alignment, space
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
+from factorgraph_loc.evaluation.alignment import rms
+from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
 from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.evaluation.scoring import MAX_GAP, RULE
 from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.trajectory import Integers, Trajectory
 from factors import se2
 from factors.se2 import Array
 
@@ -45,15 +48,17 @@ _ACCURACY = (
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the N poses of a trajectory; NaN where the reference has a gap.
+    """Errors at N stamps ``t`` (N,) of the reference; NaN where the trajectory has no pose.
 
-    ``difference`` (N, 3): estimate minus reference in x, y [m, world's frame] and heading [rad, wrapped]. ``position`` (N,):
-    Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the reference has no heading. ``nees`` (N,): squared error in units of
-    the stated covariance, of x, y and heading, or of x and y if the reference has no heading (``dof`` 3 or 2).
-    ``nees_position`` (N,): that of x and y alone. Both are NaN where the covariance is missing or not positive definite;
-    ``invalid`` (N,) marks the latter.
+    ``poses`` and ``reference`` (N, 3): what is compared with what. ``difference`` (N, 3): estimate minus reference in x, y [m,
+    world's frame] and heading [rad, wrapped]. ``position`` (N,): Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the
+    reference has no heading. ``nees`` (N,): squared error in units of the stated covariance, of x, y and heading, or of x and y if
+    the reference has no heading (``dof`` 3 or 2). ``nees_position`` (N,): that of x and y alone. Both are NaN where the covariance
+    is missing or not positive definite; ``invalid`` (N,) marks the latter.
     """
 
+    t: Array
+    poses: Array
     reference: Array
     difference: Array
     position: Array
@@ -64,24 +69,30 @@ class Errors:
     invalid: NDArray[np.bool_]
 
 
-def errors(trajectory: Trajectory, reference: Trajectory) -> Errors:
-    """The errors of each pose of ``trajectory`` against ``reference``, without alignment."""
-    truth = reference.at(trajectory.t, max_gap=MAX_REFERENCE_GAP)
-    difference = trajectory.poses - truth
+def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Errors:
+    """The errors of ``trajectory`` at the stamps of ``reference`` that are scored, without alignment; see
+    :func:`~factorgraph_loc.evaluation.pairing.pairs`."""
+    if trajectory.covariances is not None:
+        unsound = ~_positive_definite(trajectory.covariances)
+        trajectory = replace(trajectory, covariances=np.where(unsound[:, None, None], np.nan, trajectory.covariances))
+    pair = pairs(trajectory, reference, max_gap)
+    difference = pair.poses - pair.truth
     difference[:, 2] = se2.wrap(difference[:, 2])
+    known = np.isfinite(difference[:, 0])
     if not reference.has_heading:
         difference[:, 2] = np.nan
     dof = 3 if reference.has_heading else 2
-    n = len(trajectory)
-    nees, nees_position = np.full(n, np.nan), np.full(n, np.nan)
-    invalid = np.zeros(n, dtype=bool)
-    if trajectory.covariances is not None:
-        invalid = ~_positive_definite(trajectory.covariances)
-        good = ~invalid & np.isfinite(difference[:, 0])
-        nees[good] = _squared(difference[good, :dof], trajectory.covariances[good, :dof, :dof])
-        nees_position[good] = _squared(difference[good, :2], trajectory.covariances[good, :2, :2])
+    nees, nees_position = np.full(len(known), np.nan), np.full(len(known), np.nan)
+    invalid = np.zeros(len(known), dtype=bool)
+    if pair.covariances is not None:
+        good = known & np.isfinite(pair.covariances[:, 0, 0])
+        invalid = known & ~good
+        nees[good] = _squared(difference[good, :dof], pair.covariances[good, :dof, :dof])
+        nees_position[good] = _squared(difference[good, :2], pair.covariances[good, :2, :2])
     return Errors(
-        reference=truth,
+        t=pair.t,
+        poses=pair.poses,
+        reference=pair.truth,
         difference=difference,
         position=np.hypot(difference[:, 0], difference[:, 1]),
         heading=np.abs(difference[:, 2]),
@@ -95,9 +106,10 @@ def errors(trajectory: Trajectory, reference: Trajectory) -> Errors:
 def score(result: RunResult, log: Log) -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where there is nothing to say.
 
-    ``causal.*`` and ``final.*`` (see :func:`accuracy`) are scored from the first localized causal estimate, and are None without
-    a reference, or where it is there for fewer than :data:`FEWEST_SCORED` poses. ``causal.*`` is None if the run never was
-    localized; ``final.*`` is then scored from its beginning.
+    ``scoring.rule`` and ``scoring.max_gap`` [s]: by which the rest is comparable. ``causal.*`` and ``final.*`` (see
+    :func:`accuracy`) are scored from the first localized causal estimate, and but for ``scored`` are None without a reference, or
+    with fewer than :data:`FEWEST_SCORED` poses to score. ``causal.*`` is None if the run never was localized; ``final.*`` is then
+    scored from its beginning.
     ``causal.space_*`` and ``final.space_*`` (see :func:`~factorgraph_loc.evaluation.space.accuracy`) are None but for estimators
     that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
@@ -108,42 +120,43 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     final = result.final
     if causal is not None:
         final = _from(final, float(causal.t[0]))
-    scores: dict[str, Any] = {}
+    gap = result.max_gap
+    scores: dict[str, Any] = {"scoring.rule": RULE, "scoring.max_gap": gap}
     for kind, trajectory in (("causal", causal), ("final", final)):
-        figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference)
+        figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:
             figures = dict.fromkeys(_ACCURACY) | {"scored": figures["scored"]}
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     for kind, in_space in (("causal", result.causal_space), ("final", result.final_space)):
-        figures = space.accuracy(in_space, log.reference3)
+        figures = space.accuracy(in_space, log.reference3, gap)
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
-        scores |= alignment.free_map_figures(final, result.learnt.landmarks, log)
+        scores |= alignment.free_map_figures(final, result.learnt.landmarks, log, gap)
     else:
         scores |= dict.fromkeys(alignment.FIGURES)
     return scores | _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
 
 
-def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, Any]:
-    """The figures of one trajectory against the reference; all None without one.
+def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
+    """The figures of one trajectory against the reference, see :func:`errors`; all None without one.
 
     ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
     :func:`relative_errors` over ``rpe_pieces`` of path. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading).
     ``nees_bounds``: between these an average of as many *independent* NEES lies with 95 %; errors along a trajectory are
     correlated, so a consistent estimator leaves them more often. ``coverage_95``: share of the times at which the true (x, y)
     lies in the 95 % ellipse.
-    ``invalid_covariances``: how many covariances were not positive definite, and are in none of these three. ``scored``: how
-    many poses have a reference.
+    ``invalid_covariances``: of how many poses that are scored the covariance is not positive definite; they are in none of these
+    three. ``scored``: how many poses of the reference have an estimate.
     """
     figures: dict[str, Any] = dict.fromkeys(_ACCURACY)
     if reference is None:
         return figures
-    e = errors(trajectory, reference)
+    e = errors(trajectory, reference, max_gap)
     for name, values in (("position", e.position), ("heading", e.heading)):
         figures |= {f"{name}_{how}": value for how, value in _spread(values).items()}
     if reference.has_heading:
-        position, heading = relative_errors(trajectory.poses, e.reference)
+        position, heading = relative_errors(e.poses, e.reference, pauses(e.t))
         figures["rpe_position_per_m"] = rms(position)
         figures["rpe_heading_per_m"] = rms(heading)
         figures["rpe_pieces"] = len(position)
@@ -159,37 +172,41 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None) -> dict[str, 
     return figures
 
 
-def relative_errors(poses: Array, reference: Array) -> tuple[Array, Array]:
+def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Integers = ()) -> tuple[Array, Array]:
     """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
 
-    ``poses`` and ``reference`` (N, 3) at the same times, NaN in gaps of the reference. A piece begins at the first pose, or at
-    the end of the piece before, and ends at the first pose for which the path of the reference since then is 1 m or more; a gap
-    ends a piece unused. With Q and P the motion of reference and estimate over a piece, the error is the translation and rotation
-    of ``Q^-1 P``; it is not divided by the length. Without gaps this is evo's RPE with ``delta=1``, ``delta_unit=meters``,
-    ``all_pairs=False``, ``pairs_from_reference=True``.
+    ``poses`` and ``reference`` (N, 3) at the same times, NaN where there is none; ``breaks``: poses before which the reference
+    paused. A piece begins at the first pose, or at the end of the piece before, and ends at the first pose for which the path of
+    the reference since then is 1 m or more; a NaN or a break ends a piece unused. With Q and P the motion of reference and
+    estimate over a piece, the error is the translation and rotation of ``Q^-1 P``; it is not divided by the length. Without gaps
+    this is evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
     """
-    pairs: list[tuple[int, int]] = []
-    for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0])):
+    ends_of_pieces: list[tuple[int, int]] = []
+    for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0]), breaks):
         steps = np.linalg.norm(np.diff(reference[start:stop, :2], axis=0), axis=1)
         begin, path = start, 0.0
         for i, step in enumerate(steps.tolist(), start=start + 1):
             path += step
             if path >= RPE_DISTANCE:
-                pairs.append((begin, i))
+                ends_of_pieces.append((begin, i))
                 begin, path = i, 0.0
-    begins, ends = np.array(pairs, dtype=int).reshape(-1, 2).T
+    begins, ends = np.array(ends_of_pieces, dtype=int).reshape(-1, 2).T
     error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
 
-def _unbroken(valid: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The half-open ranges of indices in which ``valid`` holds throughout."""
+def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> list[tuple[int, int]]:
+    """The half-open ranges of indices in which ``valid`` holds throughout, parted at ``breaks`` too."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    found = []
+    for start, stop in edges.reshape(-1, 2).tolist():
+        bounds = [start, *(int(b) for b in breaks if start < b < stop), stop]
+        found += list(itertools.pairwise(bounds))
+    return found
 
 
 def _from(trajectory: Trajectory, t: float) -> Trajectory:
-    keep = trajectory.t >= t - 1e-9
+    keep = trajectory.t >= t - TOLERANCE
     covariances = None if trajectory.covariances is None else trajectory.covariances[keep]
     return Trajectory(trajectory.t[keep], trajectory.poses[keep], covariances, trajectory.has_heading)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, styles
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, styles, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.log import Log
 from factorgraph_loc.tag_map import tag_map
@@ -58,8 +58,9 @@ def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
             continue
         axes["map"].plot(*trajectory.poses[:, :2].T, label=label, linewidth=1.3, zorder=3, **style)
         if log.reference is not None:
-            error = np.maximum(errors(trajectory, log.reference).position, 1e-4)
-            axes["errors"].semilogy(trajectory.t, error, linewidth=1.0, **style)
+            e = errors(trajectory, log.reference, track.max_gap)
+            t, error = with_pauses(e.t, np.maximum(e.position, 1e-4))
+            axes["errors"].semilogy(t, error, linewidth=1.0, **style)
     axes["errors"].set_xlabel("time [s]")
     axes["errors"].set_ylabel("position error [m]")
     legend(figure, [axes["map"]])

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.evaluation.consistency import consistency
-from factorgraph_loc.evaluation.figures import COLOURS, Track, grid, legend, mark_events, save, styles
+from factorgraph_loc.evaluation.figures import COLOURS, Track, grid, legend, mark_events, save, styles, with_pauses
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
@@ -97,7 +96,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         if log.reference is not None:
-            line = _with_gaps(log.reference.t, log.reference.poses)
+            _, line = with_pauses(log.reference.t, log.reference.poses)
             axis.plot(line[:, 0], line[:, 1], color="0.75", linewidth=4.0, label="reference", zorder=1)
         if len(walls):
             axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
@@ -127,7 +126,7 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
     """Signed errors in x, y and heading over time, causal and final, with bands of two stated standard deviations."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
     figure, axes = grid(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
-    found = [None if trajectory is None else errors(trajectory, reference) for _, trajectory in track.kinds()]
+    found = [None if one is None else errors(one, reference, track.max_gap) for _, one in track.kinds()]
     for column, (kind, trajectory) in enumerate(track.kinds()):
         axes[0, column].set_title(kind)
         axes[-1, column].set_xlabel("time [s]")
@@ -159,7 +158,7 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
             axes[0, column].set_title(kind)
             if trajectory is None:
                 continue
-            e = errors(trajectory, reference)
+            e = errors(trajectory, reference, track.max_gap)
             for row, (what, _) in enumerate(rows):
                 _distribution(axes[row, column], getattr(e, what), label=estimator, **style)
     for row, (what, unit) in enumerate(rows):
@@ -186,12 +185,6 @@ def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
     return figure
 
 
-def _with_gaps(t: Array, poses: Array) -> Array:
-    """Poses with a row of NaN in each gap of the reference, so that no line is drawn across it."""
-    gaps = np.flatnonzero(np.diff(t) > MAX_REFERENCE_GAP + 1e-9) + 1
-    return np.insert(poses, gaps, np.nan, axis=0)
-
-
 def _joined(segments: Array) -> Array:
     """Segments (W, 2, 2) as one line (3 W, 2) with a row of NaN after each."""
     return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
@@ -208,12 +201,14 @@ def _view(places: Array, reference: Trajectory | None) -> Array | None:
 
 
 def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
-    t, error = trajectory.t, e.difference[:, row]
+    t = trajectory.t
     axis.axhline(0.0, color="0.5", linewidth=0.8)
     if trajectory.covariances is not None:
         sigma = np.sqrt(trajectory.covariances[:, row, row])
         axis.fill_between(t, -2.0 * sigma, 2.0 * sigma, color=COLOURS[5], alpha=0.45, linewidth=0.0, label="2 sigma")
-    axis.plot(t, error, color=COLOURS[0], linewidth=1.0, label="error (gaps: no reference)")
+    axis.plot(
+        *with_pauses(e.t, e.difference[:, row]), color=COLOURS[0], linewidth=1.0, label="error (gaps: no reference)"
+    )
     axis.set_xlim(t[0], max(t[-1], t[0] + 1e-3))
 
 

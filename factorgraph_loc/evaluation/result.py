@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt, Status
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
@@ -59,6 +60,11 @@ class RunResult:
     warnings: tuple[str, ...] = ()
     causal_space: Trajectory3 | None = None
     final_space: Trajectory3 | None = None
+
+    @property
+    def max_gap(self) -> float:
+        """The time [s] between estimates that are interpolated where they are scored."""
+        return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:
         """Index of the first causal estimate that is localized, or None if none is."""

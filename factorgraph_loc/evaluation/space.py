@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP, rms
+from factorgraph_loc.evaluation.alignment import rms
+from factorgraph_loc.evaluation.pairing import pairs_in_space
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.log import Log, SightingStream
-from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.reprojection import linearize_in_space, mounted
 from factors.se2 import Array
@@ -27,29 +28,28 @@ FIGURES = (
 )
 
 
-def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None) -> dict[str, Any]:
+def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
     """:data:`FIGURES` of a trajectory in space against the reference, without alignment; all None without either.
+
+    What is compared with what, see :func:`~factorgraph_loc.evaluation.pairing.pairs_in_space`.
 
     ``space_position_*`` [m]; ``space_rotation_rmse`` [rad]: of the angle between estimated and true orientation. ``space_anees``:
     mean squared error of the pose in units of its covariance, ideally 6; ``space_coverage_95``: share of the times at which that
-    is below the 95 % quantile. ``space_scored``: how many poses have a reference.
+    is below the 95 % quantile. ``space_scored``: how many poses of the reference have an estimate.
     """
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     if found is None or reference is None or not len(found):
         return figures
-    after = np.searchsorted(reference.t, found.t).clip(1, len(reference) - 1)
-    inside = (found.t >= reference.t[0]) & (found.t <= reference.t[-1])
-    near = np.minimum(found.t - reference.t[after - 1], reference.t[after] - found.t) <= MAX_REFERENCE_GAP
-    rows = np.flatnonzero(inside & near)
-    if not len(rows):
-        return figures | {"space_scored": 0}
-    errors = pose_errors(_rows(found, rows), reference.at(found.t[rows]))
+    estimates, truth = pairs_in_space(found, reference, max_gap)
+    figures["space_scored"] = len(estimates)
+    if not len(estimates):
+        return figures
+    errors = pose_errors(estimates, truth)
     distance = np.linalg.norm(errors[:, 3:], axis=1)
     figures["space_position_rmse"], figures["space_position_max"] = rms(distance), float(distance.max())
     figures["space_rotation_rmse"] = rms(np.linalg.norm(errors[:, :3], axis=1))
-    figures["space_scored"] = len(rows)
-    if found.covariances is not None:
-        spread = found.covariances[rows]
+    if estimates.covariances is not None:
+        spread = estimates.covariances
         good = np.linalg.eigvalsh(spread)[:, 0] > 0.0
         if good.any():
             nees = np.einsum("ni,ni->n", errors[good], np.linalg.solve(spread[good], errors[good, :, None])[..., 0])
@@ -97,7 +97,3 @@ def spread_of(residuals: Array) -> dict[str, float]:
         figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
         figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
     return figures
-
-
-def _rows(found: Trajectory3, rows: Integers) -> Trajectory3:
-    return Trajectory3(found.t[rows], found.positions[rows], found.rotations[rows])

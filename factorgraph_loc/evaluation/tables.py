@@ -26,6 +26,7 @@ COLUMNS = {
 # after an unknown start
 SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
+SCORED = "poses scored"
 BASELINE = "dead_reckoning"
 ALIKE = 0.01  # share by which errors may differ without one being called the least alone
 
@@ -37,7 +38,8 @@ def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
     RMSEs are pooled over seeds (root of the mean square), the rest is averaged; with several seeds the standard deviation over them
     follows after ±. The last lines pool each estimator over the logs, each log counted once; ``runs`` says how many of
-    the runs went well, and a pooled line with fewer than all says nothing about the others. How long it took to find the place is
+    the runs went well, and a pooled line with fewer than all says nothing about the others. ``scored`` is how many poses these
+    figures are from: of one run, or least to most of several; over all logs their sum. How long it took to find the place is
     a column where that took any time.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
@@ -49,14 +51,14 @@ def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
             runs = [r for r in rows if r["log"] == log and r["estimator"] == name]
             if runs:
                 cells = [_cell([_figure(r, key) for r in runs], digits, rms) for key, digits, rms in columns.values()]
-                lines.append([log, name, *cells, _went_well(runs)])
+                lines.append([log, name, *cells, counted(runs) or "-", _went_well(runs)])
     if len(logs) > 1:
         for name in names:
             runs = [r for r in rows if r["estimator"] == name]
             by_log = [[r for r in runs if r["log"] == log] for log in logs]
             cells = [_pooled(key, digits, rms, by_log) for key, digits, rms in columns.values()]
-            lines.append([ALL, name, *cells, _went_well(runs)])
-    return ["log", "estimator", *columns, "runs"], lines
+            lines.append([ALL, name, *cells, counted(*by_log) or "-", _went_well(runs)])
+    return ["log", "estimator", *columns, SCORED, "runs"], lines
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:
@@ -118,6 +120,12 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in (padded[0], rule, *padded[1:]))
 
 
+def scored_of(row: Row) -> float | None:
+    """How many poses of a run were scored: of its causal trajectory, else of the final one; None where there is no reference."""
+    found = (row.get(f"{kind}.{what}") for kind in ("causal", "final") for what in ("scored", "space_scored"))
+    return next((count for count in found if count is not None), None)
+
+
 def _figure(row: Row, key: str) -> float | None:
     # an estimator that waits for the end of the log (never localized before) only collects: its update times mean nothing
     offline = row.get("time_to_localized") is None
@@ -140,6 +148,14 @@ def _pooled(key: str, digits: int, rms: bool, by_log: Sequence[Sequence[Row]]) -
 
 def _average(values: Sequence[float], rms: bool) -> float:
     return pooled_rms(values) if rms else float(np.mean(values))
+
+
+def counted(*by_log: Sequence[Row]) -> str:
+    """How many poses were scored, least to most over the runs of a log, summed over logs; empty where there is no reference."""
+    counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
+    known = [of_log for of_log in counts if of_log]
+    least, most = sum(map(min, known)), sum(map(max, known))
+    return (f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}") if known else ""
 
 
 def _went_well(runs: Sequence[Row]) -> str:

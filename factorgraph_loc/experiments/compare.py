@@ -17,6 +17,7 @@ from factorgraph_loc.estimators import registry
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
+from factorgraph_loc.evaluation.scoring import check_max_gap
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
@@ -132,6 +133,7 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
     for config in configs:
         registry.settings_of(config.estimator, config.settings)
         check_prior(config.prior)
+        check_max_gap(config.max_gap)
         for sensor in config.sensors or ():
             if sensor not in streams:
                 raise InputError(f"no log has a sensor {sensor!r}{nearest(sensor, streams)}")

@@ -7,23 +7,33 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
+from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
+from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
 
+MOSTLY = 0.9  # of the time with estimates
 
-def without_neighbours(log: Log) -> tuple[str, ...]:
-    """A reference whose poses lie too far apart to score by."""
-    if log.reference is None or len(log.reference) < 2:
+
+def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...]:
+    """A reference with too few poses to score by, or that is there for a part of the time."""
+    reference = log.reference
+    if reference is None or not len(reference) or not len(final):
         return ()
-    gap = float(np.median(np.diff(log.reference.t)))
-    if gap <= MAX_REFERENCE_GAP:
+    count = int(np.sum(np.isfinite(pairs(final, reference, max_gap).poses[:, 0])))
+    if count < FEWEST_SCORED:
+        return (
+            f"{log.name}: only {count} poses of the reference have an estimate, expected at least {FEWEST_SCORED}: "
+            "nothing is scored",
+        )
+    begin, end = max(reference.t[0], final.t[0]), min(reference.t[-1], final.t[-1])
+    whole = final.t[-1] - final.t[0]
+    if end - begin >= MOSTLY * whole:
         return ()
     return (
-        f"{log.name}: poses of the reference lie {gap:.2f} s apart, expected at most {MAX_REFERENCE_GAP:g} s: "
-        "between them nothing is scored",
+        f"{log.name}: scored over {end - begin:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s",
     )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.estimators.base import Status
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.result import RunResult, Timings
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import Log
 from factorgraph_loc.simulation import simulate
@@ -21,8 +22,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Series:
-    """Errors at the times ``t`` (N,): ``position`` [m], ``heading`` [rad, absolute] and ``nees``, each (N,); NaN where there is
-    nothing to say."""
+    """Errors at the stamps ``t`` (N,) of the reference that are scored: ``position`` [m], ``heading`` [rad, absolute] and ``nees``,
+    each (N,); NaN where there is nothing to say."""
 
     t: Array
     position: Array
@@ -42,7 +43,7 @@ class Series:
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Of one run: ``causal`` on the grid of ticks, NaN before the first localized estimate; ``status`` at each tick; ``final``."""
+    """Of one run: ``causal``, NaN before the first localized estimate; ``final``; ``status`` at each tick."""
 
     causal: Series
     final: Series
@@ -77,20 +78,18 @@ def job_log(job: EnsembleJob) -> Log:
 
 def run_errors(result: RunResult, log: Log) -> RunErrors:
     """The errors of a run on a log with reference."""
-    causal = series(Trajectory(result.t, result.poses, result.covariances), log)
-    first = result.first_localized()
-    for values in (causal.position, causal.heading, causal.nees):
-        values[: len(result.t) if first is None else first] = np.nan
-    return RunErrors(causal, series(result.final, log), result.status, result.timings)
+    causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
+    gap = result.max_gap
+    return RunErrors(series(causal, log, gap), series(result.final, log, gap), result.status, result.timings)
 
 
-def series(trajectory: Trajectory, log: Log) -> Series:
-    """The errors of a trajectory against the reference of its log."""
+def series(trajectory: Trajectory, log: Log, max_gap: float = MAX_GAP) -> Series:
+    """The errors of a trajectory against the reference of its log, as :func:`~factorgraph_loc.evaluation.metrics.errors`."""
     assert log.reference is not None, "a log to score has a reference"
-    e = errors(trajectory, log.reference)
-    return Series(trajectory.t, e.position, e.heading, e.nees)
+    e = errors(trajectory, log.reference, max_gap)
+    return Series(e.t, e.position, e.heading, e.nees)
 
 
 def stacked(runs: Sequence[Series]) -> Array:
-    """NEES (R, N) of runs on one grid of times."""
+    """NEES (R, N) of runs whose references have the same stamps."""
     return np.stack([one.nees for one in runs])

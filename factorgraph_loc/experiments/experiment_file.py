@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.files import FileModel, nearest, parse_model, read_toml
 
@@ -130,7 +131,8 @@ class Limits(FileModel):
 
 class Experiment(FileModel):
     """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
-    default those of each log's rig; ``prior``: where runs start; ``seeds``: of the estimators."""
+    default those of each log's rig; ``prior``: where runs start; ``seeds``: of the estimators; ``max_gap`` [s]: how far apart
+    estimates may lie between which the score interpolates."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
     out: Name | None = None
@@ -139,6 +141,7 @@ class Experiment(FileModel):
     sensors: tuple[tuple[Name, ...] | None, ...] = (None,)
     prior: Name | None = None
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    max_gap: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = MAX_GAP
     sweep: Sweep = Sweep()
     report: ReportSettings = ReportSettings()
     limits: Limits = Limits()

@@ -1,4 +1,4 @@
-"""What a run's result depends on, as one key: the log, the configuration, the code, the libraries."""
+"""What a run's result depends on, as one key: the log, the configuration, the rule of scoring, the code, the libraries."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import Any
 
 import factorgraph_loc
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.scoring import RULE
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.files import write_text
 
@@ -63,7 +64,13 @@ def library_versions() -> dict[str, str]:
 def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
     """The key of a run: of a log's digest, and its effective configuration as plain data."""
     return digest_of(
-        {"log": log_digest, "config": dict(config), "code": code_version(), "libraries": library_versions()}
+        {
+            "log": log_digest,
+            "config": dict(config),
+            "scoring": RULE,
+            "code": code_version(),
+            "libraries": library_versions(),
+        }
     )
 
 

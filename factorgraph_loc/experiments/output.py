@@ -49,7 +49,8 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     """Score a run, write its files into the folder ``out``, and return the scores.
 
     ``estimates.parquet`` has one row a tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m], ``heading``
-    [rad], the covariances in the world's frame, ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``,
+    [rad], the covariances in the world's frame, ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at that
+    stamp of the reference to which the tick is the nearest (null where there is none: a reference may have fewer stamps),
     ``update_ms`` (causal: the slowest update since the tick before, null if there was none) and ``status`` (of the causal
     estimate at that time). ``causal.tum`` holds the estimates from the first localized one on. ``learnt.json``: ``constants`` by
     name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy) [m^2] in the
@@ -139,8 +140,8 @@ def estimates(result: RunResult, log: Log) -> pl.DataFrame:
     at = np.searchsorted(result.t, result.final.t - 1e-9).clip(max=len(result.t) - 1)
     return pl.concat(
         [
-            _rows("causal", causal, log, _slowest_update(result), status),
-            _rows("final", result.final, log, np.full(len(result.final), np.nan), status[at]),
+            _rows("causal", causal, result.max_gap, log, _slowest_update(result), status),
+            _rows("final", result.final, result.max_gap, log, np.full(len(result.final), np.nan), status[at]),
         ]
     )
 
@@ -163,15 +164,21 @@ def events(result: RunResult, log: Log) -> pl.DataFrame:
 
 
 def _rows(
-    kind: str, trajectory: Trajectory, log: Log, update_ms: Array, status: np.typing.NDArray[np.object_]
+    kind: str,
+    trajectory: Trajectory,
+    max_gap: float,
+    log: Log,
+    update_ms: Array,
+    status: np.typing.NDArray[np.object_],
 ) -> pl.DataFrame:
     n = len(trajectory)
-    missing = np.full(n, np.nan)
     covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
-    position, heading, nees = missing, missing, missing
-    if log.reference is not None:
-        e = errors(trajectory, log.reference)
-        position, heading, nees = e.position, e.heading, e.nees
+    position, heading, nees = np.full((3, n), np.nan)
+    if log.reference is not None and n:
+        e = errors(trajectory, log.reference, max_gap)
+        rows = np.flatnonzero(np.isfinite(e.position))
+        nearest = np.searchsorted((trajectory.t[1:] + trajectory.t[:-1]) / 2.0, e.t[rows])
+        position[nearest], heading[nearest], nees[nearest] = e.position[rows], e.heading[rows], e.nees[rows]
     columns: dict[str, Any] = {
         "kind": [kind] * n,
         "t_ns": log.t0_ns + np.round(trajectory.t * 1e9).astype(np.int64),

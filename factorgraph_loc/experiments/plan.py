@@ -31,7 +31,8 @@ class PlannedRun:
     """One run, as plain data that can be sent to other processes.
 
     ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the ``estimator`` with these ``settings``; ``sweep``: what was set for this run, by dotted name. ``key``: of its results.
+    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``sweep``: what was set for this run, by dotted name.
+    ``key``: of its results.
     """
 
     source: LogSource
@@ -44,6 +45,7 @@ class PlannedRun:
     sensors: tuple[str, ...] | None
     prior: str | None
     seed: int
+    max_gap: float
     key: str
     sweep: Mapping[str, Any] = field(default_factory=dict)
 
@@ -52,7 +54,7 @@ class PlannedRun:
         """What is run on the log."""
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
 
-        return RunConfig(self.estimator, self.settings, self.sensors, self.prior, self.seed)
+        return RunConfig(self.estimator, self.settings, self.sensors, self.prior, self.seed, self.max_gap)
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ def _runs(
                 "sensors": sensors,
                 "prior": experiment.prior,
                 "seed": seed,
+                "max_gap": experiment.max_gap,
             }
             yield PlannedRun(
                 source=log.source,
@@ -121,6 +124,7 @@ def _runs(
                 sensors=sensors,
                 prior=experiment.prior,
                 seed=seed,
+                max_gap=experiment.max_gap,
                 key=run_key(log.digest, config),
                 sweep=point,
             )

@@ -21,7 +21,8 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator
 from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.experiments.doubts import never_localized, without_neighbours, without_points, without_tags
+from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
+from factorgraph_loc.experiments.doubts import never_localized, partly_scored, without_points, without_tags
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, resolve_prior
 from factorgraph_loc.files import nearest
@@ -31,7 +32,7 @@ from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
-TICK_RATE = 10  # Hz, the grid on which trajectories are written and scored
+TICK_RATE = 10  # Hz, the grid on which trajectories are written
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
 _SHOWN = 5  # names in a warning
 
@@ -43,6 +44,7 @@ class RunConfig:
     ``estimator``: its name in the registry; ``settings``: overrides of its settings. ``sensors``: names of the streams that it
     may use, None for those of the rig; ``rssi`` and ``phase`` are what the reads of ``rfid`` tell besides. ``prior``: see
     :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator.
+    ``max_gap`` [s]: how far apart estimates may lie between which the score interpolates; it changes no estimate.
     """
 
     estimator: str
@@ -50,6 +52,7 @@ class RunConfig:
     sensors: tuple[str, ...] | None = None
     prior: str | None = None
     seed: int = 0
+    max_gap: float = MAX_GAP
 
 
 def run(
@@ -70,6 +73,7 @@ def run(
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
     Whatever the estimator itself raises is passed on.
     """
+    check_max_gap(config.max_gap)
     sensors = _sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
     prior, prior_source = resolve_prior(log, config.prior)
@@ -106,6 +110,7 @@ def run(
         "sensors": list(sensors),
         "prior": prior_source,
         "seed": config.seed,
+        "max_gap": config.max_gap,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
         "versions": versions,
     }
@@ -125,11 +130,11 @@ def run(
             *log.warnings,
             *_doubts(log, sensors),
             *unread,
-            *without_neighbours(log),
             *prepared.warnings,
             *without_points(log, sensors, config.estimator, estimator, settings),
             *without_tags(log, config.estimator, estimator.diagnostics),
             *never_localized(log, sensors, loop.estimates, final),
+            *partly_scored(log, final, config.max_gap),
         ),
         causal_space=_in_space(loop.estimates),
         final_space=estimator.space_trajectory() if isinstance(estimator, SpaceEstimator) else None,

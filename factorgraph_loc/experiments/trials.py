@@ -9,11 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import BearingRangeStream, Log, cut, join
-from factorgraph_loc.trajectory import Trajectory
+from factors import se2
 from factors.se2 import Array
 
 POSITION, HEADING = 0.5, math.radians(15.0)  # m, rad: an estimate nearer than both is right
@@ -22,6 +21,7 @@ LANDMARKS = 3  # different ones that are enough to be localized by
 START_TIME, RECOVERY_TIME = 60.0, 30.0  # s
 BEFORE = 30.0  # s that a robot drives before it is carried off
 JUMP = 0.2  # s between the two parts of a kidnapping
+REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,12 @@ def _last_start(log: Log) -> float:
 def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
     """Which causal estimates are right; where the reference has a gap, as the one before, or at the beginning as the next."""
     assert log.reference is not None
-    e = errors(Trajectory(result.t, result.poses), log.reference)
-    right = (e.position < POSITION) & ~(e.heading >= HEADING)
-    scored = np.flatnonzero(np.isfinite(e.reference[:, 0]))
+    truth = log.reference.at(result.t, max_gap=REFERENCE_GAP)
+    error = result.poses - truth
+    right = np.hypot(error[:, 0], error[:, 1]) < POSITION
+    if log.reference.has_heading:
+        right &= ~(np.abs(se2.wrap(error[:, 2])) >= HEADING)
+    scored = np.flatnonzero(np.isfinite(truth[:, 0]))
     if not len(scored):
         return right
     return right[scored[np.maximum(np.searchsorted(scored, np.arange(len(right)), side="right") - 1, 0)]]

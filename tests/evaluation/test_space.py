@@ -31,7 +31,7 @@ def test_an_error_that_is_known():
     assert figures["space_rotation_rmse"] == pytest.approx(0.02)
     assert figures["space_anees"] == pytest.approx((0.02**2 + 0.05**2) / 0.1**2)
     assert figures["space_coverage_95"] == 1.0
-    assert figures["space_scored"] == len(T)
+    assert figures["space_scored"] == len(T) / 2  # at most ten a second
 
 
 def test_a_covariance_that_says_too_little_is_seen():
@@ -43,5 +43,16 @@ def test_where_the_reference_has_a_gap_or_ends_nothing_is_scored():
     whole = truth()
     gappy = Trajectory3(T[kept], whole.positions[kept], whole.rotations[kept])
     late = np.append(T, 5.0)
-    assert space.accuracy(off(late), gappy)["space_scored"] == pytest.approx(kept.sum(), abs=4)
+    # from 0 s and from 1.05 s on, twenty stamps a second of which each second one is scored
+    assert space.accuracy(off(late), gappy)["space_scored"] == 15
     assert space.accuracy(off(late[-1:]), gappy)["space_scored"] == 0
+
+
+def test_a_reference_of_few_poses_is_met_between_the_estimates():
+    t = np.arange(0.033, 1.9, 0.13)
+    figures = space.accuracy(off(), truth(t))
+    assert figures["space_scored"] == len(t)
+    assert figures["space_position_rmse"] == pytest.approx(0.05, abs=1e-3)
+    assert figures["space_rotation_rmse"] == pytest.approx(0.02, abs=1e-3)
+    assert figures["space_anees"] == pytest.approx((0.02**2 + 0.05**2) / 0.1**2, rel=0.05)
+    assert space.accuracy(off(), truth(t), max_gap=0.04)["space_scored"] == 0

@@ -106,6 +106,17 @@ def test_times_of_an_offline_estimator_are_not_shown():
     assert line[header.index("x real time")] == "-"
 
 
+def test_how_many_poses_were_scored_is_a_column():
+    rows = rows_of({(log, "a", seed): 0.3 for log in ("one", "two") for seed in (0, 1)})
+    for row, scored in zip(rows, (40, 40, 100, 98), strict=True):
+        row["causal.scored"] = scored
+    rows[3] |= {"causal.scored": None, "final.scored": 98}  # of an offline estimator
+    header, lines = comparison_cells(rows)
+    assert [line[header.index("poses scored")] for line in lines] == ["40", "98 to 100", "138 to 140"]
+    header, lines = comparison_cells(rows_of({("one", "a", 0): None}))
+    assert lines[0][header.index("poses scored")] == "-"
+
+
 def test_verdict_names_the_best_that_can_be_compared():
     rows = rows_of({(log, name, 0): value for log in ("one", "two") for name, value in (("a", 0.4), ("b", 0.2))})
     rows += rows_of({("one", "c", 0): 0.1, ("one", "dead_reckoning", 0): 3.0, ("two", "dead_reckoning", 0): 4.0})

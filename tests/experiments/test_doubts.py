@@ -103,12 +103,33 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
     assert why(both, "bearing_range", "camera") == "its landmarks and points did not tell the place"
 
 
-def test_a_reference_of_a_few_poses_a_second_is_not_scored_by(log):
-    every = log.reference.t[0] + 0.2 * np.arange(round((log.reference.t[-1] - log.reference.t[0]) / 0.2))
-    sparse = replace(log, reference=Trajectory(every, log.reference.at(every)))
+def with_reference(log, t):
+    return replace(log, reference=Trajectory(t, log.reference.at(t)))
+
+
+def test_a_reference_of_a_few_poses_a_second_is_scored_by(log):
+    sparse = with_reference(log, np.arange(0.07, 2.0, 0.128))
     result = run(sparse, RunConfig("dead_reckoning", prior="0,0,0"))
-    assert any("poses of the reference lie 0.20 s apart" in warning for warning in result.warnings)
+    assert result.warnings == ()
+    scores = score(result, sparse)
+    assert scores["causal.scored"] == scores["final.scored"] == len(sparse.reference) == 16
+    # the robot goes straight ahead, and so does the estimate between its ticks
+    assert scores["causal.position_max"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_fewer_poses_than_tell_anything_are_warned_of(log):
+    sparse = with_reference(log, np.arange(0.0, 2.0, 0.4))
+    result = run(sparse, RunConfig("dead_reckoning", prior="0,0,0"))
+    assert result.warnings == (
+        f"straight: only 5 poses of the reference have an estimate, expected at least {FEWEST_SCORED}: nothing is scored",
+    )
     scores = score(result, sparse)
     assert scores["causal.position_rmse"] is None
-    assert 0 < scores["causal.scored"] < FEWEST_SCORED
-    assert not any("of the reference lie" in warning for warning in run(log, RunConfig("dead_reckoning")).warnings)
+    assert scores["causal.scored"] == 5
+
+
+def test_a_reference_shorter_than_the_log_is_scored_where_it_is(log):
+    short = with_reference(log, log.reference.t[(log.reference.t > 0.48) & (log.reference.t < 1.52)])
+    result = run(short, RunConfig("dead_reckoning", prior="0,0,0"))
+    assert result.warnings == ("straight: scored over 1.0 s of 2.0 s: the reference is there from 0.5 s to 1.5 s",)
+    assert score(result, short)["causal.scored"] == 11

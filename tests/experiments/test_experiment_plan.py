@@ -82,6 +82,7 @@ def test_a_key_changes_with_everything_that_a_result_depends_on(planned, logs, m
         key(sensors=["odometry"]),
         key(prior="0,0,0"),
         key(seeds=[1]),
+        key(max_gap=0.3),
     ]
     with (logs / "one" / "odometry.csv").open("a") as file:
         file.write("1700000099000000000,0,0\n")
@@ -90,6 +91,8 @@ def test_a_key_changes_with_everything_that_a_result_depends_on(planned, logs, m
         monkeypatch.setattr(keys, name, lambda value=value: value)
         monkeypatch.setattr(facts, name, lambda value=value: value)
         found.append(key())
+    monkeypatch.setattr(keys, "RULE", 1)
+    found.append(key())
     assert len(set(found)) == len(found)
 
 

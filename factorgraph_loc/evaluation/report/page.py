@@ -285,8 +285,8 @@ class _Page:
                 "are six or more, and say something of this log only. Else figures stand side by side, and nothing is tested. "
                 "The test is Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected as of Holm "
                 "within each column; below 0.05 a difference is called significant. The effect is the matched-pairs "
-                "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored against the reference "
-                "without alignment."
+                "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored at the stamps of the "
+                "reference, at most ten a second, without alignment; between estimates they are interpolated."
             ),
         )
 

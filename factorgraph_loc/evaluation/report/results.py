@@ -10,10 +10,12 @@ import polars as pl
 
 from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, least_p, pooled
 from factorgraph_loc.evaluation.report.metrics import Metric
+from factorgraph_loc.evaluation.scoring import RULE
 
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
 SCORED = 10  # poses that a log's reference must tell of at least: with fewer, its scores say nothing
+_SCORES = ("causal.", "final.", "aligned.")  # what errors against the reference begin with
 
 Row = Mapping[str, Any]
 
@@ -56,11 +58,15 @@ class Results:
     of them, as dictionaries.
 
     A simulated log is shown as another one for each value of a setting of the simulation that is swept; intervals and tests count
-    these as one.
+    these as one. ``outdated``: the runs that were not scored by the rule of this version; beside runs that were, they have no
+    errors, for they cannot be compared.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
-        self.rows: Sequence[Row] = rows.to_dicts()
+        found = rows.to_dicts()
+        self.outdated = [_run_name(row) for row in found if _is_outdated(row)]
+        self.is_mixed = 0 < len(self.outdated) < sum(row["status"] == "ok" for row in found)
+        self.rows: Sequence[Row] = [_without_errors(r) if self.is_mixed and _is_outdated(r) else r for r in found]
         self.sweeps = [c for c in rows.columns if c.startswith(SWEEP) and rows[c].drop_nulls().n_unique() > 1]
         several = _labels_with_several_sensors(self.rows)
         self.variants: dict[str, Variant] = {}
@@ -163,6 +169,18 @@ def score(row: Row, metric: str) -> float | None:
     if row["status"] != "ok" or value is None or (scored is not None and scored < SCORED):
         return None
     return float(value)
+
+
+def _is_outdated(row: Row) -> bool:
+    return row["status"] == "ok" and row.get("scoring.rule") != RULE
+
+
+def _without_errors(row: Row) -> Row:
+    return {key: None if key.startswith(_SCORES) else value for key, value in row.items()}
+
+
+def _run_name(row: Row) -> str:
+    return f"{row['log']}, {label_of(row)}, seed {row['seed']}"
 
 
 def label_of(row: Row) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.alignment import MAX_REFERENCE_GAP
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
 from factorgraph_loc.tag_map import tag_map
@@ -76,8 +75,7 @@ def _pieces(log: Log) -> tuple[Array, ...]:
         return ()
     t, places = log.reference.t, log.reference.poses[:, :2]
     step = len(t) // _POSES + 1
-    pause = max(_PAUSE, MAX_REFERENCE_GAP * step)
-    ends = np.flatnonzero(np.diff(t) > pause) + 1
+    ends = np.flatnonzero(np.diff(t) > _PAUSE) + 1
     return tuple(
         piece[np.unique(np.append(np.arange(0, len(piece), step), len(piece) - 1))] for piece in np.split(places, ends)
     )

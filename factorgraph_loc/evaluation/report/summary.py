@@ -88,6 +88,20 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
 
 def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]:
     told: list[Html] = []
+    if results.outdated:
+        by_it = join(
+            [_list(results.outdated), f" {_is(results.outdated)} scored by another rule than that of this version"]
+        )
+        told.append(
+            join(
+                [
+                    by_it,
+                    ", and not compared: run the experiment again."
+                    if results.is_mixed
+                    else ": not comparable with newer results.",
+                ]
+            )
+        )
     if poor := results.unscored():
         told.append(
             join([f"Fewer than {SCORED} poses of ", _list(poor), " have a reference: nothing is scored there."])

@@ -11,6 +11,7 @@ from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.report.markup import Html, join, table, tag
 from factorgraph_loc.evaluation.report.metrics import Metric, number
 from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, label_of, score
+from factorgraph_loc.evaluation.tables import counted
 
 TIMINGS = (
     "timing.update_ms_median",
@@ -39,8 +40,9 @@ def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
         runs = results.of(variant)
         if is_sought:
             cells.append(_share([row.get("time_to_localized") is not None for row in runs]))
-        rows.append([name(results, variant), *cells, _share([row["status"] == "ok" for row in runs])])
-    shares = ["localized before the end"] * is_sought + ["runs that went well"]
+        cells += [_poses(runs), _share([row["status"] == "ok" for row in runs])]
+        rows.append([name(results, variant), *cells])
+    shares = ["localized before the end"] * is_sought + ["poses scored in a run", "runs that went well"]
     return table(["", *(c.metric.heading for c in comparisons), *shares], rows, class_="figures")
 
 
@@ -62,8 +64,9 @@ def by_log(results: Results, metric: Metric) -> Html:
         values = {v: _average(known, metric) for v, known in found.items() if known}
         pick = {"low": min, "high": max}.get(metric.better or "")
         best = pick(values.values()) if pick and len(values) > 1 else None
-        rows.append([log, *(_log_cell(metric, found[v], len(results.runs(v, log)), best) for v in results.variants)])
-    return table(["log", *(name(results, v) for v in results.variants)], rows, class_="figures")
+        cells = [_log_cell(metric, found[v], len(results.runs(v, log)), best) for v in results.variants]
+        rows.append([log, *cells, _poses([row for v in results.variants for row in results.runs(v, log)])])
+    return table(["log", *(name(results, v) for v in results.variants), "poses scored"], rows, class_="figures")
 
 
 def timing(results: Results, metrics: Sequence[Metric]) -> Html:
@@ -151,6 +154,11 @@ def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float 
         lines.append(f"{len(known)} of {planned} runs")
     is_best = value == best
     return _cell(("● " if is_best else "") + metric.text(value), *lines, class_="best" if is_best else None)
+
+
+def _poses(runs: Sequence[Row]) -> Html:
+    """How many poses were scored, least to most over the runs."""
+    return tag("td", counted(runs) or _NONE)
 
 
 def _share(held: Sequence[bool]) -> Html:
