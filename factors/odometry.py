@@ -27,7 +27,7 @@ from factors.se2 import Array
 # of an increment that takes no time, whose covariance must still be one that can be inverted
 MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
-LEAST_POSITION, LEAST_HEADING = 1e-3, 2e-4  # m, rad per sqrt(s): the least noise
+LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): the least noise
 
 
 @dataclass(frozen=True, slots=True)
