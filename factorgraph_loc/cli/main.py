@@ -7,6 +7,7 @@ import traceback
 from typing import Annotated, Any
 
 import typer
+from typer.completion import install_callback, show_callback
 from typer.core import TyperGroup
 
 from factorgraph_loc import __version__
@@ -28,6 +29,8 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.threads import use_one_thread
 
 DEBUG = "--debug"
+COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
+SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
 INTERRUPTED = 130  # as shells count it: 128 and the number of the signal
 UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
 
@@ -36,7 +39,10 @@ class Commands(TyperGroup):
     """The one place where an error that a user can cause becomes a line on stderr and an exit code."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """``--debug`` is taken wherever it stands on the line."""
+        """``--debug`` is taken wherever it stands on the line. A shell named after an option of completion is the one meant;
+        Typer alone would take the one that it runs in."""
+        if len(args) == 2 and args[0] in COMPLETION and args[1] in SHELLS:
+            COMPLETION[args[0]](ctx, self.params[0], args[1])
         if DEBUG in args:
             args = [DEBUG, *(arg for arg in args if arg != DEBUG)]
         return super().parse_args(ctx, args)

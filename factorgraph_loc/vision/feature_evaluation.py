@@ -25,7 +25,7 @@ from factorgraph_loc.vision.competitors import DETECTORS
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
 from factorgraph_loc.vision.homography import corner_error
 from factorgraph_loc.vision.images import Image
-from factorgraph_loc.vision.matching import RATIO, distance_matrix
+from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neighbours, resolution
 from factorgraph_loc.vision.repeatability import (
     OVERLAP_ERROR,
     Repeatability,
@@ -161,19 +161,20 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     """Mutual nearest neighbours of two sets of descriptors, bits (``uint8``) or vectors.
 
     Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 0 where
-    there is no second. Those with a ratio below r are what :func:`~factorgraph_loc.vision.matching.match` gives for r.
+    there is no second, 1 where another is as near. Those with a ratio below r, r up to 1, are what
+    :func:`~factorgraph_loc.vision.matching.match` gives for r.
     """
     none = np.empty(0, dtype=np.int64)
     if len(first) == 0 or len(second) == 0:
         return none, none, np.empty(0)
-    distances = distance_matrix(first, second, binary=first.dtype == np.uint8)
-    j = distances.argmin(axis=1)
-    i = np.flatnonzero(distances.argmin(axis=0)[j] == np.arange(len(first)))
-    j = j[i]
-    best = distances[i, j].astype(float)
-    distances[i, j] = np.inf
-    runner_up = distances[i].min(axis=1).astype(float)
-    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=runner_up > 0.0)
+    binary = first.dtype == np.uint8
+    distances = distance_matrix(first, second, binary=binary)
+    there = nearest_neighbours(distances, resolution(first, binary=binary))
+    back = nearest_neighbours(distances.T, resolution(second, binary=binary))
+    i = np.flatnonzero(back.index[there.index] == np.arange(len(first)))
+    j = there.index[i]
+    best, runner_up = (values[i].astype(float) for values in (there.best, there.second))
+    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=there.alone[i] & back.alone[j])
 
 
 def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Array, shapes: Shapes) -> RankedMatches:

@@ -3,7 +3,11 @@
 Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section
 7.1. The paper accepts a match "if distance is less than 5 times the distance to the second closest", which always
 holds: ``paper_literal`` does so, and ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict sense in which it may have
-been meant."""
+been meant.
+
+Distances are computed from products, whose rounding depends on the kernel of the BLAS library. What is below their
+resolution is 0, and of two whose distances differ by less neither is the nearest: matches do not depend on the
+processor."""
 
 from __future__ import annotations
 
@@ -48,7 +52,7 @@ def match(
     allowed: Truths | None = None,
 ) -> Matches:
     """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if its distance is below ``ratio`` times that to
-    the second nearest; one without a second nearest passes.
+    the second nearest; one without a second nearest passes. Of two that are equally near none is a match.
 
     ``binary``: Hamming distance, not Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``:
     the paper's ratio of 5, without the mutual check. ``allowed`` (N, M): only such pairs are looked at. InputError
@@ -64,16 +68,13 @@ def match(
         distances[~allowed] = np.inf
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
-    rows = np.arange(len(distances))
-    nearest = distances.argmin(axis=1)
-    best = distances[rows, nearest]
-    keep = np.isfinite(best)
+    there = nearest_neighbours(distances, resolution(first, binary=binary))
+    keep = np.isfinite(there.best) & there.alone & (there.best < ratio * there.second)
     if mutual:
-        keep &= distances.argmin(axis=0)[nearest] == rows
-    distances[rows, nearest] = np.inf
-    keep &= best < ratio * distances.min(axis=1)
+        back = nearest_neighbours(distances.T, resolution(second, binary=binary))
+        keep &= (back.index[there.index] == np.arange(len(keep))) & back.alone[there.index]
     chosen = np.flatnonzero(keep)
-    return Matches(np.stack([chosen, nearest[chosen]], axis=1), best[chosen].astype(float))
+    return Matches(np.stack([chosen, there.index[chosen]], axis=1), there.best[chosen].astype(float))
 
 
 def match_guided(
@@ -112,9 +113,42 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
     return np.asarray(scaled <= -2.0 * math.log1p(-probability) * determinant[:, None])
 
 
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite where there
+    is none, and whether the nearest is ``alone`` (N,): nearer than the second by more than the distances' resolution."""
+
+    index: Integers
+    best: Float
+    second: Float
+    alone: Truths
+
+
+def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
+    """Of N rows of ``distances`` (N, M), M > 0, which column is nearest; ``resolution`` (N,): see :func:`resolution`."""
+    rows = np.arange(len(distances))
+    index = distances.argmin(axis=1)
+    best = distances[rows, index]
+    distances[rows, index] = np.inf
+    second = distances.min(axis=1)
+    distances[rows, index] = best
+    return Nearest(index, best, second, second > np.sqrt(np.square(best) + resolution))
+
+
+def resolution(descriptors: Descriptors, *, binary: bool) -> Float:
+    """The squared distance (N,) from each of ``descriptors`` (N, D) that rounding alone may give: 0 of bits, which are
+    counted; else the bound of the three products of D single-precision terms that :func:`distance_matrix` adds up
+    (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 3.1), of descriptors that are alike."""
+    if binary:
+        return np.zeros(len(descriptors), dtype=np.float32)
+    values = descriptors.astype(np.float32)
+    scale = 2.0 * descriptors.shape[1] * np.finfo(np.float32).eps
+    return np.asarray(scale * np.einsum("nd,nd->n", values, values), dtype=np.float32)
+
+
 def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) -> Float:
-    """Distances (N, M) between ``first`` (N, D) and ``second`` (M, D): the number of bits that differ, or Euclidean.
-    InputError for descriptors that are not alike, or not finite."""
+    """Distances (N, M) between ``first`` (N, D) and ``second`` (M, D): the number of bits that differ, or Euclidean,
+    and 0 where it is below the :func:`resolution`. InputError for descriptors that are not alike, or not finite."""
     for which, descriptors in (("first", first), ("second", second)):
         if descriptors.ndim != 2 or (binary and descriptors.dtype != np.uint8):
             kind = f"{descriptors.dtype} of shape {descriptors.shape}"
@@ -131,5 +165,7 @@ def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) ->
     squared = -2.0 * left @ right.T
     squared += np.einsum("nd,nd->n", left, left)[:, None]
     squared += np.einsum("md,md->m", right, right)
-    # of bits the square is the number of those that differ
-    return np.maximum(squared, 0.0) if binary else np.sqrt(np.maximum(squared, 0.0))
+    if binary:  # the square is the number of those that differ
+        return np.maximum(squared, 0.0)
+    squared[squared <= resolution(first, binary=False)[:, None]] = 0.0
+    return np.sqrt(squared)

@@ -10,6 +10,8 @@ from factorgraph_loc.calibration.image_localization import ImageLocalizer, smoot
 from factorgraph_loc.calibration.steady_motion import SteadyMotion, change_of_velocity
 from factorgraph_loc.points import PointMap
 
+pytestmark = pytest.mark.kernels
+
 T = 0.1 * np.arange(12)
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import shellingham
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.estimators.registry import ESTIMATORS
@@ -57,8 +58,22 @@ def test_completion_loads_no_numerical_libraries():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_for_a_shell_is_shown(shell, fgloc):
+@pytest.mark.parametrize(
+    ("shell", "line"),
+    [
+        ("bash", "complete -o default -F"),
+        ("zsh", "#compdef"),
+        ("fish", "complete --command"),
+    ],
+)
+def test_the_script_of_the_shell_that_is_named_is_shown(shell, line, fgloc, monkeypatch):
+    """Whatever shell this runs in, if in any."""
+
+    def nowhere():
+        raise shellingham.ShellDetectionFailure
+
+    monkeypatch.setattr(shellingham, "detect_shell", nowhere)
     done = fgloc("--show-completion", shell)
     assert done.exit_code == 0
     assert "_COMPLETE" in done.stdout
+    assert line in done.stdout

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.vision.matching import Matches, distance_matrix, gates, match, match_guided
 
+pytestmark = pytest.mark.kernels
+
 
 def by_definition(distances: np.ndarray, ratio: float, mutual: bool) -> list[tuple[int, int]]:
     found = []
@@ -59,6 +61,34 @@ def test_two_alike_are_no_match() -> None:
     a, b = np.zeros((1, 4), dtype=np.float32), np.zeros((2, 4), dtype=np.float32)
     assert len(match(a, b, binary=False)) == 0
     assert len(match(a, b[:1], binary=False)) == 1
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 512.0])
+@pytest.mark.parametrize("columns", [16, 35, 128])
+def test_equal_descriptors_are_no_distance_apart_and_no_match(scale: float, columns: int) -> None:
+    """However a processor rounds: among many pairs some would be a little apart."""
+    rng = np.random.default_rng(5)
+    looks = (scale * rng.normal(size=(200, columns))).astype(np.float32)
+    distances = distance_matrix(looks, np.concatenate((looks, looks)), binary=False)
+    assert not distances[np.arange(200), np.arange(200)].any()
+    assert not distances[np.arange(200), 200 + np.arange(200)].any()
+    assert np.count_nonzero(distances == 0.0) == 400
+    twice = np.concatenate((looks, looks))
+    for ratio in (0.8, 1.0, 5.0):
+        assert len(match(looks, twice, binary=False, ratio=ratio, mutual=False)) == 0
+        assert len(match(twice, looks, binary=False, ratio=ratio)) == 0
+    assert len(match(looks, looks, binary=False)) == 200
+
+
+def test_what_is_as_far_from_two_is_no_match() -> None:
+    rng = np.random.default_rng(6)
+    looks = rng.normal(size=(50, 32)).astype(np.float32)
+    off = 0.05 * rng.normal(size=(50, 32)).astype(np.float32)
+    beside = np.concatenate((looks + off, looks - off))
+    assert len(match(looks, beside, binary=False, ratio=5.0, mutual=False)) == 0
+    assert len(match(beside, looks, binary=False)) == 0
+    bits = np.array([[0b1111], [0b0000]], dtype=np.uint8)
+    assert len(match(bits, np.array([[0b0011]], dtype=np.uint8), binary=True)) == 0
 
 
 def test_the_papers_ratio_accepts_every_nearest_neighbour() -> None:

@@ -8,6 +8,8 @@ from factorgraph_loc.vision import tracks as tracking
 from factorgraph_loc.vision.tracks import follow, pairs
 from factors.reprojection import CameraModel, project, undistorted
 
+pytestmark = pytest.mark.kernels
+
 CAMERA = CameraModel(fx=500.0, fy=500.0, cx=319.5, cy=239.5, width=640, height=480, distortion=(0.05, 0.0, 0.0, 0.0))
 
 
