@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.log import Log
+from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.trajectory import Trajectory
 
 MOSTLY = 0.9  # of the time with estimates
@@ -34,6 +35,29 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
         return ()
     return (
         f"{log.name}: scored over {end - begin:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s",
+    )
+
+
+def check_free_map(log: Log, sensors: Sequence[str], name: str, settings: FileModel) -> None:
+    """InputError where landmarks are to be estimated (by the setting ``landmarks`` of the estimator ``name``) and no sighting tells
+    where one is, nor is of one that the map keeps: all would be ignored."""
+    use = getattr(settings, "landmarks", "known")
+    stream = log.streams.get("bearing_range")
+    if (
+        use == "known"
+        or "bearing_range" not in sensors
+        or not isinstance(stream, BearingRangeStream)
+        or not len(stream.t)
+    ):
+        return
+    if np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        return
+    if use == "extended" and any(landmark in log.world.landmarks for landmark in stream.landmark):
+        return
+    lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
+    raise InputError(
+        f"{log.name}: {name}.landmarks is {use}, but no sighting has a {lacks}, so no landmark can be placed; give a map of them "
+        f"(--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
     )
 
 

@@ -22,7 +22,13 @@ from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
-from factorgraph_loc.experiments.doubts import never_localized, partly_scored, without_points, without_tags
+from factorgraph_loc.experiments.doubts import (
+    check_free_map,
+    never_localized,
+    partly_scored,
+    without_points,
+    without_tags,
+)
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, resolve_prior
 from factorgraph_loc.files import nearest
@@ -76,6 +82,7 @@ def run(
     check_max_gap(config.max_gap)
     sensors = _sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
+    check_free_map(log, sensors, config.estimator, settings)
     prior, prior_source = resolve_prior(log, config.prior)
     world, unread = _readable(log, sensors)
     setup = registry.Setup(log.rig, world, sensors, np.random.default_rng(config.seed))

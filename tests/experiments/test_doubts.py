@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import FeatureStream, SightingStream
@@ -101,6 +102,37 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
     both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
     assert why(both, "bearing_range") == "no landmark of the map was seen"
     assert why(both, "bearing_range", "camera") == "its landmarks and points did not tell the place"
+
+
+def with_sightings(log, **columns):
+    return replace(log, streams=log.streams | {"bearing_range": replace(log.streams["bearing_range"], **columns)})
+
+
+NOTHING = np.full(8, np.nan)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "batch"])
+@pytest.mark.parametrize("lacks", ["bearing", "range"])
+def test_landmarks_that_no_sighting_can_place_are_not_estimated(log, name, lacks):
+    alone = with_sightings(log, **{lacks: NOTHING})
+    message = (
+        f"straight: {name}.landmarks is unknown, but no sighting has a {lacks}, so no landmark can be placed; give a map of them "
+        f"\\(--world\\) with {name}.landmarks=known, or leave out bearing_range \\(--sensors\\)"
+    )
+    with pytest.raises(InputError, match=f"^{message}$"):
+        run(alone, RunConfig(name, {"landmarks": "unknown"}))
+    with pytest.raises(InputError, match=f"{name}.landmarks is extended"):
+        run(replace(alone, world=World()), RunConfig(name, {"landmarks": "extended"}))
+
+
+def test_landmarks_that_some_sighting_can_place_are_estimated(log):
+    free = {"landmarks": "unknown"}
+    alone = with_sightings(log, bearing=NOTHING)
+    run(alone, RunConfig("ekf", {"landmarks": "extended"}))  # its map has them
+    run(alone, RunConfig("ekf"))
+    run(alone, RunConfig("ekf", free, ("odometry",)))
+    of_a = np.where(np.arange(8) % 2, np.nan, log.streams["bearing_range"].bearing)
+    assert set(run(with_sightings(log, bearing=of_a), RunConfig("ekf", free)).learnt.landmarks) == {"a"}
 
 
 def with_reference(log, t):
