@@ -179,13 +179,19 @@ def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRang
     nothing = np.flatnonzero(np.isnan(ranges) & np.isnan(bearings))
     if len(nothing):
         raise bad_field(table.path, "row", "", "a range, a bearing or both", row=int(table.rows[nothing[0]]))
-    checks.require_above_zero(table.path, table.rows, "range", ranges)
+    if len(short := np.flatnonzero(ranges <= 0.0)):  # radios that got no answer say 0, and gross errors may be below
+        first = f"{table.path}:{int(table.rows[short[0]])}"
+        warnings.append(
+            f"{first}: range is {ranges[short[0]]:g}: {len(short)} ranges that are not above 0 are left out"
+        )
+        ranges = np.where(ranges > 0.0, ranges, np.nan)
     turned = np.flatnonzero(np.abs(bearings) > 2.0 * np.pi)
     if len(turned):
         i = int(turned[0])
         raise bad_field(table.path, "bearing", float(bearings[i]), "radians, not degrees", row=int(table.rows[i]))
     names = table.names["landmark"]
     keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
+    keep = keep[np.isfinite(ranges[keep]) | np.isfinite(bearings[keep])]
     t = checks.seconds(table.t_ns[keep], t0_ns)
     return BearingRangeStream(t, [names[i] for i in keep], ranges[keep], bearings[keep])
 

@@ -105,7 +105,6 @@ HEADER = "t_ns,landmark,range,bearing\n"
 BAD_SIGHTINGS = {
     "neither range nor bearing": ("1,A,1,0\n2,A,,\n", ":3: row", "a range, a bearing or both"),
     "no name": ("1,,1,0\n", ":2: landmark is ''", "name of a landmark"),
-    "range of zero": ("1,A,0,0\n", ":2: range is 0.0", "more than 0"),
     "degrees": ("1,A,1,90\n", ":2: bearing is 90.0", "radians"),
     "nan": ("1,A,NaN,0\n", ":2: range is 'NaN'", "finite"),
     "too late": ("2000000000,A,1,0\n1400000000,A,1,0\n", ":3: time", "at most 0.5 s older"),
@@ -116,6 +115,17 @@ BAD_SIGHTINGS = {
 def test_bad_sightings(native, refused, text, fragments):
     (native / "bearing_range.csv").write_text(HEADER + text)
     refused(native, "bearing_range.csv", *fragments)
+
+
+def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native, one):
+    rows = "1100000000,A,1.5,0\n1200000000,A,0,\n1200000000,B,-3,0.2\n1300000000,A,1.4,0.1\n"
+    (native / "bearing_range.csv").write_text(HEADER + rows)
+    log = one(native)
+    seen = log.streams["bearing_range"]
+    assert list(seen.landmark) == ["A", "B", "A"]
+    np.testing.assert_array_equal(seen.range, (1.5, np.nan, 1.4))
+    np.testing.assert_array_equal(seen.bearing, (0.0, 0.2, 0.1))
+    assert any("bearing_range.csv:3: range is 0: 2 ranges that are not above 0 are left out" in w for w in log.warnings)
 
 
 BAD_FILES = {

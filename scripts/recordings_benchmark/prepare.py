@@ -1,0 +1,185 @@
+"""How the files of recordings become logs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import write_toml
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, Stream, VelocityStream
+from factorgraph_loc.readers import load
+from factorgraph_loc.readers.registry import DEFAULT_RIG
+from factorgraph_loc.readers.simulated_odometry import wheel_odometry
+from factorgraph_loc.readers.space_poses import read_kitti
+from factorgraph_loc.readers.write import write_log
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World
+from factors import se2
+from factors.se2 import Array
+from recordings_benchmark.listed import Recording
+
+ODOMETRY_SEED = 1
+# the trolley's anchors [m], and where its tag 0 sits; its body frame hangs upside down, so that y is to the right
+ANCHORS = (
+    (-3.4203, 3.0053),
+    (0.0016, 3.0110),
+    (3.6056, 2.9795),
+    (3.6011, -0.0008),
+    (3.5674, -3.0087),
+    (-0.0072, -2.9652),
+    (-3.4673, -2.9587),
+    (-3.4858, -0.0098),
+)
+TAG = (-0.0689, 0.1423)
+TAGS, THINNED = 3, 10  # ranges of so many tags in a row; one row of so many is taken, which leaves 10 Hz
+
+
+def prepare(recording: Recording, folder: Path, out: Path) -> Log:
+    """The log of a recording whose files lie in ``folder``; it is written to ``out`` too. InputError says what is wrong."""
+    paths = [folder / file.name for file in recording.files]
+    if missing := [path for path in paths if not path.is_file()]:
+        raise InputError(f"{missing[0]}: is missing, scripts/bench_recordings --fetch prints how to fetch it")
+    if recording.kind == "bag":
+        return _bag(recording, paths[0], out)
+    log = KINDS[recording.kind](recording, paths)
+    target = out / recording.name
+    if not target.exists():
+        write_log(log, target)
+    # what is run is what was written
+    return load(target)[0]
+
+
+def _bag(recording: Recording, path: Path, out: Path) -> Log:
+    manifest = out / f"{recording.name}.toml"
+    content = {"title": recording.title, "reader": "rosbag", "path": path.name, "licence": recording.licence}
+    content |= {"origin": f"https://github.com/{recording.files[0].repository}"}
+    out.mkdir(parents=True, exist_ok=True)
+    write_toml(manifest, content | {"options": recording.options})
+    log = load(manifest, data_root=path.parent)[0]
+    return replace(log, name=recording.name)
+
+
+def _librsf(recording: Recording, paths: list[Path]) -> Log:
+    """Lines of libRSF's text format: a name, a stamp and numbers."""
+    rows: dict[str, list[list[float]]] = {}
+    for path in paths:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            name, *numbers = line.split()
+            rows.setdefault(name, []).append([float(number) for number in numbers])
+    tables = {name: np.array(values) for name, values in rows.items() if name != "loop"}
+    landmarks: dict[str, Landmark] = {}
+    streams: dict[str, Stream] = {}
+    if "odom2diff" in tables:
+        t, right, left, _, track = tables["odom2diff"].T[:5]
+        streams["odometry"] = VelocityStream(t, (right + left) / 2.0, (right - left) / track)
+    else:
+        t, *velocity = tables["odom2"].T[:4]
+        # a row tells the motion up to its stamp
+        moves = np.stack(velocity, axis=-1) * np.diff(t, prepend=t[0])[:, None]
+        streams["odometry"] = IncrementStream(t, *np.ascontiguousarray(moves.T))
+    if "range2" in tables:
+        ranges = tables["range2"]
+        names = [f"{number:.0f}" for number in ranges[:, 5]]
+        landmarks = {name: Landmark(x=row[3], y=row[4]) for name, row in zip(names, ranges.tolist(), strict=True)}
+        streams["bearing_range"] = BearingRangeStream(ranges[:, 0], names, ranges[:, 1], np.full(len(ranges), np.nan))
+    places = tables["point2"]
+    angles = tables["angle"][:, 1] if "angle" in tables else np.zeros(len(places))
+    poses = np.column_stack((places[:, 1:3], se2.wrap(angles)))
+    reference = Trajectory(places[:, 0], poses, has_heading="angle" in tables)
+    return _log(recording, streams, reference, World(name=recording.name, landmarks=landmarks))
+
+
+def _trajectory(recording: Recording, paths: list[Path]) -> Log:
+    """A reference alone: the odometry is simulated, or what moves between the poses of another program."""
+    form, axis = recording.options["format"], "xyz".index(recording.options.get("axis", "x"))
+    if form == "kitti":
+        truth = _kitti(paths[0], paths[1])
+        others = [_kitti(path, paths[1]) for path in paths[2:]]
+    else:
+        truth, *others = (_stamped(path, form, axis) for path in paths)
+    t0 = truth.t[0]
+    reference = Trajectory(truth.t - t0, truth.poses)
+    if not others:
+        return _log(recording, {"odometry": wheel_odometry(reference, ODOMETRY_SEED)}, reference, World())
+    seen = others[0]
+    moves = np.vstack((np.zeros((1, 3)), se2.between(seen.poses[:-1], seen.poses[1:])))
+    return _log(
+        recording, {"odometry": IncrementStream(seen.t - t0, *np.ascontiguousarray(moves.T))}, reference, World()
+    )
+
+
+def _kitti(path: Path, times: Path) -> Trajectory:
+    _, t_ns, poses = read_kitti(path, times)
+    return Trajectory(t_ns / 1e9, poses.planar().poses)
+
+
+def _stamped(path: Path, form: str, axis: int) -> Trajectory:
+    """Poses of TUM (t x y z qx qy qz qw) or EuRoC (ns, x, y, z, qw, qx, qy, qz, ...), seen from above; ``axis``: whose direction
+    is the heading. A camera, or the IMU of EuRoC, looks along z."""
+    if form == "tum":
+        t, x, y, _, qx, qy, qz, qw = np.loadtxt(path, comments="#", usecols=range(8)).T
+    else:
+        nanoseconds, x, y, _, qw, qx, qy, qz = np.loadtxt(path, comments="#", delimiter=",", usecols=range(8)).T
+        t = nanoseconds / 1e9
+    ahead = (
+        (1.0 - 2.0 * (qy**2 + qz**2), 2.0 * (qx * qy + qw * qz)),
+        (2.0 * (qx * qy - qw * qz), 1.0 - 2.0 * (qx**2 + qz**2)),
+        (2.0 * (qx * qz + qw * qy), 2.0 * (qy * qz - qw * qx)),
+    )[axis]
+    kept = np.append(True, np.diff(t) > 0.0)
+    return Trajectory(t[kept], np.column_stack((x, y, np.arctan2(ahead[1], ahead[0])))[kept])
+
+
+def _trolley(recording: Recording, paths: list[Path]) -> Log:
+    """Ranges of one tag of three, and motion capture, by which wheels are simulated."""
+    capture, ranges = (_dated(path) for path in paths)
+    t0 = float(max(capture[0, 0], ranges[0, 0]))
+    x, y, qw, qx, qy, qz = capture[:, (1, 2, 4, 5, 6, 7)].T
+    heading = np.arctan2(2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qy**2 + qz**2))
+    kept = (np.diff(capture[:, 0], prepend=-np.inf) > 0.0) & (capture[:, 0] >= t0)
+    reference = Trajectory(capture[kept, 0] - t0, np.column_stack((x, y, heading))[kept])
+    rows = ranges[::THINNED]
+    rows = rows[(rows[:, 0] > t0) & np.isfinite(rows).all(axis=1)]
+    names = [str(i) for i in range(len(ANCHORS))]
+    told = rows[:, 1::TAGS]
+    stream = BearingRangeStream(
+        np.repeat(rows[:, 0] - t0, len(ANCHORS)), names * len(rows), told.ravel(), np.full(told.size, np.nan)
+    )
+    landmarks = {name: Landmark(x=place[0], y=place[1]) for name, place in zip(names, ANCHORS, strict=True)}
+    streams: dict[str, Stream] = {"odometry": wheel_odometry(reference, ODOMETRY_SEED), "bearing_range": stream}
+    log = _log(recording, streams, reference, World(name=recording.name, landmarks=landmarks))
+    assert log.rig.bearing_range is not None
+    mounted = log.rig.bearing_range.model_copy(update={"x": TAG[0], "y": TAG[1]})
+    return replace(log, rig=log.rig.model_copy(update={"bearing_range": mounted}))
+
+
+def _dated(path: Path) -> Array:
+    """Rows of a date and numbers, as seconds of the day and numbers; what is no number is NaN."""
+    out = []
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.reader(file):
+            if not row[0][:1].isdigit():
+                continue
+            moment = datetime.strptime(row[0], "%Y-%m-%d %H:%M:%S.%f")
+            seconds = 3600.0 * moment.hour + 60.0 * moment.minute + moment.second + moment.microsecond / 1e6
+            out.append([seconds, *(float(cell) if cell else np.nan for cell in row[1:])])
+    return np.array(out)
+
+
+def _log(recording: Recording, streams: dict[str, Stream], reference: Trajectory, world: World) -> Log:
+    sensors = tuple(streams)
+    rig = DEFAULT_RIG.model_copy(update={"sensors": sensors})
+    return Log(name=recording.name, rig=rig, world=world, streams=streams, reference=reference)
+
+
+KINDS: dict[str, Callable[[Recording, list[Path]], Log]] = {
+    "librsf": _librsf,
+    "trajectory": _trajectory,
+    "trolley": _trolley,
+}

@@ -1,0 +1,84 @@
+"""What the estimators make of the recordings: position RMSE of causal and final estimates, or in one line why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarking.report import Options, Report
+
+from factorgraph_loc.api import run
+from factorgraph_loc.errors import FglocError
+from recordings_benchmark.listed import RECORDINGS, Recording
+from recordings_benchmark.prepare import prepare
+
+ESTIMATORS = ("dead_reckoning", "ekf", "particle_filter", "switching", "smoother", "batch")
+
+
+@dataclass(frozen=True)
+class Job:
+    recording: Recording
+    folder: Path
+    out: Path
+
+
+@dataclass(frozen=True)
+class Found:
+    """``scores`` by estimator, a line of why there are none in their place; ``warnings`` of the log; ``sensors`` that were used."""
+
+    scores: dict[str, dict[str, Any] | str]
+    seconds: float
+
+
+def section(options: Options) -> Report:
+    """The table, and the lines of what was not scored."""
+    assert options.data_root is not None
+    report = Report("recordings", options)
+    logs = options.out / "logs"
+    jobs = [Job(recording, options.data_root, logs) for recording in RECORDINGS]
+    found = report.collect(measured, jobs, [job.recording.name for job in jobs])
+    rows, notes = [], []
+    for i, result in sorted(found.items()):
+        recording = RECORDINGS[i]
+        told = {name: one for name, one in result.scores.items() if isinstance(one, dict)}
+        refused = {name: one for name, one in result.scores.items() if isinstance(one, str)}
+        counts = {one.get("causal.scored") or one.get("final.scored") or 0 for one in told.values()}
+        sensors = recording.odometry + (f"; {recording.others}" if recording.others else "")
+        scored = str(max(counts, default=0))
+        rows.append((recording.name, recording.title, sensors, scored, *(_cell(result.scores[e]) for e in ESTIMATORS)))
+        lines = sorted(set(refused.values()))
+        notes += [f"- {recording.name}: {line}" for line in lines]
+        if told and not any(counts):
+            notes.append(
+                f"- {recording.name}: runs, but has no reference to be scored by; {result.seconds:.0f} s of log"
+            )
+    report.table(("log", "what it is", "odometry; other sensors", "poses", *ESTIMATORS), rows)
+    report.lines += [*notes, ""]
+    return report
+
+
+def measured(job: Job) -> Found:
+    """Every estimator on one recording."""
+    recording = job.recording
+    try:
+        log = prepare(recording, job.folder, job.out)
+    except FglocError as error:
+        return Found({name: str(error).replace(f"{job.folder}/", "") for name in ESTIMATORS}, 0.0)
+    scores: dict[str, dict[str, Any] | str] = {}
+    for name in ESTIMATORS:
+        try:
+            scores[name] = run(log, name, prior=recording.prior).scores
+        except FglocError as error:
+            scores[name] = str(error)
+    t = log.streams["odometry"].t
+    return Found(scores, float(t[-1] - t[0]))
+
+
+def _cell(scores: dict[str, Any] | str) -> str:
+    if isinstance(scores, str):
+        return "-"
+    values = [scores.get(f"{kind}.position_rmse") for kind in ("causal", "final")]
+    if all(value is None for value in values):
+        return "runs"
+    return " / ".join("-" if value is None else f"{value:.3f}" for value in values)
