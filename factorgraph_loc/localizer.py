@@ -22,6 +22,7 @@ from factorgraph_loc.estimators.base import (
     Learnt,
     PoseEstimate,
     PosePrior,
+    finds_heading,
 )
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
@@ -84,10 +85,12 @@ class Localizer:
     def initialize(
         self, pose: ArrayLike | None = None, covariance: ArrayLike | None = None, t: float | None = None
     ) -> None:
-        """Begin, or begin anew, at a ``pose`` (3,), x, y [m] and heading [rad] in the world's frame; None: anywhere in the map.
+        """Begin, or begin anew, at a ``pose`` (3,), x, y [m] and heading [rad] in the world's frame; None: anywhere in the map. A
+        heading of NaN may be any: nothing is ``localized`` until what is seen has told it.
 
-        ``covariance`` (3, 3) of the pose, by default that of 0.05 m and 0.05 rad. ``t`` [s]: when the robot is there, by default at
-        the first measurement. Odometry from before then is taken in, as its velocity holds on; other measurements are ignored.
+        ``covariance`` (3, 3) of the pose, or (2, 2) of the position where the heading is NaN, by default that of 0.05 m and
+        0.05 rad. ``t`` [s]: when the robot is there, by default at the first measurement. Odometry from before then is taken in,
+        as its velocity holds on; other measurements are ignored.
         InputError if these are no pose, or if the estimator cannot begin from an unknown one.
         """
         start = None if pose is None else _start(pose, covariance, t)
@@ -95,6 +98,8 @@ class Localizer:
         new = registry.create(self._name, setup, self._settings)
         if start is None and not getattr(new, "supports_unknown_start", False):
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
+        if start is not None and not start.has_heading and not finds_heading(new):
+            raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected one")
         with self._lock:
             self._begin_anew(new, start)
 
@@ -273,13 +278,20 @@ def _sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
 
 def _start(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
     """The Gaussian to begin from; its time is NaN where none is given."""
+    mean = numbers("initialize()", "pose", pose)
+    if mean.shape != (3,) or not np.all(np.isfinite(mean[:2])) or np.isinf(mean[2]):
+        raise InputError(f"pose is {mean.tolist()}, expected finite x, y [m] and heading [rad], which may be NaN")
+    size = 2 if np.isnan(mean[2]) else 3
     if covariance is None:
-        covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA)))
-    mean, spread = numbers("initialize()", "pose", pose), numbers("initialize()", "covariance", covariance)
-    if mean.shape != (3,) or not np.all(np.isfinite(mean)):
-        raise InputError(f"pose is {mean.tolist()}, expected finite x, y [m] and heading [rad]")
-    if spread.shape != (3, 3) or not np.allclose(spread, spread.T) or not np.all(np.linalg.eigvalsh(spread) > 0.0):
-        raise InputError(f"covariance is {spread.tolist()}, expected (3, 3), symmetric and positive definite")
+        covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA))[:size])
+    spread = numbers("initialize()", "covariance", covariance)
+    if (
+        spread.shape != (size, size)
+        or not np.allclose(spread, spread.T)
+        or not np.all(np.linalg.eigvalsh(spread) > 0.0)
+    ):
+        raise InputError(f"covariance is {spread.tolist()}, expected ({size}, {size}), symmetric and positive definite")
     if t is not None and not math.isfinite(t):
         raise InputError(f"t is {t!r}, expected a finite number of seconds")
-    return PosePrior(math.nan if t is None else float(t), mean, spread)
+    at = math.nan if t is None else float(t)
+    return PosePrior(at, mean, spread) if size == 3 else PosePrior.at_position(at, mean[:2], spread)

@@ -48,7 +48,7 @@ class OdometryChain:
     def __init__(self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0) -> None:
         self.model = model
         self._use_gyro = use_gyro
-        self._horizon = horizon
+        self.horizon = horizon
         self._rows = np.zeros((256, _ROW))
         self._knots = np.zeros((256, _KNOT))
         self._count = 0
@@ -142,8 +142,8 @@ class OdometryChain:
         # seldom, and many at a time: moving what is kept to the front costs its length
         n = self._count
         newest = self._knots[n - 1, _T]
-        if newest - self._knots[0, _T] > 2.0 * self._horizon:
-            keep = int(np.searchsorted(self._knots[:n, _T], newest - self._horizon, side="right")) - 1
+        if newest - self._knots[0, _T] > 2.0 * self.horizon:
+            keep = int(np.searchsorted(self._knots[:n, _T], newest - self.horizon, side="right")) - 1
             for table in (self._rows, self._knots):
                 table[: n - keep] = table[keep:n].copy()
             self._count = n - keep

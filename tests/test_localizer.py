@@ -47,6 +47,8 @@ def started(log, name="smoother", prior=None, **options):
     start, _ = resolve_prior(log, prior)
     if start is None:
         localizer.initialize()
+    elif not start.has_heading:
+        localizer.initialize((*start.pose[:2], math.nan), start.covariance[:2, :2], start.t)
     else:
         localizer.initialize(start.pose, start.covariance, start.t)
     return localizer
@@ -59,6 +61,9 @@ def started(log, name="smoother", prior=None, **options):
         ("smoother", ("odometry", "bearing_range"), {"lag": 5.0}, None),
         ("smoother", ("odometry", "rfid"), {}, "unknown"),
         ("ekf", ("odometry", "bearing_range"), {}, None),
+        ("ekf", ("odometry", "bearing_range"), {}, "position"),
+        ("smoother", ("odometry", "rfid"), {}, "position"),
+        ("particle_filter", ("odometry", "bearing_range"), {"particles": 500}, "position"),
         ("particle_filter", ("odometry", "rfid"), {"particles": 500}, None),
         ("switching", SENSORS, {"particles": 500}, None),
         ("batch", ("odometry", "bearing_range"), {}, None),
@@ -66,6 +71,9 @@ def started(log, name="smoother", prior=None, **options):
 )
 def test_estimates_are_those_of_a_run(log, name, sensors, settings, prior):
     lag = {"lag": 10.0} if name == "smoother" else {}
+    if prior == "position":
+        x, y, _ = log.reference.poses[0].tolist()
+        prior = f"{x},{y}"
     expected = run(log, RunConfig(name, lag | settings, sensors, prior))
     localizer = started(log, name, prior, settings=settings, sensors=sensors)
     ticks, found = iter([*expected.t, math.inf]), []
@@ -324,6 +332,7 @@ def test_clocks_that_go_back_or_are_others_are_refused(log):
             r"expected \(3, 3\), symmetric and positive definite",
         ),
         ({"pose": (0, 0, 0), "t": math.inf}, "t is inf, expected a finite number"),
+        ({"pose": (0, 0, math.nan), "covariance": np.eye(3)}, r"expected \(2, 2\), symmetric and positive definite"),
         ({}, "ekf cannot start from an unknown pose with this rig and map, expected a pose"),
     ],
 )

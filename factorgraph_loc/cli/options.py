@@ -59,7 +59,7 @@ Prior = Annotated[
     str | None,
     typer.Option(
         metavar="PRIOR",
-        help="Where a run starts: reference, log, unknown or X,Y,HEADING [m, m, rad]; else the log's start, else the reference.",
+        help="Where a run starts: reference, log, unknown, X,Y [m] or X,Y,HEADING [rad]; else the log's start, else the reference.",
         autocompletion=completion.prior,
     ),
 ]

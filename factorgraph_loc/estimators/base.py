@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
@@ -20,12 +21,21 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 @dataclass(frozen=True)
 class PosePrior:
     """What is known of the start: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame;
-    ``space``: of a robot that is not on a floor."""
+    ``space``: of a robot that is not on a floor. ``has_heading``: False where the heading may be any; that of the pose is 0 then,
+    and its variance that of a uniform distribution."""
 
     t: float
     pose: Array
     covariance: Array
     space: SpacePose | None = None
+    has_heading: bool = True
+
+    @staticmethod
+    def at_position(t: float, position: Array, covariance: Array) -> PosePrior:
+        """At a ``position`` (2,) with ``covariance`` (2, 2), and any heading."""
+        whole = np.diag((0.0, 0.0, math.pi**2 / 3.0))
+        whole[:2, :2] = covariance
+        return PosePrior(t, np.append(position, 0.0), whole, has_heading=False)
 
 
 @dataclass(frozen=True)
@@ -168,7 +178,11 @@ class Estimator(Protocol):
     diagnostics: Diagnostics
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; before that every estimate is ``unlocalized``."""
+        """Start from a Gaussian; before that every estimate is ``unlocalized``.
+
+        A prior without a heading is given only to an estimator of which :func:`finds_heading` is true: no estimate is
+        ``localized`` until what is seen has told the heading.
+        """
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement; one that is late by more than ``max_delay`` is counted and dropped."""
@@ -200,6 +214,12 @@ class ForgettingEstimator(Protocol):
 
     def forget(self, before: float) -> None:
         """Drop what only the trajectory before that time needs, as far as late measurements cannot change it any more."""
+
+
+def finds_heading(estimator: Estimator) -> bool:
+    """Whether the estimator can start at a position with an unknown heading: who finds its place finds its heading too."""
+    names = ("supports_unknown_start", "supports_unknown_heading")
+    return any(getattr(estimator, name, False) for name in names)
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:

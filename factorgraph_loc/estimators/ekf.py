@@ -14,15 +14,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Learnt, LearntPoint, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Belief, Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks, world_estimate
+from factorgraph_loc.estimators.heading_search import HeadingSearch
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.landmarks import KnownLandmarks, MapUse, together
 from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.robust_update import update_state
 from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, KnownPoints, Predicted
-from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings
+from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
@@ -109,6 +111,9 @@ class Ekf(Filter):
         self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, motion=self._motion)
         self._finder = PixelFinder(self._points, self._motion)
         self.supports_unknown_start = self._points.known
+        self.supports_unknown_heading = self._points.known or self._landmarks.known
+        self._setup = setup
+        self._search: HeadingSearch | None = None
         # where the constants lie in the state's rest, and where the landmarks begin
         middle = len(self._odometry_constants.names)
         end = middle + len(self._sensor_constants.names)
@@ -116,6 +121,27 @@ class Ekf(Filter):
         self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, end)
         self._camera_part = slice(end, self._first_landmark)
         self._step: _Step | None = None
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian; without a heading, once what is seen tells it."""
+        self._search = None
+        if prior.has_heading:
+            super().initialize(prior)
+            return
+        self._wait(prior.t)
+        start = KnownPosition(prior, self._motion.state(prior.t), self._motion)
+        self._search = HeadingSearch(self._setup, self._motion, start, self._finder)
+
+    def estimate(self) -> PoseEstimate:
+        """The pose at the time of the newest measurement or tick; ``ambiguous`` while its heading is sought."""
+        if self._search is None:
+            return super().estimate()
+        likeliest = self._search.belief(self._t).modes[0]
+        return PoseEstimate(self._t, likeliest.pose, likeliest.covariance, "ambiguous")
+
+    def belief(self) -> Belief:
+        """The belief behind :meth:`estimate`; of all headings while that is sought."""
+        return super().belief() if self._search is None else self._search.belief(self._t)
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
@@ -211,6 +237,23 @@ class Ekf(Filter):
         if since is not None and found is not None:
             self.diagnostics.events.append((m.t, f"lost: {MISSED} since {since:.1f} s; goes on at another place"))
             self._jump(found)
+
+    def _begin(self, m: Exteroceptive | Tick) -> None:
+        if self._search is None:
+            super()._begin(m)
+            return
+        if m.t < max(self._search.start.t, self._t - self._max_delay):
+            self._drop_late(m)
+            return
+        self._t = max(self._t, m.t)
+        found = self._search.take(m)
+        if found is None:
+            return
+        again = self._search.kept()
+        self.diagnostics.events.append((m.t, "localized"))
+        self.initialize(found)
+        for one in again:
+            self._take(one)
 
     def _seek(self, m: Exteroceptive) -> _State | None:
         if not isinstance(m, PixelSightings | CameraFrame) or not self._finder.look(m, self._odometry):

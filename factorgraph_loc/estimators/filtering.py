@@ -94,6 +94,11 @@ class Filter(ABC):
         self._state = self._start(prior)
         self._taken.clear()
 
+    def _wait(self, t: float) -> None:
+        """Begin at ``t`` without a state: measurements go to :meth:`_begin`."""
+        self._t, self._state = t, None
+        self._taken.clear()
+
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
         if isinstance(measurement, Odometry):

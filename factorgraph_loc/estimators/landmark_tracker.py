@@ -14,6 +14,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.cloud import Cloud
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
@@ -52,6 +53,10 @@ class LandmarkTracker:
     def factor(self, m: BearingRange) -> BearingRangeFactor | None:
         """What was seen of landmarks of the map; None where that is nothing."""
         return self._landmarks.factor(m)
+
+    def seek_from(self, start: KnownPosition | None) -> None:
+        """Seek the heading of a start whose position is known; None: that is over."""
+        self._relocalizer.start = start
 
     def seek(self, seen: BearingRangeFactor, odometry: ChainState) -> None:
         """Search with what was seen while no place is known at all."""

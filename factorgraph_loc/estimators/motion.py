@@ -31,18 +31,17 @@ class Motion:
         self._constants_as_noise = not self_calibration
         self._use_gyro = "imu" in sensors and rig.imu is not None
         self._use_wheels = "odometry" in sensors
-        self._horizon = HORIZON
+        self.horizon = HORIZON
         self._chain = self._new_chain()
         self._diagnostics = diagnostics
 
     def keep(self, horizon: float) -> None:
-        """Keep the odometry of the last ``horizon`` seconds; to be said before any row comes."""
-        self._horizon = horizon
-        self._chain = self._new_chain()
+        """Keep the odometry of the last ``horizon`` seconds, as far as it is there yet."""
+        self.horizon = self._chain.horizon = horizon
 
     def _new_chain(self) -> OdometryChain:
         model = self._rig.odometry_model(use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
-        return OdometryChain(model, use_gyro=self._use_gyro, horizon=self._horizon)
+        return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
     def add(self, m: Odometry) -> None:
         """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""

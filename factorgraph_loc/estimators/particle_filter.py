@@ -9,6 +9,7 @@ little too small where landmarks tell next to nothing of them: resampling moves 
 Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what landmarks tell of it
 (:mod:`~factorgraph_loc.estimators.landmark_tracker`), or where no landmarks are used from what scans of RFID tags tell
 (:mod:`~factorgraph_loc.estimators.scan_tracker`). A camera tells it by itself (:mod:`~factorgraph_loc.estimators.pixel_tracker`).
+A start with an unknown heading is such a place: particles there face anywhere.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.landmark_tracker import LandmarkTracker
 from factorgraph_loc.estimators.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.estimators.pixel_finder import MISSED
@@ -124,8 +126,18 @@ class ParticleFilter(Filter):
         super().forget(max(clouds, default=-math.inf) if self._smooth else before)
 
     def _start(self, prior: PosePrior) -> Cloud:
+        if not prior.has_heading:
+            start = KnownPosition(prior, self._odometry, self._motion)
+            self._seek_from(start)
+            poses = start.drawn(self._rng, self._settings.particles, self._odometry)
+            return replace(self._cloud(poses), localized=False)
         self._scans.start(found=False)
         return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
+
+    def _seek_from(self, start: KnownPosition | None) -> None:
+        """Tell the searches what is known of the start, as long as its heading is sought."""
+        for part in (self._landmarks, self._scans, self._pixels):
+            part.seek_from(start)
 
     def _seek(self, m: Exteroceptive) -> Cloud | None:
         if isinstance(m, RfidScan):
@@ -195,6 +207,7 @@ class ParticleFilter(Filter):
             self._state = self._landmarks.injected(self._state)
             if self._landmarks.settled(self._state):
                 self._state = replace(self._state, localized=True)
+                self._seek_from(None)
                 self._event("recovered" if self._lost else "localized")
 
     def _look(self, m: Pixels) -> None:
@@ -217,6 +230,7 @@ class ParticleFilter(Filter):
         if clear or not self._scans.finds:
             self._state = replace(self._cloud(poses), localized=clear)
         if clear:
+            self._seek_from(None)
             self._scans.start(found=True)
             self._event(what)
 
@@ -244,6 +258,7 @@ class ParticleFilter(Filter):
         """Go on where scans alone lead to; ``what`` that is, once it is one place."""
         self._state = self._sought()
         if self._state.localized:
+            self._seek_from(None)
             self._scans.start(found=True)
             self._event(what)
 

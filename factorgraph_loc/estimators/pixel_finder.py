@@ -2,7 +2,7 @@
 
 A frame that shows enough of the map tells the pose by itself. One that tells it less clearly needs others to agree with it along
 the odometry, and so do those that are to refute a track, which is under suspicion once points of the map are persistently not
-where they are expected.
+where they are expected. Where the start is known but for its heading, a frame must agree with it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.estimators.base import Mode, PosePrior
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels
+from factorgraph_loc.vision.relocalization import FoundOnFloor
 from factors import se2
 from factors.odometry import ChainState
 from factors.se2 import Array
@@ -43,6 +45,7 @@ class PixelFinder:
 
     def __init__(self, points: KnownPoints, motion: Motion) -> None:
         self._points, self._motion = points, motion
+        self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
         self._fixes: list[_Fix] = []
         self._stamps: list[tuple[float, bool]] = []
         self._fruitless = -np.inf
@@ -111,6 +114,9 @@ class PixelFinder:
         if found is None:
             self._fruitless = m.t
             return False
+        if self.start is not None and self._is_not_from(self.start, found, odometry):
+            self._fruitless = m.t
+            return False
         count = int(np.count_nonzero(found.inliers))
         clear = count >= CLEAR and count >= CLEAR_SHARE * seen
         self._fixes.append(_Fix(odometry, found.pose, found.covariance, clear))
@@ -125,6 +131,10 @@ class PixelFinder:
     def clear(self) -> None:
         """Forget the frames: the track begins anew, or is trusted."""
         self._fixes, self._stamps = [], []
+
+    @staticmethod
+    def _is_not_from(start: KnownPosition, found: FoundOnFloor, now: ChainState) -> bool:
+        return bool(2.0 * start.loss(found.pose[None], now, found.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
         """Whether the last frames agree, along the odometry."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.cloud import Cloud
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.pixel_finder import PixelFinder
 from factorgraph_loc.estimators.registry import Setup
@@ -32,6 +33,10 @@ class PixelTracker:
         self._motion = motion
         self._finder = PixelFinder(self._points, motion)
         self._rng = setup.rng
+
+    def seek_from(self, start: KnownPosition | None) -> None:
+        """Seek the heading of a start whose position is known; None: that is over."""
+        self._finder.start = start
 
     def seek(self, m: Pixels, odometry: ChainState) -> bool:
         """Take a frame while the place is not known; False where it tells nothing."""

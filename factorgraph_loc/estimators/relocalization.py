@@ -4,7 +4,8 @@ The sightings of the last seconds are chained by odometry to the present. Poses 
 landmark: a circle around it; two: the alignment of two points); each is scored against all sightings by the robust likelihood,
 the best are refined by Gauss-Newton, and those that remain apart are hypotheses. Their weights are posterior probabilities
 under a flat prior, by Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6):
-likelihood times the volume of the mode. Hypotheses made from few features and tested by the others: Jensfelt, Kristensen,
+likelihood times the volume of the mode. Where the start is known but for its heading, it takes the place of the flat prior, and
+candidates are made from it too. Hypotheses made from few features and tested by the others: Jensfelt, Kristensen,
 IEEE Transactions on Robotics and Automation 17(5), 2001.
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import PosePrior, Status
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.robust_update import GATE
 from factorgraph_loc.estimators.sighting_window import Sighting, Window
@@ -71,6 +73,7 @@ class Relocalizer:
         self._window: Window | None = None
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._best: PosePrior | None = None
+        self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -114,19 +117,20 @@ class Relocalizer:
         self._hypotheses, self._best, self._window = (), None, None
         if not rows:
             return
-        window = self._window = Window(self._model, rows, self._motion)
-        poses = np.concatenate((window.alignments(), window.circles()))
+        window = self._window = Window(self._model, rows, self._motion, self.start)
+        poses = np.concatenate((window.starts(), window.alignments(), window.circles()))
         if before is not None and earlier:
             since = self._motion.relative(before.now, window.now).delta
             poses = np.concatenate((se2.compose(np.array([h.pose for h in earlier]), since), poses))
         grain = window.grain()
         coarse, fine = window.whitener(grain), window.whitener()
-        losses = robust_loss(window.squared(poses, coarse), self._model.robust).sum(axis=1)
+        losses = window.losses(poses, coarse, grain)
         poses = poses[_apart(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
-        poses, _ = window.refined(poses, coarse, iterations=4)
+        poses, _ = window.refined(poses, coarse, iterations=4, spread=grain)
         poses, covariances = window.refined(poses, fine, iterations=6)
         squared = window.squared(poses, fine)
-        self._hypotheses = self._weighed(window, poses, covariances, squared)
+        logs = -robust_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(window, poses, covariances)
+        self._hypotheses = self._weighed(window, poses, covariances, squared, logs)
         self._best = self._clear(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
@@ -156,10 +160,16 @@ class Relocalizer:
         other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
         return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
-    def _weighed(self, window: Window, poses: Array, covariances: Array, squared: Array) -> tuple[Hypothesis, ...]:
+    def _log_prior(self, window: Window, poses: Array, covariances: Array) -> Array:
+        """Log of the prior probability (N,) of modes with these body-frame covariances (N, 3, 3)."""
+        volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
+        density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
+        return np.asarray(np.minimum(volume + density, 0.0))
+
+    def _weighed(
+        self, window: Window, poses: Array, covariances: Array, squared: Array, logs: Array
+    ) -> tuple[Hypothesis, ...]:
         """Those that differ, with their posterior probabilities beside that of being elsewhere, where nothing is explained."""
-        volume = np.minimum(0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1] - self._log_volume, 0.0)
-        logs = volume - robust_loss(squared, self._model.robust).sum(axis=1)
         covariances = se2.body_to_world(poses, covariances)
         kept: list[int] = []
         for i in np.argsort(-logs):
@@ -189,7 +199,8 @@ class Relocalizer:
         best = self._hypotheses[0]
         if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
             return None
-        if best.explained < CLEAR_SIGHTINGS or best.landmarks < 2:
+        # one landmark alone may be a wrong one, unless the start agrees with it
+        if best.explained < CLEAR_SIGHTINGS or best.landmarks < (2 if self.start is None else 1):
             return None
         pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
         covariance = se2.body_to_world(pose, covariance)

@@ -1,9 +1,10 @@
 """Graphs that find their place: an unknown start, a wrong one, and a robot that was carried elsewhere.
 
-Before the start the last sightings are kept until they tell one place; then they are taken in from their first on. On the
-way, landmarks that are persistently not where they are expected make a suspicion, and a place that explains them much better
-a certainty: the graph goes back to where the suspicion began, and goes on at the new place after a step of unknown length.
-Where no landmarks are used, scans of RFID tags do the same. A camera tells the place by itself, whatever else is used.
+Before the start the last sightings are kept until they tell one place; then they are taken in from their first on. So they are
+where the start is known but for its heading; the graph then begins at that start. On the way, landmarks that are persistently
+not where they are expected make a suspicion, and a place that explains them much better a certainty: the graph goes back to where
+the suspicion began, and goes on at the new place after a step of unknown length. Where no landmarks are used, scans of RFID tags
+do the same. A camera tells the place by itself, whatever else is used.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status, Written
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
+from factorgraph_loc.estimators.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
 from factorgraph_loc.estimators.new_points import FEWEST
@@ -68,6 +70,22 @@ class RelocatingGraph(MeasuringGraph):
         self._searched: ChainState | None = None
         # the last measurements, in the order in which they were taken, with what the diagnostics say of them
         self._recent: deque[tuple[Exteroceptive | Tick, Written]] = deque()
+        self._start: KnownPosition | None = None  # while its heading is sought
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian; without a heading, once what is seen tells it."""
+        if prior.has_heading:
+            super().initialize(prior)
+            return
+        self._t = prior.t
+        self._seek_from(KnownPosition(prior, self._motion.state(prior.t), self._motion))
+
+    def _seek_from(self, start: KnownPosition | None) -> None:
+        """Tell the searches what is known of the start."""
+        self._start = self._relocalizer.start = self._camera.start = start
+        self._motion.keep(2.0 * DURATION if start is None else START_KEPT)
+        if self._finder is not None and start is not None:
+            self._finder.begin(start)
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
@@ -114,7 +132,7 @@ class RelocatingGraph(MeasuringGraph):
         if self._camera.newest is not None:
             found, at = self._camera.hypotheses, self._camera.newest
         if at is None:
-            return []
+            return [] if self._start is None else [self._start.mode(self._motion.state(self._t))]
         since = self._motion.relative(at, self._motion.state(self._t))
         return [
             Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
@@ -134,7 +152,7 @@ class RelocatingGraph(MeasuringGraph):
 
     def _remember(self, m: Exteroceptive | Tick, written: Written = NOTHING_WRITTEN) -> None:
         self._recent.append((m, written))
-        while self._recent[0][0].t < m.t - DURATION:
+        while self._recent[0][0].t < m.t - (DURATION if self._start is None else START_KEPT):
             self._recent.popleft()
 
     def _take_back(self, t: float) -> list[Exteroceptive | Tick]:
@@ -147,9 +165,12 @@ class RelocatingGraph(MeasuringGraph):
 
     def _search(self, m: Exteroceptive | Tick) -> None:
         """Before the start: see whether what was seen tells one place by now, and start there."""
+        if self._start is not None and m.t < max(self._start.t, self._t - self._graph_settings.max_delay):
+            self._drop_late(m)
+            return
         self._t = max(self._t, m.t)
         looked = not isinstance(m, Tick) and self._look(m)
-        if not looked and self._searched is None and self._camera.newest is None:
+        if not looked and self._searched is None and self._camera.newest is None and self._start is None:
             return  # the run begins with the first landmark, scan or image that tells something
         self._remember(m)
         if not looked or self._best() is None:
@@ -157,7 +178,11 @@ class RelocatingGraph(MeasuringGraph):
         replay = self._take_back(-math.inf)
         self.diagnostics.events.append((m.t, "localized"))
         t = replay[0].t
-        self.initialize(PosePrior(t, self._placed(t), UNKNOWN))
+        prior = PosePrior(t, self._placed(t), UNKNOWN)
+        if self._start is not None and self._t <= self._start.t + START_KEPT:
+            prior = self._start.facing(float(self._placed(self._start.t)[2]))
+        self._seek_from(None)
+        self.initialize(prior)
         self._replay(replay)
 
     def _look(self, m: Exteroceptive) -> bool:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from factorgraph_loc.estimators.base import Mode, PosePrior
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.seeker import Seeker
 from factors import se2
@@ -33,6 +34,10 @@ class ScanFinder:
         self._scans: deque[tuple[ChainState, Looks, float]] = deque()
         self._seeker: Seeker | None = self._new_seeker()
         self._since = -np.inf
+
+    def begin(self, start: KnownPosition) -> None:
+        """Seek the heading of a start whose position is known."""
+        self._seeker = self._new_seeker(start)
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
@@ -105,5 +110,5 @@ class ScanFinder:
         spread = covariance + se2.world_to_body(best.pose, best.covariance)
         return float(error @ np.linalg.solve(spread, error)) > APART
 
-    def _new_seeker(self) -> Seeker:
-        return Seeker(self._likelihood, self._motion, self._bounds, self._rng)
+    def _new_seeker(self, start: KnownPosition | None = None) -> Seeker:
+        return Seeker(self._likelihood, self._motion, self._bounds, self._rng, start)

@@ -16,6 +16,7 @@ import numpy as np
 from factorgraph_loc.estimators import tags
 from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.cloud import Cloud
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.scan_finder import ScanFinder
@@ -67,6 +68,11 @@ class ScanTracker:
     def silent(self) -> bool:
         """Whether no tag is read where some should be."""
         return self._silence.lasts
+
+    def seek_from(self, start: KnownPosition | None) -> None:
+        """Seek the heading of a start whose position is known; None: that is over."""
+        if self._finder is not None and start is not None:
+            self._finder.begin(start)
 
     def seek(self, m: RfidScan, odometry: ChainState) -> bool:
         """Take a scan while the place is not known; False where it tells nothing."""

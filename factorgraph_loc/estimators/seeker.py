@@ -1,6 +1,7 @@
 """Where the robot is, from scans of RFID tags alone: for an unknown start, and after being carried elsewhere.
 
-A particle filter over pose that begins anywhere: evenly over the map's bounds. Each scan is weighed a share at a time, with
+A particle filter over pose that begins anywhere: evenly over the map's bounds, or with any heading where the start's position is
+known. Each scan is weighed a share at a time, with
 resampling from a kernel density in between (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo
 Methods in Practice", 2001, section 12.4), so that few particles find narrow places. Their number follows the size of the
 places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each resampling some are drawn anywhere once more,
@@ -17,6 +18,7 @@ import numpy as np
 from factorgraph_loc.estimators import kld
 from factorgraph_loc.estimators.base import Mode, PosePrior
 from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factors import se2
 from factors.odometry import ChainState
@@ -41,10 +43,18 @@ NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
 
 
 class Seeker:
-    """Places where the robot may be; see the module. ``bounds`` (2, 2): lower and upper corner [m] of where it may be."""
+    """Places where the robot may be; see the module. ``bounds`` (2, 2): lower and upper corner [m] of where it may be, unless
+    ``start`` tells that."""
 
-    def __init__(self, likelihood: RfidLikelihood, motion: Motion, bounds: Array, rng: np.random.Generator) -> None:
-        self._likelihood, self._motion, self._bounds, self._rng = likelihood, motion, bounds, rng
+    def __init__(
+        self,
+        likelihood: RfidLikelihood,
+        motion: Motion,
+        bounds: Array,
+        rng: np.random.Generator,
+        start: KnownPosition | None = None,
+    ) -> None:
+        self._likelihood, self._motion, self._bounds, self._rng, self._start = likelihood, motion, bounds, rng, start
         self._cloud: Cloud | None = None
         self._odometry: ChainState | None = None
         self._hypotheses: tuple[Mode, ...] | None = ()
@@ -83,7 +93,7 @@ class Seeker:
         if self._cloud is None or self._odometry is None:
             area = float(np.prod(self._bounds[1] - self._bounds[0]))
             count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
-            self._cloud = _cloud(self._anywhere(count), np.full(count, -math.log(count)))
+            self._cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
         else:
             self._predict(self._cloud, self._odometry, odometry)
         self._odometry = odometry
@@ -147,15 +157,19 @@ class Seeker:
                 self._resample(self._cloud)
 
     def _resample(self, cloud: Cloud) -> None:
+        assert self._odometry is not None
         rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
-        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH)))
+        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, self._odometry)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
         log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
         self._cloud = _cloud(poses, log_weights)
 
-    def _anywhere(self, count: int) -> Array:
-        """Poses (N, 3), evenly over the bounds and all headings, one in each layer of each axis (Latin hypercube)."""
+    def _anywhere(self, count: int, now: ChainState) -> Array:
+        """Poses (N, 3) where the robot may have come to by ``now``, as far as its start tells it: else evenly over the bounds and
+        all headings, one in each layer of each axis (Latin hypercube)."""
+        if self._start is not None:
+            return self._start.drawn(self._rng, count, now)
         layers = np.column_stack([self._rng.permutation(count) for _ in range(3)])
         even = (layers + self._rng.random((count, 3))) / count
         low, high = np.append(self._bounds[0], -math.pi), np.append(self._bounds[1], math.pi)

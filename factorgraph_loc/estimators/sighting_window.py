@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
+from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factors import se2
 from factors.bearing_range import BearingRangeModel, jacobians, located, residuals, robust_loss, robust_weight, sigmas
@@ -32,10 +33,13 @@ class Sighting:
 
 
 class Window:
-    """K sightings as constraints on the present pose. ``now``: the odometry at the last one; ``points`` (K, 2): in the map."""
+    """K sightings as constraints on the present pose, and the start where that is known but for its heading. ``now``: the odometry
+    at the last one; ``points`` (K, 2): in the map."""
 
-    def __init__(self, model: BearingRangeModel, rows: list[Sighting], motion: Motion) -> None:
-        self._model, self._motion = model, motion
+    def __init__(
+        self, model: BearingRangeModel, rows: list[Sighting], motion: Motion, start: KnownPosition | None = None
+    ) -> None:
+        self._model, self._motion, self._start = model, motion, start
         self._times = [r.odometry for r in rows]
         self.now = rows[-1].odometry
         self.points = np.array([r.point for r in rows])
@@ -49,6 +53,10 @@ class Window:
         self._missing = np.isnan(np.column_stack((self._ranges, self._bearings)))
         self._sigmas = sigmas(model, self._ranges)
 
+    def starts(self) -> Array:
+        """Present poses (N, 3) that come from the start, none where that is not known."""
+        return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
+
     def circles(self) -> Array:
         """Present poses (N, 3) that put the landmark seen last on its range and bearing, in all directions from it."""
         k = len(self.points) - 1
@@ -58,7 +66,9 @@ class Window:
         return self._placed(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Present poses (N, 3) drawn from the likelihood of the last sighting alone."""
+        """Present poses (N, 3) drawn from the start, where that is not known from the likelihood of the last sighting alone."""
+        if self._start is not None:
+            return self._start.drawn(rng, count, self.now)
         k, noise = len(self.points) - 1, rng.standard_normal((2, count))
         headings = rng.uniform(-np.pi, np.pi, count)
         ranges = np.abs(self._ranges[k] + self._sigmas[k, 0] * noise[0])
@@ -115,33 +125,47 @@ class Window:
         """Squared whitened residuals (N, K) at present poses (N, 3)."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
-    def refined(self, poses: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """Poses (N, 3) after iterations of Levenberg and Marquardt on the robust loss, with body-frame covariances (N, 3, 3)."""
-        scale = self._model.robust
+    def losses(self, poses: Array, whitener: Array, spread: Array | None = None) -> Array:
+        """Losses (N,) of present poses (N, 3): the robust ones of the sightings, and that of the start."""
+        found: Array = robust_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
+        return found if self._start is None else found + self._start.loss(poses, self.now, spread)
+
+    def refined(
+        self, poses: Array, whitener: Array, iterations: int, spread: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Poses (N, 3) after iterations of Levenberg and Marquardt on the losses, with body-frame covariances (N, 3, 3)."""
         damping = np.full((len(poses), 1, 1), 1e-2)
-        loss = robust_loss(self.squared(poses, whitener), scale).sum(axis=1)
+        loss = self.losses(poses, whitener, spread)
         for _ in range(iterations):
-            information, gradient = self._normal_equations(poses, whitener)
+            information, gradient = self._normal_equations(poses, whitener, spread)
             damped = information + damping * np.eye(3) * np.einsum("nii->ni", information)[:, None]
             step = np.clip(-np.linalg.solve(damped, gradient[..., None])[..., 0], -1.0, 1.0)
             tried = se2.compose(poses, se2.exp(step))
-            tried_loss = robust_loss(self.squared(tried, whitener), scale).sum(axis=1)
+            tried_loss = self.losses(tried, whitener, spread)
             better = tried_loss < loss
             poses, loss = np.where(better[:, None], tried, poses), np.where(better, tried_loss, loss)
             damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
-        return poses, np.asarray(np.linalg.inv(self._normal_equations(poses, whitener)[0]))
+        return poses, np.asarray(np.linalg.inv(self._normal_equations(poses, whitener, spread)[0]))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
         """A hypothesis (3,) after Gauss-Newton with the odometry's errors taken as what they are, common to all sightings before
         them; and its body-frame covariance (3, 3). The path is marginalised out: with weighted Jacobians J by it, of covariance C,
         residuals e have the covariance R = 1 + J C J', and those along the most likely path are R^-1 e."""
-        rows = np.arange(len(self.points))
-        common = self._covariance[np.maximum(rows[:, None], rows)]
-        weight = robust_weight(self.squared(pose[None], whitener)[0], self._model.robust)
+        covariances = self._covariance
+        if self._start is not None:  # the first row, of which no robust loss takes anything
+            covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
+        rows = np.arange(len(covariances))
+        common = covariances[np.maximum(rows[:, None], rows)]
+        weight = np.ones(len(rows))
+        first = len(rows) - len(self.points)
+        weight[first:] = robust_weight(self.squared(pose[None], whitener)[0], self._model.robust)
         for _ in range(iterations):
             root = np.sqrt(np.maximum(weight, 1e-6))
-            jacobian = root[:, None, None] * self._jacobians(pose[None])[0]
-            error = (root[:, None] * self._residuals(pose[None])[0]).ravel()
+            jacobian, error = self._jacobians(pose[None])[0], self._residuals(pose[None])[0]
+            if self._start is not None:
+                told, by_pose, _ = self._start.whitened(pose, self.now)
+                jacobian, error = np.concatenate((by_pose[None], jacobian)), np.concatenate((told[None], error))
+            jacobian, error = root[:, None, None] * jacobian, (root[:, None] * error).ravel()
             drift = np.einsum("iab,ijbc,jdc->iajd", jacobian, common, jacobian, optimize=True)
             jacobian = jacobian.reshape(-1, 3)
             solved = np.linalg.solve(np.eye(len(error)) + drift.reshape(len(error), -1), np.c_[jacobian, error])
@@ -149,7 +173,7 @@ class Window:
             step = -covariance @ (jacobian.T @ solved[:, 3])
             pose = se2.compose(pose, se2.exp(step))
             on_path = (solved[:, 3] + solved[:, :3] @ step).reshape(-1, 2) / root[:, None]
-            weight = robust_weight(np.sum(on_path**2, axis=1), self._model.robust)
+            weight[first:] = robust_weight(np.sum(on_path[first:] ** 2, axis=1), self._model.robust)
         return pose, covariance
 
     def _recent(self) -> list[int]:
@@ -178,10 +202,14 @@ class Window:
         jacobian[:, self._missing] = 0.0
         return np.asarray(jacobian @ self._carried)
 
-    def _normal_equations(self, poses: Array, whitener: Array) -> tuple[Array, Array]:
-        """Robustly weighted information (N, 3, 3), with that of a nearly flat prior, and gradient (N, 3)."""
+    def _normal_equations(self, poses: Array, whitener: Array, spread: Array | None) -> tuple[Array, Array]:
+        """Robustly weighted information (N, 3, 3), with that of a nearly flat prior or of the start, and gradient (N, 3)."""
         jacobian = whitener @ self._jacobians(poses)
         error = (whitener @ self._residuals(poses)[..., None])[..., 0]
         weight = robust_weight(np.sum(error**2, axis=-1), self._model.robust)
         weighted = np.swapaxes(weight[..., None, None] * jacobian, -1, -2)
-        return np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)[..., 0]
+        information, gradient = np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)
+        if self._start is None:
+            return information, gradient[..., 0]
+        more, by_start = self._start.normal_equations(poses, self.now, spread)
+        return information + more, gradient[..., 0] + by_start

@@ -89,13 +89,8 @@ def without_points(
     return (f"{log.name}: the map has no points that a camera could find: give --world{others}",)
 
 
-def never_localized(
-    log: Log, sensors: Sequence[str], estimates: Sequence[PoseEstimate], final: Trajectory
-) -> tuple[str, ...]:
-    """An unknown start that nothing told, in terms of what ``sensors`` find in the map."""
-    found = {e.status for e in estimates}
-    if "localized" in found or ("ambiguous" not in found and len(final)):  # or it says nothing before the end
-        return ()
+def findable(log: Log, sensors: Sequence[str]) -> list[tuple[str, str]]:
+    """What ``sensors`` could find in the map, each with the words for that nothing of it was."""
     world = log.world
     kinds = []
     if world.landmarks and "bearing_range" in sensors:
@@ -104,6 +99,19 @@ def never_localized(
         kinds.append(("tags", "no tag of the map was read"))
     if world.points is not None and any(sensor in sensors for sensor in OF_CAMERA):
         kinds.append(("points", "no point of the map was found in an image"))
+    return kinds
+
+
+def never_localized(
+    log: Log, sensors: Sequence[str], estimates: Sequence[PoseEstimate], final: Trajectory
+) -> tuple[str, ...]:
+    """An unknown start that nothing told, in terms of what ``sensors`` find in the map."""
+    found = {e.status for e in estimates}
+    if "localized" in found or (
+        len(final) and estimates[-1].status == "unlocalized"
+    ):  # or it says nothing before the end
+        return ()
+    kinds = findable(log, sensors)
     names = " and ".join(name for name, _ in kinds)
     if not kinds:
         why = "the map has nothing that its sensors could find"

@@ -218,7 +218,7 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
 def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
     """Where the robot starts, and the frame in words. Without a map in use the start is certain, as it defines the frame."""
     prior, source = resolve_prior(log, options.prior)
-    if prior is None:
+    if prior is None or (options.extend and not prior.has_heading):
         if options.extend:
             raise InputError(
                 f"{log.name}: to extend its map from odometry the start has to be known in it; give --prior"
@@ -230,7 +230,9 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
 
 def _in_words(start: PosePrior, source: str) -> str:
     x, y, heading = start.pose
-    return f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {SOURCES.get(source, '--prior')}"
+    chosen = "" if start.has_heading else ", which tells no heading"
+    source = SOURCES.get(source, "--prior")
+    return f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {source}{chosen}"
 
 
 def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tuple[str, ...]]:

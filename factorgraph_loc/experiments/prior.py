@@ -18,18 +18,18 @@ REFERENCE_HEADING_SIGMA = 0.01  # rad
 # of a start that a person typed
 POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
-VAGUE_HEADING_SIGMA = 0.1  # rad, where the reference's heading is no measurement
 
 KNOWN = "reference, log or X,Y,HEADING"
-EXPECTED = "reference, log, unknown or X,Y,HEADING"
+EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     """The Gaussian that a run starts from, and the name of its source.
 
     ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
-    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``unknown``, or None: the
-    log's start, else the reference, else unknown. An unknown start is returned as None.
+    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with any heading,
+    ``unknown``, or None: the log's start, else the reference, else unknown. An unknown start is returned as None. From a
+    reference without headings, too, the heading may be any.
 
     Raises InputError if the log lacks what is asked for, or ``prior`` is none of these.
     """
@@ -44,8 +44,15 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
         return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
     if prior == "reference":
         return _from_reference(log), prior
-    pose = np.array(_parse(prior))
-    return PosePrior(first_odometry(log), pose, _covariance(POSITION_SIGMA, HEADING_SIGMA)), prior
+    pose, covariance = np.array(_parse(prior)), _covariance(POSITION_SIGMA, HEADING_SIGMA)
+    if len(pose) == 2:
+        return PosePrior.at_position(first_odometry(log), pose, covariance[:2, :2]), prior
+    return PosePrior(first_odometry(log), pose, covariance), prior
+
+
+def at_origin(log: Log) -> PosePrior:
+    """The start (0, 0, 0) of a log of which nothing else is known, at the first odometry."""
+    return PosePrior(first_odometry(log), np.zeros(3), _covariance(POSITION_SIGMA, HEADING_SIGMA))
 
 
 def check_prior(prior: str | None) -> None:
@@ -73,9 +80,11 @@ def _from_reference(log: Log) -> PosePrior:
         raise InputError(
             f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
         )
-    sigma = REFERENCE_HEADING_SIGMA if log.reference.has_heading else VAGUE_HEADING_SIGMA
-    covariance = _covariance(REFERENCE_POSITION_SIGMA, sigma)
-    return PosePrior(float(log.reference.t[after]), np.array(log.reference.poses[after]), covariance)
+    t, pose = float(log.reference.t[after]), np.array(log.reference.poses[after])
+    covariance = _covariance(REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
+    if not log.reference.has_heading:
+        return PosePrior.at_position(t, pose[:2], covariance[:2, :2])
+    return PosePrior(t, pose, covariance)
 
 
 def _in_space(reference: Trajectory3) -> PosePrior:
@@ -90,11 +99,14 @@ def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArra
     return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
 
 
-def _parse(prior: str) -> tuple[float, float, float]:
+def _parse(prior: str) -> list[float]:
+    """Position [m], and the heading [rad] if it is given."""
     try:
-        x, y, heading = (float(part) for part in prior.split(","))
+        x, y, *heading = (float(part) for part in prior.split(","))
     except ValueError:
         raise InputError(f"prior is {prior!r}, expected {EXPECTED}") from None
-    if not all(map(math.isfinite, (x, y, heading))) or abs(heading) > 2.0 * math.pi:
+    if len(heading) > 1:
+        raise InputError(f"prior is {prior!r}, expected {EXPECTED}")
+    if not all(map(math.isfinite, (x, y, *heading))) or any(abs(angle) > 2.0 * math.pi for angle in heading):
         raise InputError(f"prior is {prior!r}, expected finite metres and a heading in radians")
-    return x, y, heading
+    return [x, y, *heading]

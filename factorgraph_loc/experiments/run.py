@@ -19,18 +19,19 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator
+from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator, finds_heading
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.experiments.doubts import (
     check_free_map,
+    findable,
     never_localized,
     partly_scored,
     without_points,
     without_tags,
 )
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
-from factorgraph_loc.experiments.prior import KNOWN, resolve_prior
+from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
@@ -73,7 +74,8 @@ def run(
     the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
     its velocity holds on; other measurements older than the prior are counted as ignored. With an unknown start the grid begins at
     the first measurement, and the final trajectory, empty if nothing told the pose, where the estimator began to believe
-    something. ``progress`` is given the share done; where features of images are looked for first, that is its first half.
+    something. A log with neither start nor reference, and without a map that its sensors see, begins at (0, 0, 0).
+    ``progress`` is given the share done; where features of images are looked for first, that is its first half.
     ``watch`` is given the time and the estimator after each tick, to look at what it believes.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
@@ -92,10 +94,19 @@ def run(
             f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
             f"expected one of {', '.join(registry.IN_SPACE)}"
         )
+    unstated: tuple[str, ...] = ()
+    if prior is None and config.prior is None and not findable(log, tuple(log.streams)):
+        prior, prior_source = at_origin(log), "origin"
+        unstated = (f"{log.name}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else",)
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
             f"expected a prior {KNOWN}"
+        )
+    if prior is not None and not prior.has_heading and not (finds_heading(estimator) and findable(log, sensors)):
+        raise InputError(
+            f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors, "
+            f"expected a prior X,Y,HEADING"
         )
 
     report = progress or (lambda _: None)
@@ -135,6 +146,7 @@ def run(
         versions=versions,
         warnings=(
             *log.warnings,
+            *unstated,
             *_doubts(log, sensors),
             *unread,
             *prepared.warnings,

@@ -29,7 +29,8 @@ def assert_refused(result, *fragments):
         (["-e", "ekf", "--set", "smoother.lag=1"], ["smoother.lag=1", "smoother is not run here"]),
         (["-e", "ekf", "--set", "lag=1"], ["lag=1", "NAME.key=value"]),
         (["-e", "ekf", "--set", "ekf.max_delay"], ["--set", "KEY=VALUE"]),
-        (["-e", "ekf", "--prior", "1,2"], ["'1,2'", "X,Y,HEADING"]),
+        (["-e", "ekf", "--prior", "1"], ["'1'", "X,Y or X,Y,HEADING"]),
+        (["-e", "dead_reckoning", "--prior", "1,2"], ["dead_reckoning cannot find an unknown heading", "X,Y,HEADING"]),
         (["-e", "ekf", "--prior", "nan,0,0"], ["nan"]),
         (["-e", "ekf", "--prior", "unknown"], ["unknown"]),
         (["-e", "ekf", "--sensors", "odometri"], ["odometri", "odometry"]),
@@ -53,7 +54,7 @@ def test_compare_checks_names_and_seeds_before_it_runs(fgloc, short_log, tmp_pat
     assert_refused(fgloc("compare", short_log, "-e", "ekf,smother", "-o", out), "'smother'", "did you mean smoother?")
     assert_refused(fgloc("compare", short_log, "-e", "ekf", "-o", out, "--seeds", "5:5"), "--seeds", "'5:5'")
     for option, text, named in (
-        ("--prior", "1,2", "'1,2'"),
+        ("--prior", "1", "'1'"),
         ("--sensors", "odometri", "did you mean odometry?"),
         ("--set", "ekf.max_dely=1", "did you mean max_delay?"),
     ):

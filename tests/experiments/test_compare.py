@@ -83,7 +83,7 @@ def test_bad_input_is_found_before_anything_runs(log, tmp_path):
         ([log], [config, RunConfig("dead_reckoning", {"max_delay": 0.1})], "given twice"),
         ([log], [RunConfig("dead_reckoning", {"max_dely": 0.1})], "did you mean max_delay"),
         ([log], [RunConfig("smother")], "did you mean smoother"),
-        ([log], [RunConfig("ekf", prior="1,2")], "prior is '1,2'"),
+        ([log], [RunConfig("ekf", prior="1")], "prior is '1'"),
         ([log], [RunConfig("ekf", sensors=("odometri",))], "did you mean odometry"),
     ):
         with pytest.raises(InputError, match=message):

@@ -128,7 +128,7 @@ def test_the_rig_and_the_map_that_are_given_are_part_of_the_log(planned, logs):
         ({"estimators": [{"name": "ekf", "settings": {"max_dely": 1}}]}, "did you mean max_delay?"),
         ({"sweep": {"dead_reckoning.max_dely": [1]}}, "did you mean max_delay?"),
         ({"sensors": ["odometri"]}, "did you mean odometry?"),
-        ({"prior": "1,2"}, "X,Y,HEADING"),
+        ({"prior": "1"}, "X,Y,HEADING"),
         ({"logs": [{"simulate": "ofice"}]}, "did you mean office?"),
         ({"logs": [{"simulate": "office", "settings": {"drvie": {}}}]}, "did you mean drive?"),
     ],

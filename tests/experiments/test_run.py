@@ -13,6 +13,7 @@ from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import BearingRangeStream, StartPose, VelocityStream
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
 
 
 def test_order_of_what_is_fed(log, fake):
@@ -106,7 +107,9 @@ def test_priors(log):
     assert source == "reference"
     assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.02, 0.02, 0.01))
     vague = replace(log, reference=Trajectory(log.reference.t, log.reference.poses, has_heading=False))
-    assert resolve_prior(vague, "reference")[0].covariance[2, 2] == pytest.approx(0.01)
+    prior, source = resolve_prior(vague, None)
+    assert (prior.has_heading, source) == (False, "reference")
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.02, 0.02, np.pi / np.sqrt(3.0)))
     stated = replace(log, start=StartPose(0.3, np.ones(3), np.array((0.1, 0.2, 0.3))))
     prior, source = resolve_prior(stated, None)
     assert (prior.t, source) == (0.3, "log")
@@ -114,6 +117,9 @@ def test_priors(log):
     prior, source = resolve_prior(log, "1, -2, 0.5")
     assert (prior.pose.tolist(), prior.t, source) == ([1.0, -2.0, 0.5], 0.0, "1, -2, 0.5")
     assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.05, 0.05, 0.05))
+    prior, source = resolve_prior(log, "1, -2")
+    assert (prior.pose[:2].tolist(), prior.has_heading, source) == ([1.0, -2.0], False, "1, -2")
+    assert np.sqrt(np.diag(prior.covariance)) == pytest.approx((0.05, 0.05, np.pi / np.sqrt(3.0)))
     assert resolve_prior(replace(log, reference=None), None) == (None, "unknown")
 
 
@@ -123,7 +129,7 @@ def test_the_reference_prior_is_not_before_the_odometry(log):
     assert resolve_prior(replace(log, streams={"odometry": later}), "reference")[0].t == pytest.approx(0.45)
 
 
-@pytest.mark.parametrize("prior", ["here", "1,2", "1,2,nan", "0,0,90"])
+@pytest.mark.parametrize("prior", ["here", "1", "1,nan", "1,2,nan", "0,0,90", "1,2,0,0"])
 def test_priors_that_are_none(log, prior):
     with pytest.raises(InputError, match=f"prior is '{prior}', expected"):
         resolve_prior(log, prior)
@@ -137,6 +143,29 @@ def test_missing_priors(log):
     message = "fake cannot start from an unknown pose .*, expected a prior reference, log or X,Y,HEADING"
     with pytest.raises(InputError, match=message):
         run(log, RunConfig("fake", prior="unknown"))
+
+
+def test_a_start_without_a_heading_where_it_can_be_found(log, fake, monkeypatch):
+    with pytest.raises(
+        InputError, match=r"^fake cannot find an unknown heading on straight .* expected a prior X,Y,HEADING$"
+    ):
+        run(log, RunConfig("fake", prior="1,2"))
+    monkeypatch.setattr(fake, "supports_unknown_heading", True, raising=False)
+    run(log, RunConfig("fake", prior="1,2"))
+    assert not fake.made.prior.has_heading
+    with pytest.raises(InputError, match="cannot find an unknown heading"):  # nothing could tell it
+        run(log, RunConfig("fake", sensors=("odometry",), prior="1,2"))
+
+
+def test_a_log_that_tells_nothing_of_its_start_begins_at_the_origin(log, fake):
+    bare = replace(log, reference=None, world=World())
+    result = run(bare, RunConfig("fake"))
+    assert fake.made.prior.pose.tolist() == [0.0, 0.0, 0.0]
+    assert result.config["prior"] == "origin"
+    assert result.warnings[0].startswith("straight: has neither a start nor a reference: begins at (0, 0, 0)")
+    # in a map of what its sensors see, the origin is a place like any other
+    with pytest.raises(InputError, match="cannot start from an unknown pose"):
+        run(replace(log, reference=None), RunConfig("fake"))
 
 
 def test_unknown_start_where_supported(log, fake, monkeypatch):
