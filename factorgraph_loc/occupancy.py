@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model
-from factorgraph_loc.flat_yaml import read_flat_yaml
+from factorgraph_loc.yaml_files import read_yaml
 from factors import se2
 from factors.se2 import Array
 
@@ -23,16 +23,22 @@ TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an a
 MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
 
 
+def _zero_or_one(value: Any) -> Any:
+    """``negate`` as Nav2 also takes it: true or false."""
+    return {"false": 0, "true": 1}.get(value.lower(), value) if isinstance(value, str) else value
+
+
 class MapFile(FileModel):
-    """What map_server writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
+    """What map_server of ROS or of Nav2 writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
 
     image: str
     resolution: Annotated[float, Field(gt=0.0, le=10.0, description="m per cell")]
     origin: tuple[float, float, float]
     occupied_thresh: Share = 0.65
     free_thresh: Share = 0.196
-    negate: Literal[0, 1] = 0
+    negate: Annotated[Literal[0, 1], BeforeValidator(_zero_or_one)] = 0
     mode: Literal["trinary", "scale", "raw"] = "trinary"
+    map_type: Literal["occupancy"] = "occupancy"
 
 
 def read_walls(path: Path) -> tuple[Wall, ...]:
@@ -41,7 +47,7 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
     They run through the middles of the outermost occupied cells, within :data:`TOLERANCE`; groups of less than :data:`MIN_EXTENT`
     are left out. InputError names the file and what is wrong.
     """
-    told = parse_model(MapFile, read_flat_yaml(path), path)
+    told = parse_model(MapFile, read_yaml(path), path)
     if told.free_thresh >= told.occupied_thresh:
         raise bad_field(path, "free_thresh", told.free_thresh, f"less than occupied_thresh, {told.occupied_thresh:g}")
     # maps made by a saver name their image without a folder, but nav stacks also write absolute paths

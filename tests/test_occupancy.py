@@ -5,7 +5,6 @@ import pytest
 from PIL import Image
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.flat_yaml import read_flat_yaml
 from factorgraph_loc.occupancy import read_walls
 from factorgraph_loc.world import read_world
 
@@ -118,13 +117,15 @@ def test_a_world_names_its_occupancy_map(hall):
         ("resolution: 0.1", "", ("hall.yaml: resolution is missing",)),
         ("resolution: 0.1", "resolution: -1", ("hall.yaml: resolution is -1",)),
         ("resolution", "resolutoin", ("unknown key resolutoin: did you mean resolution",)),
-        ("0.0]", "", ("hall.yaml:3: the list origin has no end",)),
-        ("negate: 0", "negate 0", ("hall.yaml:4", "'negate 0', expected key: value")),
+        ("0.0]", "", ("hall.yaml:3: is not YAML that can be read: while parsing a flow sequence",)),
+        ("negate: 0", "negate 0", ("hall.yaml:4: is not YAML that can be read", "could not find expected ':'")),
         ("free_thresh: 0.196", "free_thresh: 0.7", ("free_thresh is 0.7", "less than occupied_thresh")),
         ("hall.pgm", "none.pgm", ("none.pgm: cannot be read",)),
         ("hall.pgm", "hall.yaml", ("hall.yaml: is not an image",)),
         ("hall.pgm", "../hall.pgm", ("leaves its folder",)),
+        ("negate: 0", "map_type: costmap", ("map_type is 'costmap': input should be 'occupancy'",)),
         ("negate: 0", "negate: 1\nmode: trinary", None),
+        ("negate: 0", "negate: true", None),
     ],
 )
 def test_a_wrong_map(hall, old, new, fragments):
@@ -145,7 +146,12 @@ def test_a_map_without_walls(hall):
         read_walls(hall)
 
 
-def test_blocks_and_lists_of_a_calibration(tmp_path):
-    path = tmp_path / "sensor.yaml"
-    path.write_text("%YAML:1.0\n---\nT_BS:\n  cols: 4\n  data: [1.0, 0.0,\n         2e-1]  # more\nname: 'cam 0'\n")
-    assert read_flat_yaml(path) == {"T_BS.cols": 4, "T_BS.data": [1.0, 0.0, 0.2], "name": "cam 0"}
+def test_a_map_of_nav2_with_a_hash_in_its_name(hall):
+    """As Nav2's map_saver writes it, of an image whose name needs quotes."""
+    (hall.parent / "hall.pgm").rename(hall.parent / "floor #2.pgm")
+    expected = {"mode": "trinary", "map_type": "occupancy"}
+    lines = YAML.replace("hall.pgm", '"floor #2.pgm"  # second floor') + "".join(
+        f"{k}: {v}\n" for k, v in expected.items()
+    )
+    hall.write_text(lines)
+    assert len(read_walls(hall)) >= 4

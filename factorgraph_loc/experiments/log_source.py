@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import read_toml
-from factorgraph_loc.flat_yaml import read_flat_yaml
 from factorgraph_loc.shipped import manifests
+from factorgraph_loc.yaml_files import read_yaml
 
 if TYPE_CHECKING:
     from factorgraph_loc.log import Log
 
 RUN_FILE = "run.toml"
-NAMING = {".toml": read_toml, ".yaml": read_flat_yaml, ".yml": read_flat_yaml}  # files that name others
+NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
 
 
 @dataclass(frozen=True)

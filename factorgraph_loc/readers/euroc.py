@@ -17,13 +17,13 @@ from pydantic import Field
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, parse_model
-from factorgraph_loc.flat_yaml import read_flat_yaml
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers.bag_frames import angles_of_camera
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.space_poses import ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.world import World
+from factorgraph_loc.yaml_files import read_yaml
 from factors.se2 import Array
 
 TRUTHS = ("state_groundtruth_estimate0", "state_groundtruth0")
@@ -78,15 +78,16 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def _camera(path: Path) -> CameraSettings:
-    found = read_flat_yaml(path)
+    found = read_yaml(path)
     model = str(found.get("distortion_model", ""))
+    placed = found.get("T_BS")
     if model not in {"radial-tangential", "radtan", *UNDISTORTED}:
         raise bad_field(path, "distortion_model", model, "radial-tangential")
     told = {
         "intrinsics": found.get("intrinsics"),
         "distortion": found.get("distortion_coefficients", (0.0,) * 4),
         "resolution": found.get("resolution"),
-        "T_BS": found.get("T_BS.data", found.get("T_BS")),
+        "T_BS": placed.get("data") if isinstance(placed, dict) else placed,
     }
     sensor = parse_model(_Sensor, {key: value for key, value in told.items() if value is not None}, path)
     pose: Array = np.array(sensor.T_BS).reshape(4, 4)
