@@ -302,10 +302,10 @@ class Smoother(RelocatingGraph):
         parameters = gtsam.ISAM2Params()
         # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
         parameters.setFactorization("QR" if self._unknown is None else "CHOLESKY")
-        parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
         # far from where a point was first taken to be its factors mean nothing
         parameters.relinearizeSkip = self._settings.relinearize_skip if self._unknown is None else 1
         if self._settings.lag is None:
-            return FullHistory(parameters)
+            return FullHistory(parameters, self._settings.relinearize_threshold)
+        parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
         parameters.findUnusedFactorSlots = True
         return Window(parameters, self._settings.lag, self._failed.append)

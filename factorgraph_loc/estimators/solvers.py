@@ -1,12 +1,15 @@
 """iSAM2 with the full history, and with a window that poses leave, behind one set of methods.
 
-In the full history our own factors are linearised here and given to iSAM2 as linear ones, which are replaced when their
-variables have moved: a callback from GTSAM copies all variables, so its cost would grow with the run. In a window there
-are few variables, and callbacks are cheap.
+In the full history our own factors are linearised here and given to iSAM2 as linear ones: a callback from GTSAM copies all
+variables, so its cost would grow with the run. A factor is linearised where iSAM2 linearises its variables, and replaced in the
+update that moves these: were it left behind, the factors would no longer agree on what a turn of the whole graph does to the poses,
+and would seem to tell of the heading what nothing measured (Huang, Mourikis, Roumeliotis, International Journal of Robotics
+Research 29(5), 2010). In a window there are few variables, and callbacks are cheap.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol, cast
@@ -15,13 +18,9 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.estimators.variables import Node, Values, gather, is_point, is_pose, read, to_gtsam
-from factors import se2
 from factors.graph import custom_factor, jacobian_factor, pose_array, read_pose, read_vector
 from factors.se2 import Array
 
-RELINEARIZE_SKIP = 10  # updates between checks of which factors of the full history to linearise anew
-RECENT = 200  # variables that are checked then; older ones hardly move before the end
-MOVED, TURNED = 0.05, 0.03  # m, rad: how far a variable may be from where its factors were linearised
 MARGIN = 1.0  # s that a pose stays longer in a window
 
 
@@ -45,30 +44,45 @@ class Solver(Protocol):
 
 
 class FullHistory:
-    """Everything stays in the graph."""
+    """Everything stays in the graph. ``threshold``: how far iSAM2 lets a variable move from where it is linearised, in m, rad or
+    the units of constants."""
 
-    def __init__(self, parameters: gtsam.ISAM2Params) -> None:
+    def __init__(self, parameters: gtsam.ISAM2Params, threshold: float) -> None:
+        parameters.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(parameters)
-        self._ours: list[_Linear] = []
+        self._threshold, self._skip = threshold, parameters.relinearizeSkip
         self._updates = 0
+        self._at: Values = {}  # where ISAM2 linearises each variable
+        self._keys: list[int] = []  # of all variables
+        self._starts: list[int] = [0]  # of each of them in a vector of all, and its length
+        self._linear: defaultdict[int, list[_Linear]] = defaultdict(list)  # our factors on each variable
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
+        ours = self._relinearized()
+        old = [linear.slot for linear in ours]
+        self._at |= values
+        for key, value in values.items():
+            self._keys.append(key)
+            self._starts.append(self._starts[-1] + len(value))
         graph = gtsam.NonlinearFactorGraph()
-        new: list[_Linear] = []
+        for linear in ours:
+            graph.add(linear.at(self._at))
         for node in nodes:
             if node.native is not None:
                 graph.add(node.native)
-            else:
-                new.append(_Linear(node, graph.size(), self._point(node.keys, values)))
-                graph.add(new[-1].linearize())
+                continue
+            linear = _Linear(node, graph.size())
+            graph.add(linear.at(self._at))
+            ours.append(linear)
+            for key in node.keys:
+                self._linear[key].append(linear)
+        for i in range(len(old)):
+            ours[i].slot = i
         with _gtsam():
-            slots = self._isam.update(graph, to_gtsam(values)).getNewFactorsIndices()
-        for linear in new:
+            slots = self._isam.update(graph, to_gtsam(values), old).getNewFactorsIndices()
+        for linear in ours:
             linear.slot = slots[linear.slot]
-        self._ours += new
         self._updates += 1
-        if self._updates % RELINEARIZE_SKIP == 0:
-            self._relinearize(self._ours[-RECENT:])
 
     def value(self, key: int) -> Array:
         return read(self._isam, key)
@@ -82,29 +96,17 @@ class FullHistory:
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
         return _linear(self._isam)
 
-    def _point(self, keys: Sequence[int], values: Values) -> list[Array]:
-        """Values of the variables: as given in ``values``, else as the solver estimates them."""
-        return [values[key] if key in values else read(self._isam, key) for key in keys]
-
-    def _relinearize(self, linears: Iterable[_Linear]) -> None:
-        """Replace the factors whose variables have moved from where they were linearised."""
-        graph, slots, changed = gtsam.NonlinearFactorGraph(), [], []
-        estimates: Values = {}
-        for linear in linears:
-            for key in linear.node.keys:
-                if key not in estimates:
-                    estimates[key] = read(self._isam, key)
-            point = gather(estimates, linear.node.keys)
-            if linear.is_off(point):
-                linear.point = point
-                slots.append(linear.slot)
-                changed.append(linear)
-                graph.add(linear.linearize())
-        if changed:
-            with _gtsam():
-                new = self._isam.update(graph, gtsam.Values(), slots).getNewFactorsIndices()
-            for linear, slot in zip(changed, new, strict=True):
-                linear.slot = slot
+    def _relinearized(self) -> list[_Linear]:
+        """Our factors on those variables that the next update will linearise elsewhere."""
+        if not self._keys or (self._updates + 1) % self._skip:
+            return []
+        change = np.abs(self._isam.getDelta().vector(self._keys))
+        moved = np.flatnonzero(np.maximum.reduceat(change, self._starts[:-1]) >= self._threshold)
+        found: dict[int, _Linear] = {}
+        for key in (self._keys[i] for i in moved.tolist()):
+            self._at[key] = read(self._isam, key)
+            found |= {id(linear): linear for linear in self._linear.get(key, ())}
+        return list(found.values())
 
 
 class Window:
@@ -152,29 +154,18 @@ class Window:
 
 
 class _Linear:
-    """One of our factors in the full history: where it was linearised and which slot of iSAM2 it has."""
+    """One of our factors in the full history, and which slot of iSAM2 it has."""
 
-    def __init__(self, node: Node, slot: int, point: list[Array]) -> None:
+    def __init__(self, node: Node, slot: int) -> None:
         self.node = node
         self.slot = slot
-        self.point = point
 
-    def linearize(self) -> gtsam.LinearContainerFactor:
+    def at(self, values: Values) -> gtsam.LinearContainerFactor:
+        """The factor, linearised at ``values``."""
         assert self.node.factor is not None
-        values = to_gtsam(dict(zip(self.node.keys, self.point, strict=True)))
-        return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, self.point), values)
-
-    def is_off(self, point: Sequence[Array]) -> bool:
-        """Whether a variable has moved too far from where it was."""
-        for key, old, new in zip(self.node.keys, self.point, point, strict=True):
-            change = new - old
-            if is_pose(key):
-                turn = abs(se2.wrap_scalar(change[2]))
-                if abs(change[0]) > MOVED or abs(change[1]) > MOVED or turn > TURNED:
-                    return True
-            elif np.abs(change).max() > MOVED:
-                return True
-        return False
+        point = gather(values, self.node.keys)
+        here = to_gtsam(dict(zip(self.node.keys, point, strict=True)))
+        return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, point), here)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 
 from factorgraph_loc.estimators.base import Diagnostics
@@ -146,7 +147,8 @@ class UnknownPoints:
                 self._looks.keep(key, m, rows[names.index(name)], lifted(model, *guess).position, self._way)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
-            prior = Node((key,), VectorPriorFactor(found.position, OPEN), 3)
+            native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
+            prior = Node((key,), VectorPriorFactor(found.position, OPEN), 3, native)
             keyframe.nodes.append(prior)
             addition.nodes.append(prior)
             for sighting in seen:
