@@ -25,7 +25,8 @@ class File:
 @dataclass(frozen=True)
 class Recording:
     """``kind``: how it is read, a function of :mod:`recordings_benchmark.prepare`, with its ``options``. ``prior``: where a log
-    without a start begins. ``odometry``, ``others``: where it is from, and the other sensors, in the words of the table."""
+    without a start begins; ``seconds``: how much of a long one is taken. ``odometry``, ``others``: where it is from, and the other
+    sensors, in the words of the table."""
 
     name: str
     title: str
@@ -35,6 +36,7 @@ class Recording:
     kind: str
     files: tuple[File, ...]
     prior: str | None = None
+    seconds: float | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
 

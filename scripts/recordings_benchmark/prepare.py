@@ -12,7 +12,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import write_toml
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, Stream, VelocityStream
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, Stream, VelocityStream, cut
 from factorgraph_loc.readers import load
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.simulated_odometry import wheel_odometry
@@ -48,6 +48,8 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
     if recording.kind == "bag":
         return _bag(recording, paths[0], out)
     log = KINDS[recording.kind](recording, paths)
+    if recording.seconds is not None:
+        log = cut(log, 0.0, recording.seconds)
     target = out / recording.name
     if not target.exists():
         write_log(log, target)
