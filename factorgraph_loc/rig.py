@@ -97,7 +97,8 @@ class OdometrySettings(FileModel):
 
 
 class ImuSettings(FileModel):
-    """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``."""
+    """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``, of a rig without
+    these settings with the default ones."""
 
     time_offset: Seconds = 0.0
     bias: Rate = 0.0

@@ -3,6 +3,7 @@
 Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9).
 Commanded velocities act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
 
+A gyro replaces the rotation that the wheels tell, of velocities and of increments; where it is silent, that of the wheels counts.
 While the wheels report that the robot stands, it does: noise and bias of a gyro do not turn it.
 
 The step from knot to knot is compiled: an estimator takes hundreds of rows a second, a calibration integrates whole logs
@@ -23,9 +24,9 @@ from factors.se2 import Array
 _ROW = 5
 _VELOCITY, _INCREMENT, _GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
 # columns of a knot: state at the time of a row, the velocity in the robot's frame then, the velocity that it tends to, and
-# whether the wheels stand
-_T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS = range(15)
-_KNOT, _STATE = 15, 8
+# whether the wheels stand, and the time of the last row of a gyro
+_T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
+_KNOT, _STATE = 16, 8
 
 # m/s and rad/s, beyond the biases: what is reported at rest; a gyro, that the robot does not turn although its wheels stand
 _REST, _GYRO_REST = 1e-3, 0.02
@@ -161,7 +162,9 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
         knot = knots[i]
         if i == 0:
             knot[:] = 0.0
-            knot[_T] = t
+            knot[_T], knot[_GYRO_T] = t, -math.inf
+        elif kind == _INCREMENT and use_gyro:
+            _turn_by_gyro(rows, knots, i, constants)
         elif kind == _INCREMENT:
             previous = knots[i - 1]
             duration = t - previous[_T]
@@ -187,13 +190,53 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
             turn = 0.0 if stands else scale_rotation * (b - heading_rate_bias)
             speed = math.copysign(max(0.0, abs(speed) - turn_slowdown * abs(turn)), speed)
             knot[_UX], knot[_UY] = speed * c, speed * s
-            if not use_gyro:
+            if not use_gyro or t - knot[_GYRO_T] > hold:
                 knot[_UW] = turn + heading_drift * abs(speed)
             elif stands and abs(knot[_UW]) <= _GYRO_REST:
                 knot[_UW] = knot[_W] = 0.0
         elif kind == _GYRO:
-            turn = a - gyro_bias
-            knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
+            _take_gyro(knot, t, a - gyro_bias)
+
+
+@numba.njit(cache=True)
+def _take_gyro(knot: Array, t: float, turn: float) -> None:
+    knot[_GYRO_T] = t
+    knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
+
+
+@numba.njit(cache=True)
+def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: _Constants) -> None:
+    """The knot of an increment in row ``i``, and anew those of the gyro since the increment before it: on all of the way the robot
+    moves as the increment says, and turns as the gyro did."""
+    scales, (c, s), (_, hold), (gyro_bias, _) = constants
+    scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, _ = scales
+    t, a, b, phi = rows[i, 0], rows[i, 2], rows[i, 3], rows[i, 4]
+    first = i - 1
+    while first >= 0 and rows[first, 1] != _INCREMENT:
+        first -= 1
+    told = first >= 0 and t > knots[first, _T]  # else nothing says when the motion began
+    first = max(first, 0)
+    duration = t - knots[first, _T]
+    forward, sideways, turn, stands = 0.0, 0.0, 0.0, False
+    if told:
+        forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
+        stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
+        if stands:
+            forward = sideways = turn = 0.0
+    ahead, aside = scale_distance * (c * forward - s * sideways), scale_distance * (s * forward + c * sideways)
+    for k in range(first, i):
+        knot, following = knots[k], knots[k + 1]
+        if told:
+            knot[_STANDS], knot[_UX], knot[_UY] = stands, ahead, aside
+            if t - knot[_GYRO_T] > duration + hold:
+                knot[_UW] = scale_rotation * turn + heading_drift * math.hypot(ahead, aside)
+            elif stands and abs(knot[_UW]) <= _GYRO_REST:
+                knot[_UW] = 0.0
+        step = rows[k + 1, 0] - knot[_T]
+        _move(knot, step, 0.0, step, following)
+        if rows[k + 1, 1] == _GYRO:
+            _take_gyro(following, rows[k + 1, 0], rows[k + 1, 2] - gyro_bias)
+    knots[i, _UNKNOWN] += max(0.0, duration - hold)
 
 
 @numba.njit(cache=True)
@@ -215,7 +258,7 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
         out[_VX], out[_VY], out[_W] = ux, uy, uw
     if duration > hold:
         out[_VX] = out[_VY] = out[_W] = 0.0
-    out[_UX], out[_UY], out[_UW], out[_STANDS] = ux, uy, uw, knot[_STANDS]
+    out[_UX], out[_UY], out[_UW], out[_STANDS], out[_GYRO_T] = ux, uy, uw, knot[_STANDS], knot[_GYRO_T]
     a, b = _arc_coefficients(dtheta)
     c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
     chord_x, chord_y = a * dx - b * dy, b * dx + a * dy

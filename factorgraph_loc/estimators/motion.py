@@ -20,7 +20,7 @@ TWIST_TIME = 0.1  # s over which the velocity is taken
 class Motion:
     """Odometry rows in, relative motion between any two recent times out.
 
-    A gyro replaces the rotation of wheels that report velocities; increments hold their own, and then it is ignored.
+    A gyro replaces the rotation of the wheels where ``sensors`` name it (``imu``).
     ``self_calibration``: the uncertain constants of the odometry are estimated; else their error is part of the noise.
     """
 
@@ -29,7 +29,7 @@ class Motion:
     ) -> None:
         self._rig = rig
         self._constants_as_noise = not self_calibration
-        self._use_gyro = "imu" in sensors and rig.imu is not None
+        self._use_gyro = "imu" in sensors
         self._use_wheels = "odometry" in sensors
         self.horizon = HORIZON
         self._chain = self._new_chain()
@@ -48,9 +48,6 @@ class Motion:
         if isinstance(m, Twist):
             self._diagnostics.ignore("motion in space")
             return
-        if isinstance(m, IncrementOdometry) and self._use_gyro:
-            self._use_gyro = False
-            self._chain = self._new_chain()
         if isinstance(m, YawRate) and not self._use_gyro:
             self._diagnostics.ignore("yaw rate")
         elif not isinstance(m, YawRate) and not self._use_wheels:

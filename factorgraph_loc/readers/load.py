@@ -175,6 +175,11 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
 
         log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)
+    if "imu" in log.streams and "imu" not in log.rig.sensors:
+        if log.rig == readers.DEFAULT_RIG:
+            log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
+        else:
+            warnings.append("the gyro is used only where sensors name imu: those of the rig do not")
     if log.rig.name == readers.DEFAULT_RIG.name:
         warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
     return replace(log, warnings=(*warnings, *checks.look_over(log)))

@@ -17,15 +17,17 @@ def test_a_gyro_replaces_the_rotation_of_velocities():
     assert motion.state(1.0).heading == pytest.approx(0.3)
 
 
-def test_a_gyro_beside_increments_is_ignored_and_counted():
+@pytest.mark.parametrize(("rig", "turned"), [(RIG, 0.06), (Rig(), 0.09)])
+def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
+    """Of a rig without settings of a gyro too: then its bias is 0."""
     diagnostics = Diagnostics()
-    motion = Motion(RIG, ("odometry", "imu"), diagnostics)
+    motion = Motion(rig, ("odometry", "imu"), diagnostics)
     for i in range(4):
-        motion.add(IncrementOdometry(0.1 * i, 0.05, 0.0, 0.02))
-        motion.add(YawRate(0.1 * i + 0.05, 9.0))
-    assert motion.state(0.3).x == pytest.approx(0.15, abs=1e-3)
-    assert motion.state(0.3).heading == pytest.approx(0.06)
-    assert diagnostics.ignored == {"yaw rate": 4}
+        motion.add(YawRate(0.1 * i, 0.3))
+        motion.add(IncrementOdometry(0.1 * i, 0.05, 0.0, 0.5))
+    assert motion.state(0.3).path == pytest.approx(0.15, abs=1e-2)
+    assert motion.state(0.3).heading == pytest.approx(turned)
+    assert diagnostics.ignored == {}
 
 
 def test_a_sensor_that_is_not_used_is_ignored_and_counted():

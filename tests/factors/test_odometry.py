@@ -140,6 +140,67 @@ def test_gyro_replaces_the_rotation_of_the_wheels():
     np.testing.assert_allclose(pose_of(chain.state(1.0)), se2.exp(np.array((1.0, 0.0, 0.5))), atol=1e-12)
 
 
+def increments_and_gyro(move, rate, turn, *, bias=0.0, seconds=4.0):
+    """A chain that was told of increments ``move`` each 0.2 s, and in between, each 0.03 s, of a gyro's ``turn(t)``."""
+    chain = OdometryChain(OdometryModel(gyro_bias=bias), use_gyro=True, horizon=100.0)
+    rows = [(t, 0, None) for t in np.arange(0.0, seconds + 0.1, 0.2)]
+    rows += [(t, 1, turn(t)) for t in np.arange(0.0, seconds, rate)] if rate else []
+    for t, _, w in sorted(rows, key=lambda row: row[:2]):
+        if w is None:
+            assert chain.add_increment(t, *move)
+        else:
+            assert chain.add_yaw_rate(t, w)
+    return chain
+
+
+def test_a_gyro_replaces_the_rotation_of_increments():
+    """The wheels say straight on, the gyro a circle: also between increments, which come after the gyro's rows."""
+    chain = increments_and_gyro((0.1, 0.0, 0.0), 0.05, lambda _: 0.6, bias=0.1)
+    np.testing.assert_allclose(pose_of(chain.state(4.0)), se2.exp(np.array((2.0, 0.0, 2.0))), atol=1e-9)
+    np.testing.assert_allclose(pose_of(chain.state(1.13)), se2.exp(1.13 * np.array((0.5, 0.0, 0.5))), atol=1e-9)
+    assert chain.state(4.0).path == pytest.approx(2.0)
+    assert chain.state(4.0).unknown == 0.0
+
+
+def test_increments_under_a_turn_rate_that_varies():
+    chain = increments_and_gyro(se2.exp(np.array((0.1, 0.0, -0.3))), 0.01, np.sin, seconds=6.0)
+    t = np.arange(0.0, 6.0, 0.001) + 0.0005
+    heading = 1.0 - np.cos(t)
+    expected = (np.sum(0.0005 * np.cos(heading)), np.sum(0.0005 * np.sin(heading)), 1.0 - np.cos(6.0))
+    np.testing.assert_allclose(pose_of(chain.state(6.0)), expected, atol=0.02)  # the gyro's rows are held for 0.01 s
+
+
+def test_a_gyro_that_is_silent_leaves_the_rotation_to_the_wheels():
+    silent = increments_and_gyro((0.1, 0.0, 0.1), 0.0, None)
+    way = se2.exp(20.0 * se2.log(np.array((0.1, 0.0, 0.1))))
+    np.testing.assert_allclose(pose_of(silent.state(4.0)), way, atol=1e-9)
+    chain = OdometryChain(OdometryModel(), use_gyro=True)
+    chain.add_velocity(0.0, 1.0, 0.5)
+    assert chain.state(1.0).heading == pytest.approx(0.5)
+
+
+def test_a_gyro_turns_no_robot_whose_increments_say_that_it_stands():
+    chain = increments_and_gyro((0.0, 0.0, 0.0), 0.03, lambda t: 0.01 if t < 2.0 else 0.3)
+    assert chain.relative(chain.state(0.0), chain.state(1.9)).delta[2] == 0.0
+    assert chain.relative(chain.state(0.0), chain.state(1.9)).still == pytest.approx(1.9)
+    assert chain.relative(chain.state(2.4), chain.state(3.4)).delta[2] == pytest.approx(0.3)
+
+
+def test_late_rows_of_a_gyro_beside_increments():
+    """Whenever they come, the path is the same."""
+    rng = np.random.default_rng(0)
+    rows = [(0.2 * i, 0, (0.1, 0.01, 0.02)) for i in range(20)] + [(0.07 * i + 0.003, 1, 0.1 * i) for i in range(50)]
+    in_order = sorted(rows, key=lambda row: row[0])
+    shuffled = sorted(rows, key=lambda row: row[0] + (rng.uniform(0.0, 0.3) if row[1] else 0.0))
+    chains = []
+    for order in (in_order, shuffled):
+        chain = OdometryChain(OdometryModel(), use_gyro=True)
+        for t, kind, value in order:
+            assert chain.add_yaw_rate(t, value) if kind else chain.add_increment(t, *value)
+        chains.append(chain.states(np.arange(0.0, 3.8, 0.1)))
+    np.testing.assert_allclose(chains[0], chains[1], atol=1e-9)
+
+
 def test_at_rest_the_pose_diffuses_by_the_least_noise_alone():
     chain = velocities(NOISY_IN_TIME, [(0.0, 0.5, 0.1), (1.0, 0.0, 0.0), (61.0, 0.5, 0.0)], horizon=100.0)
     rest = chain.relative(chain.state(1.0), chain.state(2.5))  # the hold of a velocity ends then
