@@ -145,7 +145,9 @@ class RfidSettings(FileModel):
 
     ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
     below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where
-    the log does not tell the rounds. ``rssi``, ``phase``: what is made of them, where an estimator is given these sensors.
+    the log does not tell the rounds. ``dead_tags``: the share of a map's tags that are broken, hidden or gone, before anything is
+    heard of them. The default is a guess for an installation that is kept in order; ``fgloc calibrate`` learns it. ``rssi``,
+    ``phase``: what is made of them, where an estimator is given these sensors.
     """
 
     time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
@@ -157,6 +159,7 @@ class RfidSettings(FileModel):
     miss: Share = 0.0
     tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
+    dead_tags: Share = 0.03
     rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from factors.compressed import compressed
 from factors.rfid_likelihood import Looks, RfidLikelihood, Score
@@ -28,6 +28,10 @@ class RfidFactor:
     def is_phase(self) -> bool:
         """Whether it has many optima, centimetres apart."""
         return isinstance(self.likelihood, PhaseLikelihood)
+
+    def with_odds(self, odds: Array) -> RfidFactor:
+        """The same, with other log-odds (T,) that each tag is dead; these are of looks alone."""
+        return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, Looks) else self
 
     def score(self, pose: Array) -> TagScore:
         """Of one pose (3,); every part has a leading axis of length 1."""

@@ -92,6 +92,97 @@ def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, floa
     return nll, gradient, information, expected, variance
 
 
+@numba.njit(cache=True, inline="always")
+def _place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
+    """Rows (K, 8) of looks: place and boresight of the antenna in the world, then in the frame of the pose. Returns how far from
+    the pose [m] the farthest antenna reaches."""
+    farthest = 0.0
+    for k in range(len(antennas)):
+        a = packed.antennas[antennas[k]]
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3], _, _ = placed(packed, antennas[k], pose, offsets[k])
+        co, so = math.cos(offsets[k, 2]), math.sin(offsets[k, 2])
+        out[k, 4], out[k, 5] = co * a[3] - so * a[4], so * a[3] + co * a[4]
+        out[k, 6], out[k, 7] = offsets[k, 0] + co * a[0] - so * a[1], offsets[k, 1] + so * a[0] + co * a[1]
+        reach = packed.reach[packed.which[antennas[k]]]
+        farthest = max(farthest, math.sqrt(out[k, 6] ** 2 + out[k, 7] ** 2) + reach)
+    return farthest
+
+
+@numba.njit(cache=True, inline="always")
+def _alive(
+    packed: Packed,
+    at: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    point: Array,
+    normal: Array,
+    far: Array,
+) -> tuple[float, float, float, float, tuple[float, float, float], tuple[float, float, float, float, float, float]]:
+    """Of one tag that is alive, over all looks: negative log-likelihood, that of a silence, their mean and variance over all that
+    could be read; gradient, and information (its upper triangle)."""
+    e_sum = silent = mean_sum = spread_sum = 0.0
+    g_x = g_y = g_a = 0.0
+    xx = xy = xa = yy = ya = aa = 0.0
+    for k in range(len(antennas)):
+        x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
+        z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, point, normal)
+        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
+            e_sum, silent = e_sum + far[k, 0], silent + far[k, 0]
+            mean_sum, spread_sum = mean_sum + far[k, 1], spread_sum + far[k, 2]
+            continue
+        e, g, f, mean, spread = terms(packed, z, hits[k], rounds[k])
+        e_sum += e
+        silent += e if hits[k] == 0 else terms(packed, z, 0, rounds[k])[0]
+        mean_sum += mean
+        spread_sum += spread
+        # the antenna moves, the tag does not
+        by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
+        by_a = by_heading - by_x * at[k, 7] + by_y * at[k, 6]
+        g_x += g * by_x
+        g_y += g * by_y
+        g_a += g * by_a
+        xx += f * by_x * by_x
+        xy += f * by_x * by_y
+        xa += f * by_x * by_a
+        yy += f * by_y * by_y
+        ya += f * by_y * by_a
+        aa += f * by_a * by_a
+    return e_sum, silent, mean_sum, spread_sum, (g_x, g_y, g_a), (xx, xy, xa, yy, ya, aa)
+
+
+@numba.njit(cache=True, inline="always")
+def softplus(x: float) -> float:
+    """log(1 + exp(x)), without overflow: of log-odds x of dead against alive, the negative logarithm of P(alive)."""
+    return math.log1p(math.exp(x)) if x < 0.0 else x + math.log1p(math.exp(-x))
+
+
+@numba.njit(cache=True, inline="always")
+def _mixed(
+    odds: float, silent: float, mean: float, spread: float, none: float, tempering: float
+) -> tuple[float, float, float, float]:
+    """Of a tag that is dead with prior log-odds ``odds``, and is not read (:mod:`factors.tag_states`): the tempered negative
+    log-likelihood, by how much the tag counts, and mean and variance of the likelihood over all that could be read.
+
+    ``silent``: negative log-likelihood of the silence if the tag is alive, ``mean`` and ``spread``: mean and variance of that of
+    all that could be read, ``none``: that of a silence out of reach.
+    """
+    alive = 1.0 / (1.0 + math.exp(odds))
+    log_alive = -softplus(odds)
+    left = alive * math.exp(-tempering * (silent - none))
+    total = left + 1.0 - alive
+    nll = tempering * none - math.log(total)
+    # an alive tag that is read costs what it does alive, less log P(alive); a silent one costs nll, whatever it is
+    quiet = math.exp(-silent)
+    read = tempering * (mean - quiet * silent) - (1.0 - quiet) * log_alive
+    expected = (alive * quiet + 1.0 - alive) * nll + alive * read
+    squared = (
+        tempering**2 * spread + (tempering * mean - log_alive) ** 2 - quiet * (tempering * silent - log_alive) ** 2
+    )
+    second = (alive * quiet + 1.0 - alive) * nll * nll + alive * squared
+    return nll, left / total, expected, max(second - expected * expected, 0.0) / tempering
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def score(
     packed: Packed,
@@ -102,6 +193,7 @@ def score(
     antennas: NDArray[np.int64],
     rounds: NDArray[np.int64],
     hits: NDArray[np.int64],
+    odds: Array,
     tempering: float,
     nll: Array,
     gradient: Array,
@@ -109,56 +201,108 @@ def score(
     expected: Array,
     variance: Array,
 ) -> None:
+    looks, tags = hits.shape
+    heard = np.zeros(tags, np.int64)
+    for k in range(looks):
+        for t in range(tags):
+            heard[t] += hits[k, t]
+    # what a tag that is out of reach of all looks adds
+    far = np.empty((looks, 3))
+    far_e = far_mean = far_spread = 0.0
+    for k in range(looks):
+        far[k, 0], _, _, far[k, 1], far[k, 2] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])
+        far_e, far_mean, far_spread = far_e + far[k, 0], far_mean + far[k, 1], far_spread + far[k, 2]
+    at = np.empty((looks, 8))
     for n in range(len(poses)):
         # sums in registers, not in arrays: a scan is one pose, and this loop is most of a smoother's step
         e_sum = mean_sum = spread_sum = 0.0
         g_x = g_y = g_a = 0.0
         xx = xy = xa = yy = ya = aa = 0.0
-        for k in range(len(antennas)):
-            a = antennas[k]
-            x, y, c, s, _, _ = placed(packed, a, poses[n], offsets[k])
-            ca, sa = packed.antennas[a, 3], packed.antennas[a, 4]
-            lx, ly = packed.antennas[a, 0], packed.antennas[a, 1]
-            co, so = math.cos(offsets[k, 2]), math.sin(offsets[k, 2])
-            # of the antenna's boresight in the frame of the pose, and the antenna's place there
-            cb, sb = co * ca - so * sa, so * ca + co * sa
-            px, py = offsets[k, 0] + co * lx - so * ly, offsets[k, 1] + so * lx + co * ly
-            far_e, _, _, far_mean, far_spread = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])
-            far = 0
-            for t in range(len(points)):
-                z, by_p, by_q, by_heading = of_tag(packed, a, x, y, c, s, points[t], normals[t])
-                if z == NEGLIGIBLE_LOGIT and hits[k, t] == 0:  # out of reach and not read, as most are
-                    far += 1
-                    continue
-                e, g, f, mean, spread = terms(packed, z, hits[k, t], rounds[k])
-                e_sum += e
+        farthest = _place_looks(packed, poses[n], offsets, antennas, at)
+        beyond = 0
+        for t in range(tags):
+            dx, dy = points[t, 0] - poses[n, 0], points[t, 1] - poses[n, 1]
+            if heard[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
+                beyond += 1
+                continue
+            tag_e, tag_silent, tag_mean, tag_spread, slope, curve = _alive(
+                packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far
+            )
+            share = tempering
+            if odds[t] == -np.inf:
+                e_sum += tempering * tag_e
+                mean_sum += tempering * tag_mean
+                spread_sum += tempering * tag_spread
+            else:
+                mixed, counts, mean, spread = _mixed(odds[t], tag_silent, tag_mean, tag_spread, far_e, tempering)
                 mean_sum += mean
                 spread_sum += spread
-                # the antenna moves, the tag does not
-                by_x, by_y = sb * by_q - cb * by_p, -sb * by_p - cb * by_q
-                by_a = by_heading - by_x * py + by_y * px
-                g_x += g * by_x
-                g_y += g * by_y
-                g_a += g * by_a
-                xx += f * by_x * by_x
-                xy += f * by_x * by_y
-                xa += f * by_x * by_a
-                yy += f * by_y * by_y
-                ya += f * by_y * by_a
-                aa += f * by_a * by_a
-            e_sum += far * far_e
-            mean_sum += far * far_mean
-            spread_sum += far * far_spread
-        nll[n], expected[n], variance[n] = tempering * e_sum, tempering * mean_sum, tempering * spread_sum
-        gradient[n, 0], gradient[n, 1], gradient[n, 2] = tempering * g_x, tempering * g_y, tempering * g_a
-        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = (
-            tempering * xx,
-            tempering * yy,
-            tempering * aa,
-        )
-        information[n, 0, 1] = information[n, 1, 0] = tempering * xy
-        information[n, 0, 2] = information[n, 2, 0] = tempering * xa
-        information[n, 1, 2] = information[n, 2, 1] = tempering * ya
+                if heard[t] > 0:
+                    e_sum += tempering * tag_e + softplus(odds[t])
+                else:
+                    e_sum += mixed
+                    share = tempering * counts
+            g_x, g_y, g_a = g_x + share * slope[0], g_y + share * slope[1], g_a + share * slope[2]
+            xx, xy, xa = xx + share * curve[0], xy + share * curve[1], xa + share * curve[2]
+            yy, ya, aa = yy + share * curve[3], ya + share * curve[4], aa + share * curve[5]
+        nll[n] = e_sum + tempering * beyond * far_e
+        expected[n] = mean_sum + tempering * beyond * far_mean
+        variance[n] = spread_sum + tempering * beyond * far_spread
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = g_x, g_y, g_a
+        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = xx, yy, aa
+        information[n, 0, 1] = information[n, 1, 0] = xy
+        information[n, 0, 2] = information[n, 2, 0] = xa
+        information[n, 1, 2] = information[n, 2, 1] = ya
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def silence(
+    packed: Packed,
+    pose: Array,
+    covariance: Array,
+    points: Array,
+    normals: Array,
+    offsets: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    odds: Array,
+    tempering: float,
+    out: Array,
+) -> None:
+    looks, tags = hits.shape
+    at = np.empty((looks, 8))
+    farthest = _place_looks(packed, pose, offsets, antennas, at)
+    far = np.empty(looks)
+    for k in range(looks):
+        far[k] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])[0]
+    g = np.empty(3)
+    for t in range(tags):
+        out[t] = 0.0
+        dx, dy = points[t, 0] - pose[0], points[t, 1] - pose[1]
+        if odds[t] == -np.inf or dx * dx + dy * dy >= farthest * farthest:
+            continue
+        total, g[0], g[1], g[2] = 0.0, 0.0, 0.0, 0.0
+        for k in range(looks):
+            if hits[k, t] > 0:
+                total = -np.inf
+                break
+            x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
+            z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
+            if z == NEGLIGIBLE_LOGIT:
+                continue
+            e, by_z, _, _, _ = terms(packed, z, 0, rounds[k])
+            total += e - far[k]
+            by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
+            g[0] += by_z * by_x
+            g[1] += by_z * by_y
+            g[2] += by_z * (by_heading - by_x * at[k, 7] + by_y * at[k, 6])
+        # the mean of exp(-E) over a Gaussian, E linear: it is larger than at the middle, a silence then tells less
+        across = 0.0
+        for i in range(3):
+            for j in range(3):
+                across += g[i] * covariance[i, j] * g[j]
+        out[t] = max(tempering * total - 0.5 * tempering * tempering * across, 0.0)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -2,7 +2,10 @@
 
 Each antenna that listens for a tag in n inventory rounds reads it in k of them, with probability q each
 (:mod:`factors.rfid`): the negative log-likelihood is ``-tempering * sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by
-the expected one, Fisher's information, which is never indefinite.
+the expected one, Fisher's information, which is never indefinite. A tag that may be dead counts by a mixture
+(:mod:`factors.tag_states`): its gradient and its information are those of an alive tag, times the probability that it is alive
+given that it is silent; of the Hessian of the mixture that leaves out what the state, not being known, takes away (Louis, JRSS B
+44(2), 1982, eq. 3.2').
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 
 from factors import rfid_kernels, se2
 from factors.rfid import Packed, RfidModel
-from factors.rfid_tables import Tables, add_log_likelihood, make_tables
+from factors.rfid_tables import Array32, Tables, add_log_likelihood, add_mixed, make_tables
 from factors.se2 import Array
 
 
@@ -40,21 +43,28 @@ class Looks:
     """What K antennas read of T tags, each at its own place on the way.
 
     ``offsets`` (K, 3): the robot's pose at the look, in the frame of the pose that the likelihood is of; ``antennas`` (K,): places
-    in the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): in how many of them each tag was read.
+    in the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): in how many of them each tag was read. ``odds`` (T,): log-odds
+    before these looks that each tag is dead, against alive (:class:`~factors.tag_states.TagStates`), ``-inf`` where it
+    lives, as by default all do.
     """
 
     offsets: Array
     antennas: NDArray[np.int64]
     rounds: NDArray[np.int64]
     hits: NDArray[np.int64]
+    odds: Array = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.odds):
+            object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
 
     def moved(self, offset: Array) -> Looks:
         """The same looks, of the pose that lies ``offset`` (3,) before theirs."""
-        return Looks(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits)
+        return Looks(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits, self.odds)
 
 
 def together(parts: list[Looks]) -> Looks:
-    """Several looks as one, all of the same pose."""
+    """Several looks as one, all of the same pose, in the order in which they were made: the odds are those before the first."""
     if len(parts) == 1:
         return parts[0]
     return Looks(
@@ -62,6 +72,7 @@ def together(parts: list[Looks]) -> Looks:
         np.concatenate([p.antennas for p in parts]),
         np.concatenate([p.rounds for p in parts]),
         np.concatenate([p.hits for p in parts]),
+        parts[0].odds,
     )
 
 
@@ -95,18 +106,53 @@ class RfidLikelihood:
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
         tags = (self.tags.points, self.tags.normals)
         where, seen = (looks.offsets, looks.antennas), (looks.rounds, looks.hits)
-        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, self.model.tempering, *out)
+        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, looks.odds, self.model.tempering, *out)
+        return out
+
+    def silence(self, pose: Array, covariance: Array, looks: Looks) -> Array:
+        """Tempered negative log-likelihood (T,), if they are alive, that tags of which that is not certain were not read, from a
+        pose (3,) with body-frame ``covariance`` (3, 3); less what it is out of reach, and 0 where a tag was read or is certain."""
+        out = np.empty(len(self.tags.points))
+        pose, covariance = np.asarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+        tags, where = (self.tags.points, self.tags.normals), (looks.offsets, looks.antennas)
+        seen = (looks.rounds, looks.hits)
+        tempering = self.model.tempering
+        rfid_kernels.silence(self.packed, pose, covariance, *tags, *where, *seen, looks.odds, tempering, out)
         return out
 
     def log_likelihood(self, poses: Array, looks: Looks) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid_tables`): for particles."""
-        out = np.zeros(len(poses))
         poses = np.ascontiguousarray(poses, dtype=float)
+        certain, silent, which = self.by_silence(poses, looks)
+        if len(which):
+            add_mixed(silent, looks.odds[which], self.model.tempering, certain)
+        # a tag that is read is alive, which was not certain before
+        return certain - float(np.logaddexp(0.0, looks.odds[looks.hits.any(axis=0)]).sum())
+
+    def by_silence(self, poses: Array, looks: Looks) -> tuple[Array, Array32, NDArray[np.int64]]:
+        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,
+        of the silence of U tags that may be dead, each by itself if it is alive, above what it is out of reach, (U, N), with the
+        places (U,) of these tags in the map."""
+        out = np.zeros(len(poses))
+        which = np.flatnonzero((looks.odds > -np.inf) & ~looks.hits.any(axis=0) & self._near(poses, looks))
+        apart = np.full(len(looks.odds), -1, dtype=np.int64)
+        apart[which] = np.arange(len(which))
+        silent = np.zeros((len(which), len(poses)), dtype=np.float32)
         for i in range(len(looks.antennas)):
             at = poses if not looks.offsets[i].any() else se2.compose(poses, looks.offsets[i])
             tags = (self.tags.points, self.tags.normals, looks.hits[i], int(looks.rounds[i]))
-            add_log_likelihood(self.packed, self._tables, int(looks.antennas[i]), at, *tags, out)
-        return self.model.tempering * out
+            add_log_likelihood(self.packed, self._tables, int(looks.antennas[i]), at, *tags, apart, out, silent)
+        return self.model.tempering * out, silent, which
+
+    def _near(self, poses: Array, looks: Looks) -> NDArray[np.bool_]:
+        """Which tags (T,) may be in reach of an antenna from any of the poses."""
+        packed = self.packed
+        way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
+        reach = way + float(np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
+        low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
+        return np.asarray(
+            np.all((self.tags.points[:, :2] > low - reach) & (self.tags.points[:, :2] < high + reach), axis=1)
+        )
 
     @cached_property
     def _tables(self) -> Tables:

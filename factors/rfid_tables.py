@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.rfid import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidModel, logistic_value
-from factors.rfid_kernels import seen
+from factors.rfid_kernels import FAST, seen
 from factors.se2 import Array
 
 Array32 = NDArray[np.float32]
@@ -86,15 +86,29 @@ def add_log_likelihood(
     normals: Array,
     hits: NDArray[np.int64],
     rounds: int,
+    apart: NDArray[np.int64],
     out: Array,
+    each: Array32,
 ) -> None:
     """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
-    (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds."""
-    arrays = (points, normals, hits, rounds)
+    (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
+    added by itself, above what it is out of reach, -1 of tags that go to ``out``."""
+    arrays = (points, normals, hits, rounds, apart)
     if packed.kinds[packed.which[antenna]] == LOGISTIC:
-        _add_direct(packed, antenna, poses, *arrays, tables.logs, out)
+        _add_direct(packed, antenna, poses, *arrays, tables.logs, out, each)
     else:
-        _add_tabled(packed, antenna, poses, *arrays, tables, tables.level[antenna], out)
+        _add_tabled(packed, antenna, poses, *arrays, tables, tables.level[antenna], out, each)
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def add_mixed(each: Array32, odds: Array, tempering: float, out: Array) -> None:
+    """Add to ``out`` (N,) the tempered log-likelihood of U silent tags that may be dead, with log-odds ``odds`` (U,) before, of
+    which ``each`` (U, N) is that if they are alive (:mod:`factors.tag_states`)."""
+    for u in range(len(odds)):
+        dead = 1.0 / (1.0 + math.exp(-odds[u]))
+        for n in range(len(out)):
+            if each[u, n] < 0.0:
+                out[n] += math.log((1.0 - dead) * math.exp(tempering * each[u, n]) + dead)
 
 
 @numba.njit(cache=True)
@@ -139,9 +153,11 @@ def _add_tabled(
     normals: Array,
     hits: NDArray[np.int64],
     rounds: int,
+    apart: NDArray[np.int64],
     tables: Tables,
     level: NDArray[np.int64],
     out: Array,
+    each: Array32,
 ) -> None:
     a = packed.antennas[antenna]
     ax, ay, ca, sa = a[0], a[1], a[3], a[4]
@@ -159,11 +175,17 @@ def _add_tabled(
         c[n], s[n] = ct * ca - st * sa, st * ca + ct * sa
     constant = 0.0
     # tag by tag, as all poses look at places of its table that are close together
-    total = np.zeros(len(poses), np.float32)
+    certain = np.zeros(len(poses), np.float32)
     for t in range(len(points)):
         if far[t]:
             constant += hits[t] * logs[0, 0] + (rounds - hits[t]) * logs[0, 1]
             continue
+        total = certain
+        if apart[t] >= 0:
+            total = each[apart[t]]
+            constant += rounds * logs[0, 1]
+            for n in range(len(poses)):
+                total[n] -= np.float32(rounds * logs[0, 1])
         k = level[t]
         tx, ty = np.float32((points[t, 0] - middle_x) * inverse), np.float32((points[t, 1] - middle_y) * inverse)
         size = 2 * tables.half[k] + 1
@@ -185,7 +207,7 @@ def _add_tabled(
             row = table[i * size + j]
             total[n] += np.float32(hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1])
     for n in range(len(poses)):
-        out[n] += constant + total[n]
+        out[n] += constant + certain[n]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -254,8 +276,10 @@ def _add_direct(
     normals: Array,
     hits: NDArray[np.int64],
     rounds: int,
+    apart: NDArray[np.int64],
     logs: Array,
     out: Array,
+    each: Array32,
 ) -> None:
     """The same for a logistic model, which is computed faster than it is looked up for all facings."""
     m = packed.which[antenna]
@@ -292,5 +316,9 @@ def _add_direct(
             c = -(normals[t, 0] * ex + normals[t, 1] * ey) / math.sqrt(distance2 + 1e-9)
             w = 1.0 - u / r
             row = _index(logistic_value(b, r, w, z, c))
-            total += hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1]
+            if apart[t] >= 0:
+                each[apart[t], n] += np.float32(rounds * (logs[row, 1] - none_missed))
+                total += rounds * none_missed
+            else:
+                total += hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1]
         out[n] += total

@@ -116,7 +116,8 @@ class Diagnostics:
 
     ``residuals``: by sensor and value (``bearing_range.range`` in m), measurement less prediction, before the update. ``nis``: by
     sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by reason.
-    ``events``: (t, what happened), for example a rebuilt graph.
+    ``events``: (t, what happened), for example a rebuilt graph. ``dead_tags``: tags of the map that are believed dead now, with the
+    probability of it.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -125,6 +126,7 @@ class Diagnostics:
     rejected: dict[str, int] = field(default_factory=dict)
     late: dict[str, int] = field(default_factory=dict)
     events: list[tuple[float, str]] = field(default_factory=list)
+    dead_tags: dict[str, float] = field(default_factory=dict)
 
     def ignore(self, reason: str, count: int = 1) -> None:
         self.ignored[reason] = self.ignored.get(reason, 0) + count

@@ -230,6 +230,10 @@ class Filter(ABC):
         self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry
         del self._records[taken.records :], self._ticks[taken.ticks :]
         self.diagnostics.take_back(taken.written)
+        self._went_back()
+
+    def _went_back(self) -> None:  # noqa: B027
+        """The filter went back to its time: what it took after that comes again."""
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:

@@ -162,6 +162,10 @@ class KeyframeGraph(ABC):
         """What waits on the newest keyframe and is in no graph yet."""
 
     @abstractmethod
+    def _odds_of_tags(self) -> Array:
+        """Log-odds (T,) that each tag of the map is dead, as far as is known."""
+
+    @abstractmethod
     def _final(self) -> tuple[Array, Array]:
         """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3)."""
 
@@ -215,7 +219,8 @@ class KeyframeGraph(ABC):
 
     def _problem(self, width: float = 1.0) -> Problem:
         """All that is known as one problem; the robust losses ``width`` times as wide as they are, and without the phases of tags,
-        which have many optima, where that is more than once."""
+        which have many optima, where that is more than once. Tags count by what is known of their states now, at the end, and not
+        by what was known at each scan."""
         assert self._prior is not None
         body = se2.world_to_body(self._prior.pose, self._prior.covariance)
         natives: list[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = []
@@ -232,8 +237,11 @@ class KeyframeGraph(ABC):
                     continue
                 if isinstance(factor, BearingRangeFactor):
                     factor = factor.widened(width)
-                if width == 1.0 or not (isinstance(factor, RfidFactor) and factor.is_phase):
-                    factors.append((factor, node.keys))
+                elif isinstance(factor, RfidFactor):
+                    if factor.is_phase and width > 1.0:
+                        continue
+                    factor = factor.with_odds(self._odds_of_tags())
+                factors.append((factor, node.keys))
         return Problem(factors, natives)
 
     def _drop_astray(self, keyframes: Sequence[Keyframe], values: Values) -> bool:

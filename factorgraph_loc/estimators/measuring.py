@@ -106,6 +106,14 @@ class MeasuringGraph(KeyframeGraph):
     def _scanned(self, t: float, looks: Looks, update: TagUpdate) -> None:
         """Antennas listened at ``t``; ``update``: what that changed."""
 
+    @property
+    @abstractmethod
+    def _doubted(self) -> bool:
+        """Whether the robot may be elsewhere."""
+
+    def _odds_of_tags(self) -> Array:
+        return self._scans.tags.states.odds
+
     @abstractmethod
     def _observed(self, t: float, seen: BearingRangeFactor, guess: Guess) -> None:
         """Landmarks of the map were seen at ``t`` from a keyframe whose pose is expected to be ``guess``."""
@@ -150,11 +158,14 @@ class MeasuringGraph(KeyframeGraph):
         if keyframe is not self._keyframes[-1]:
             self._add_late(keyframe, m, here)
             return
-        update = self._scans.update(m, here, self._pose, self._covariance)
+        predicted = self._pose, self._covariance
+        update = self._scans.update(m, here, *predicted)
         if update is None:
             return
         self._take_over(update)
         self._scanned(m.t, looks, update)
+        if not self._doubted:
+            self._scans.tags.miss(m.t, here, *predicted)
         by_phases = self._scans.update_by_phases(m, self._places_at, self._pose, self._covariance)
         if by_phases is not None:
             self._take_over(by_phases)
@@ -174,10 +185,13 @@ class MeasuringGraph(KeyframeGraph):
         if not self._is_open(keyframe.index):
             self._drop_late(m)
             return
-        factors = self._scans.late_factors(m, looks, *self._guess_of(keyframe.index))
+        guess = self._guess_of(keyframe.index)
+        factors = self._scans.late_factors(m, looks, *guess)
         nodes = [Node((keyframe.key,), factor, ROWS) for factor in factors]
         keyframe.nodes += nodes
         self._attach(keyframe, Addition([*self._gather(), *nodes]), None)
+        if not self._doubted:
+            self._scans.tags.miss(m.t, looks, *guess)
 
     def _gather(self) -> list[Node]:
         """The scans from the newest keyframe, which are in no graph yet."""

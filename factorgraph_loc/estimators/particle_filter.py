@@ -262,6 +262,9 @@ class ParticleFilter(Filter):
             self._scans.start(found=True)
             self._event(what)
 
+    def _went_back(self) -> None:
+        self._scans.go_back(self._t)
+
     def _places(self, times: Array) -> Array:
         """Where the robot was at these times (R,), in the frame of its pose, (R, 3)."""
         if not self._odometry_constants.names:

@@ -106,8 +106,7 @@ class RelocatingGraph(MeasuringGraph):
         ``ambiguous`` before one place is clear, and while the landmarks are not where they are expected.
         """
         if self._prior is not None:
-            doubted = self._monitor.suspicious_since is not None or self._scans.silent
-            status: Status = "ambiguous" if doubted else "localized"
+            status: Status = "ambiguous" if self._doubted or self._scans.silent else "localized"
             return replace(super().estimate(), status=status)
         modes = self._modes()
         if not modes:
@@ -257,6 +256,7 @@ class RelocatingGraph(MeasuringGraph):
         self._keyframe_times.append(t)
         self._pose, self._covariance = pose, UNKNOWN
         self._scans.clear()
+        self._scans.tags.forget(t)
         self._forget_points()
         self._begin_again(keyframe)
         self._replay(replay)
@@ -300,6 +300,10 @@ class RelocatingGraph(MeasuringGraph):
         if self._monitor.suspicious_since is None:
             self._finder.rest()
         self._finder.add(self._motion.state(t), looks, update.evidence)
+
+    @property
+    def _doubted(self) -> bool:
+        return self._monitor.suspicious_since is not None
 
     @abstractmethod
     def _begin_again(self, newest: Keyframe) -> None:

@@ -9,6 +9,7 @@ and not read is weighed there: the phase has many optima, and between places it 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -97,13 +98,15 @@ class ScanTracker:
         looks, likelihood = self._tags.looks(m), self._tags.likelihood
         if looks is None or likelihood is None:
             return False
-        mean, covariance = cloud.moments
-        update = tags.update(likelihood, looks, mean, se2.world_to_body(mean, covariance), iterations=1)
+        mean, covariance = cloud.moments[0], se2.world_to_body(*cloud.moments)
+        update = tags.update(likelihood, looks, mean, covariance, iterations=1)
         self._diagnostics.innovation("rfid", m.t, update.nis, update.dof)
         reads = int(looks.hits.sum())
         # a scan without reads that comes again, as the filter went back, counts once
         if reads or m.t > self._heard:
-            self._silence.add(reads, update.evidence)
+            lasted = self._silence.lasts
+            if self._silence.add(reads, update.evidence) and not lasted:
+                self._tags.silent()
             self._heard = max(self._heard, m.t)
         if self._silence.lasts:
             self._diagnostics.reject(Silence.REJECTED, len(m.antennas))
@@ -113,10 +116,16 @@ class ScanTracker:
         if self._finder is not None:
             self._finder.add(odometry, looks, evidence)
             self._monitor.add(m.t, update.surprise, update.variance)
+        if cloud.localized and not self.doubts:
+            self._tags.miss(m.t, looks, mean, covariance)
         strength, strengths = self._signals.strength, self._signals.strengths(m)
         if strength is not None and strengths is not None:
             weigh(lambda cloud: strength.log_likelihood(cloud.poses, strengths))
         return True
+
+    def go_back(self, t: float) -> None:
+        """The filter goes back to ``t``: later scans come again."""
+        self._tags.forget(math.nextafter(t, math.inf))
 
     def take_phases(self, m: RfidScan, cloud: Cloud, places: Places, weigh: Weigh) -> None:
         """Keep the phases of a scan, and take the window of them that ends with it, if one does.
@@ -154,4 +163,6 @@ class ScanTracker:
         found = self._finder.best
         assert found is not None
         here = found.pose
-        return self._finder.change(lambda t: np.asarray(se2.compose(here, places(np.array([t]))[0])))
+        change = self._finder.change(lambda t: np.asarray(se2.compose(here, places(np.array([t]))[0])))
+        self._tags.forget(change)
+        return change

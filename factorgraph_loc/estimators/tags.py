@@ -19,10 +19,11 @@ from factors.rfid import Packed
 from factors.rfid_factor import RfidFactor, TagScore
 from factors.rfid_likelihood import Looks, RfidLikelihood, Score
 from factors.se2 import Array
+from factors.tag_states import TagStates
 
 _Tags = tuple[Array, Array]  # points and normals
 _Integers = NDArray[np.int64]
-_Seen = tuple[Array, _Integers, _Integers, _Integers]  # offsets, antennas, rounds and hits
+_Seen = tuple[Array, _Integers, _Integers, _Integers, Array]  # offsets, antennas, rounds, hits and odds
 
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
@@ -32,7 +33,11 @@ TELLING = 1e-6  # eigenvalue of an information that counts
 
 
 class KnownTags:
-    """Turns scans into looks at the tags of the map; what the map or the rig lacks is counted as ignored."""
+    """Turns scans into looks at the tags of the map; what the map or the rig lacks is counted as ignored.
+
+    It also keeps what the scans told of the ``states`` of the tags: that one was read shows when it is looked at, that one was not
+    only from where the robot was, if that is known (:meth:`miss`). Tags that are believed dead stand in the diagnostics.
+    """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
         settings = setup.rig.rfid if "rfid" in setup.sensors else None
@@ -41,6 +46,7 @@ class KnownTags:
         self._rounds: dict[tuple[str, ...], tuple[list[int], _Integers, _Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
         self.likelihood = None if settings is None else RfidLikelihood(settings.model(), self.map.tags)
+        self.states = TagStates(len(self.map.names), 0.0 if settings is None else settings.dead_tags)
 
     def looks(self, m: RfidScan, *, count: bool = True) -> Looks | None:
         """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time.
@@ -56,7 +62,7 @@ class KnownTags:
             diagnostics.ignore("antenna that the rig lacks", rows.count(-1))
         if not len(used) or not self.map.names:
             return None
-        hits = np.zeros((len(used), len(self.map.names)), dtype=np.int64)
+        hits, odds = np.zeros((len(used), len(self.map.names)), dtype=np.int64), self.states.odds
         unknown = 0
         # a tag counts once a round, as often as it may answer in it
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
@@ -67,7 +73,31 @@ class KnownTags:
                 hits[rows[number], place] += 1
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        return Looks(np.zeros((len(used), 3)), used, rounds, hits)
+        self.states.hear(m.t, np.flatnonzero(hits.any(axis=0)))
+        self._tell()
+        return Looks(np.zeros((len(used), 3)), used, rounds, hits, odds)
+
+    def miss(self, t: float, looks: Looks, pose: Array, covariance: Array) -> None:
+        """Learn of the tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): that of the looks, as
+        it was predicted before them."""
+        if self.likelihood is not None:
+            self.states.miss(t, self.likelihood.silence(pose, covariance, looks))
+            self._tell()
+
+    def forget(self, since: float) -> None:
+        """Take back what scans from then on told of tags that were not read."""
+        self.states.forget(since)
+        self._tell()
+
+    def silent(self) -> None:
+        """The reader or all tags have failed since a tag was last read: that tells nothing of each of them."""
+        self.forget(math.nextafter(self.states.heard, math.inf))
+
+    def _tell(self) -> None:
+        believed, told = self.states.believed_dead, self._diagnostics.dead_tags
+        told.clear()
+        if len(believed):
+            told.update(zip((self.map.names[i] for i in believed), self.states.dead[believed].tolist(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], _Integers, _Integers]:
         """Of antennas that listened: the rows of their looks, -1 of those that the rig lacks; of each row its antenna's place in
@@ -121,7 +151,7 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
     likelihood, looks = factors[0].likelihood, factors[0].seen
     if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, Looks):
         return scored_update(factors, pose, covariance, iterations)
-    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits)
+    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
     return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
 
@@ -212,12 +242,12 @@ def _updated(
 def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
     """Of one pose (3,), as of :meth:`~factors.rfid_likelihood.RfidLikelihood.score`."""
     points, normals = tags
-    offsets, antennas, rounds, hits = seen
+    offsets, antennas, rounds, hits, odds = seen
     nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
     told = np.empty(1), np.empty(1)
     at = pose.copy().reshape(1, 3)
     rfid_kernels.score(
-        packed, at, points, normals, offsets, antennas, rounds, hits, tempering, nll, gradient, information, *told
+        packed, at, points, normals, offsets, antennas, rounds, hits, odds, tempering, nll, gradient, information, *told
     )
     return Score(nll, gradient, information, *told)
 

@@ -64,6 +64,7 @@ class WaitingScans:
             self._diagnostics.reject(Silence.REJECTED, len(m.antennas))
             if not lasted:
                 self._diagnostics.events.append((m.t, Silence.EVENT))
+                self.tags.silent()
             return None
         self._waiting += factors
         if strengths:

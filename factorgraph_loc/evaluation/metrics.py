@@ -243,7 +243,7 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     """NIS by sensor (total NIS over total degrees of freedom, ideally 1; share beyond the 95 % bound), residuals at the
-    prediction (m, rad), and what was left out."""
+    prediction (m, rad), what was left out, and the tags that are believed dead, with the probability of it."""
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
@@ -259,6 +259,8 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
         counts: dict[str, int] = getattr(diagnostics, kind)
         figures[f"{kind}.total"] = sum(counts.values())
         figures |= {f"{kind}.{reason}": count for reason, count in sorted(counts.items())}
+    figures["dead_tags.total"] = len(diagnostics.dead_tags)
+    figures |= {f"dead_tags.{name}": dead for name, dead in sorted(diagnostics.dead_tags.items())}
     figures["events"] = len(diagnostics.events)
     return figures
 

@@ -12,10 +12,11 @@ from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
 from factorgraph_loc.files import FileModel
-from factorgraph_loc.log import BearingRangeStream, Log
+from factorgraph_loc.log import BearingRangeStream, Log, RfidStream
 from factorgraph_loc.trajectory import Trajectory
 
 MOSTLY = 0.9  # of the time with estimates
+SHOWN = 5  # names in a warning
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...]:
@@ -67,6 +68,26 @@ def without_tags(log: Log, estimator: str, diagnostics: Diagnostics) -> tuple[st
     if not rounds or estimator == "dead_reckoning":  # which says so by its name
         return ()
     return (f"{log.name}: {estimator} takes no tags: all {rounds} inventory rounds are ignored",)
+
+
+def dead_tags(log: Log, diagnostics: Diagnostics) -> tuple[str, ...]:
+    """Tags of the map that are believed dead at the end, the surest first; or that no tag is read."""
+    stream = log.streams.get("rfid")
+    if isinstance(stream, RfidStream) and log.world.tags and not any(epc in log.world.tags for epc in stream.epc):
+        return (f"{log.name}: none of the {len(log.world.tags)} tags of the map is read",)
+    found = sorted(diagnostics.dead_tags.items(), key=lambda row: -row[1])
+    if not found:
+        return ()
+    names = ", ".join(f"{name} ({_percent(dead)})" for name, dead in found[:SHOWN])
+    more = len(found) - SHOWN
+    return (
+        f"{log.name}: {len(found)} of {len(log.world.tags)} tags of the map are believed dead, as they were not read from where "
+        f"they should have been: {names}" + (f" and {more} more" if more > 0 else ""),
+    )
+
+
+def _percent(probability: float) -> str:
+    return "> 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
 
 
 def without_points(

@@ -70,6 +70,8 @@ def optimal_filter(log: Log) -> Trajectory:
             state = motion.state(m.t)
             grid.predict(motion.relative(before, state))
             before = state
+            mean, covariance = grid.moments()
+            tags.miss(m.t, looks, mean, se2.world_to_body(mean, covariance))
             grid.update(partial(_log_likelihood, likelihood, looks))
             mean, covariance = grid.moments()
             t.append(m.t)

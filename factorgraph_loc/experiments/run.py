@@ -24,6 +24,7 @@ from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.experiments.doubts import (
     check_free_map,
+    dead_tags,
     findable,
     never_localized,
     partly_scored,
@@ -36,12 +37,10 @@ from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
 from factorgraph_loc.trajectory3 import Trajectory3
-from factorgraph_loc.world import World
 from factors.se2 import Array
 
 TICK_RATE = 10  # Hz, the grid on which trajectories are written
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
-_SHOWN = 5  # names in a warning
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,7 @@ def run(
     settings = registry.settings_of(config.estimator, config.settings)
     check_free_map(log, sensors, config.estimator, settings)
     prior, prior_source = resolve_prior(log, config.prior)
-    world, unread = _readable(log, sensors)
-    setup = registry.Setup(log.rig, world, sensors, np.random.default_rng(config.seed))
+    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
     estimator = registry.create(config.estimator, setup, settings)
     if "odometry" not in log.streams and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
@@ -148,10 +146,10 @@ def run(
             *log.warnings,
             *unstated,
             *_doubts(log, sensors),
-            *unread,
             *prepared.warnings,
             *without_points(log, sensors, config.estimator, estimator, settings),
             *without_tags(log, config.estimator, estimator.diagnostics),
+            *(dead_tags(log, estimator.diagnostics) if "rfid" in sensors else ()),
             *never_localized(log, sensors, loop.estimates, final),
             *partly_scored(log, final, config.max_gap),
         ),
@@ -314,25 +312,6 @@ def _is_read(log: Log, sensor: str) -> bool:
     """Whether any read has a value of ``sensor``, one of ``OF_READS``."""
     stream = log.streams.get("rfid")
     return isinstance(stream, RfidStream) and bool(np.any(np.isfinite(getattr(stream, sensor))))
-
-
-def _readable(log: Log, sensors: tuple[str, ...]) -> tuple[World, tuple[str, ...]]:
-    """The map without the tags that the whole log never reads, and a warning that names them.
-
-    Such a tag is broken, hidden or gone; to an estimator it would be evidence, round after round, against all places near it.
-    """
-    stream = log.streams.get("rfid")
-    if "rfid" not in sensors or not isinstance(stream, RfidStream):
-        return log.world, ()
-    read = set(stream.epc)
-    unread = [epc for epc in log.world.tags if epc not in read]
-    if not unread:
-        return log.world, ()
-    names = ", ".join(unread[:_SHOWN]) + (", ..." if len(unread) > _SHOWN else "")
-    tags = {epc: tag for epc, tag in log.world.tags.items() if epc in read}
-    return log.world.model_copy(update={"tags": tags}), (
-        f"{log.name}: {len(unread)} of {len(log.world.tags)} tags of the map are never read and are left out: {names}",
-    )
 
 
 def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from factorgraph_loc.estimators import kld
-from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior, Status
 from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
 from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
@@ -112,6 +112,9 @@ class ActiveMcl(Filter):
     def _scan(self, m: RfidScan) -> None:
         self._state = self._weighed(self._state, m)
 
+    def _went_back(self) -> None:
+        self._tags.forget(math.nextafter(self._t, math.inf))
+
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
         """Weigh the particles by free lengths (D,) [m] that a proximity sensor has read; before the first scan there are none."""
         if self._state is not None:
@@ -121,12 +124,15 @@ class ActiveMcl(Filter):
         looks, likelihood = self._tags.looks(m), self._tags.likelihood
         if looks is None or likelihood is None:
             return cloud
+        known = self._is_one_place(cloud)
         if m.tags:
             # tags that are read where none of the particles is: they have lost the robot
             anywhere = self._everywhere()
             told, else_told = (_evidence(c, likelihood.log_likelihood(c.poses, looks)) for c in (cloud, anywhere))
             if told < else_told + LOST:
-                cloud = anywhere
+                cloud, known = anywhere, False
+        if known:
+            self._tags.miss(m.t, looks, cloud.moments[0], se2.world_to_body(*cloud.moments))
         return self._tempered(cloud, lambda poses: likelihood.log_likelihood(poses, looks))
 
     def _tempered(self, cloud: Cloud, log_likelihood: Callable[[Array], Array]) -> Cloud:
@@ -145,9 +151,13 @@ class ActiveMcl(Filter):
         return cloud
 
     def _estimate(self) -> PoseEstimate:
-        pose, covariance = self._state.moments
-        one = np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2 and covariance[2, 2] < ONE_HEADING**2
-        return PoseEstimate(self._t, pose, covariance, "localized" if one else "ambiguous")
+        status: Status = "localized" if self._is_one_place(self._state) else "ambiguous"
+        return PoseEstimate(self._t, *self._state.moments, status)
+
+    @staticmethod
+    def _is_one_place(cloud: Cloud) -> bool:
+        covariance = cloud.moments[1]
+        return bool(np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2 and covariance[2, 2] < ONE_HEADING**2)
 
     def _record(self) -> PoseEstimate:
         return self._estimate()

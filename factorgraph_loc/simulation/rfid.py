@@ -23,16 +23,26 @@ def read_probabilities(rfid: RfidSettings, tags: TagArray, poses: Array) -> Arra
     return np.stack([likelihood.probabilities(poses, a) for a in range(len(model.antennas))], axis=1)
 
 
+def draw_dead(faults: FaultSettings, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Which of so many tags are never read."""
+    return np.asarray(rng.permutation(count)[: round(faults.dead * count)])
+
+
 def draw_reads(
-    rfid: RfidSettings, probabilities: Array, times: Array, faults: FaultSettings, rng: np.random.Generator
+    rfid: RfidSettings,
+    probabilities: Array,
+    times: Array,
+    faults: FaultSettings,
+    dead: NDArray[np.int64],
+    rng: np.random.Generator,
 ) -> Hits:
     """Which tag each round reads (N, A, T), of rounds at ``times`` (N,), with all faults but those of the map and the clock.
+    ``dead``: tags that are never read.
 
     In a fade a tag is read falsely only. Outside it is read so much more often that, over all, the probability is what the
     model says, as far as it can be: a rig with ``miss`` of at least the share of fades makes it so.
     """
     shape = probabilities.shape
-    dead = rng.permutation(shape[2])[: round(faults.dead * shape[2])]
     share = faults.fading.share
     p = probabilities
     if share > 0.0:

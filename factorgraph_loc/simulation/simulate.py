@@ -15,7 +15,7 @@ from factorgraph_loc.rfid_settings import SurveySettings
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.pixels import pixel_stream
 from factorgraph_loc.simulation.recorded import RecordedLooks
-from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities, rfid_stream
+from factorgraph_loc.simulation.rfid import draw_dead, draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
 from factorgraph_loc.simulation.sightings import sighting_stream
 from factorgraph_loc.simulation.signals import phases, strengths
@@ -50,8 +50,8 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     truth = drive(world, settings.drive, rngs[1])
     streams: dict[str, Stream] = {
         "odometry": wheel_odometry(truth, int(rngs[2].integers(2**32))),
-        "rfid": _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7], rngs[8])),
     }
+    streams["rfid"], dead = _reads(settings, rig, world, truth, recorded, (rngs[3], rngs[7], rngs[8]))
     if world.landmarks and rig.bearing_range is not None:
         times = ticks(settings.sightings.rate, truth)
         model = rig.bearing_range.model()
@@ -72,6 +72,8 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         share = recorded.unmatched(tag_map(world, rig.survey).tags, truth.poses[::SPARSE])
         if share > 0.1:
             warnings.append(f"rfid: {share:.0%} of the looks in reach have no recorded one that is alike")
+    if dead:
+        metadata["dead"] = ", ".join(dead)
     if misplaced:
         metadata["misplaced"] = ", ".join(misplaced)
     return Log(
@@ -99,7 +101,8 @@ def _reads(
     truth: Trajectory,
     recorded: RecordedLooks | None,
     rngs: tuple[np.random.Generator, ...],
-) -> Stream:
+) -> tuple[Stream, list[str]]:
+    """What the antennas read, and the tags that are dead."""
     rfid = rig.rfid
     assert rfid is not None, "the settings have been checked"
     tags = tag_map(world, rig.survey)
@@ -107,15 +110,17 @@ def _reads(
     poses = truth.at(times)
     # recorded outcomes are probabilities of zero and one
     p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rngs[0])
-    hits = draw_reads(rfid, p, times, settings.faults, rngs[0])
     names, epcs = list(rfid.all_antennas()), list(tags.names)
+    dead = draw_dead(settings.faults, len(epcs), rngs[0])
+    hits = draw_reads(rfid, p, times, settings.faults, dead, rngs[0])
     signals: dict[str, Array] = {}
     if settings.rssi is not None:
         signals["rssi"] = strengths(rfid, tags.tags, poses, hits, settings.rssi, rngs[1])
     if settings.phase is not None:
         signals["phase"] = phases(rfid, tags.tags, poses, settings.phase, rngs[2])
         signals["frequency"] = np.full(hits.shape, settings.phase.frequency)
-    return rfid_stream(names, epcs, times, hits, settings.faults, signals)
+    stream = rfid_stream(names, epcs, times, hits, settings.faults, signals)
+    return stream, [epcs[i] for i in sorted(dead.tolist())]
 
 
 def ticks(rate: float, truth: Trajectory) -> Array:

@@ -149,7 +149,8 @@ def test_silence_of_a_minute_is_survived():
     during = (result.t > 20.0) & (result.t < 70.0)
     # it is said that something is wrong, and the robot goes on by its odometry
     assert events(result) == ["no tag is read where some should be"]
-    assert position_errors(result, log).max() < 5.0
+    sigmas = np.sqrt(np.linalg.eigvalsh(result.covariances[:, :2, :2])[:, -1])
+    assert (position_errors(result, log) / sigmas).max() < 3.5
     assert np.mean(np.array(result.status)[during] == "ambiguous") > 0.8
     assert position_errors(result, log)[result.t > 80.0].max() < 0.5
 
@@ -192,7 +193,8 @@ def test_antenna_that_the_rig_lacks_and_late_scans():
 def test_scans_that_come_again_make_no_silence():
     # not to read a tag a metre ahead has a log-probability of -2.3: three times are no silence yet, six would be
     world = World(tags={"a": Tag(x=1.0, y=0.0)})
-    particles = alone(world, RfidSettings(antennas={"ahead": AntennaSettings()}), 500)
+    # and the tag lives: one that may be dead would be given up before the reader is
+    particles = alone(world, RfidSettings(antennas={"ahead": AntennaSettings()}, dead_tags=0.0), 500)
     particles.initialize(PosePrior(0.0, np.zeros(3), 1e-4 * np.eye(3)))
     for t in (0.3, 0.2, 0.1):
         particles.process(scan(t))

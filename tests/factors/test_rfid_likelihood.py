@@ -1,6 +1,7 @@
 """The likelihood of reads and silences: value, gradient, information, tables."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,3 +141,75 @@ def test_factor_has_the_cost_gradient_and_curvature_of_the_likelihood() -> None:
     assert jacobian.T @ residual == pytest.approx(score.gradient[0], rel=1e-5, abs=1e-7)
     assert jacobian.T @ jacobian == pytest.approx(score.information[0], rel=1e-4, abs=1e-6)
     assert factor.cost([POSE]) == pytest.approx(score.nll[0])
+
+
+def doubtful(seed: int, name: str = "beam") -> tuple[RfidLikelihood, Looks, Looks]:
+    """A scene in which most tags are silent: all of them certain to live, and with odds from certain to nearly given up."""
+    likelihood, looks = scene(MODELS[name], seed, tempering=0.3)
+    looks.hits[:, 4:] = 0
+    return likelihood, looks, replace(looks, odds=np.resize(np.array((-np.inf, -3.0, 0.5, 8.0)), 15))
+
+
+def out_of_reach(likelihood: RfidLikelihood, looks: Looks) -> float:
+    """The negative log-likelihood of a tag out of reach that is not read."""
+    model = likelihood.model
+    floor = model.false_read + (1.0 - model.false_read - model.miss) / (1.0 + math.exp(14.0))
+    return -model.tempering * float(looks.rounds.sum()) * math.log1p(-floor)
+
+
+def mixture(likelihood: RfidLikelihood, looks: Looks, odds: np.ndarray, pose: np.ndarray) -> float:
+    """The negative log-likelihood of tags that may be dead, tag by tag."""
+    total, none = 0.0, out_of_reach(likelihood, looks)
+    each, _, _ = likelihood.by_tag(pose, looks)
+    for tag, own in enumerate(odds):
+        dead = 0.0 if own == -np.inf else 1.0 / (1.0 + math.exp(-own))
+        silent = 0.0 if looks.hits[:, tag].any() else dead * math.exp(-none)
+        total -= math.log((1.0 - dead) * math.exp(-each[tag]) + silent)
+    return total
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tag_that_may_be_dead_counts_as_a_mixture(name: str, seed: int) -> None:
+    likelihood, looks, mixed = doubtful(seed, name)
+    found = likelihood.score(POSE, mixed)
+    assert found.nll[0] == pytest.approx(mixture(likelihood, looks, mixed.odds, POSE), rel=1e-6)
+    for k, step in enumerate(1e-5 * np.eye(3)):
+        low, high = (mixture(likelihood, looks, mixed.odds, se2.compose(POSE, se2.exp(s * step))) for s in (-1, 1))
+        assert found.gradient[0, k] == pytest.approx((high - low) / 2e-5, abs=1e-3, rel=1e-3)
+    assert np.all(np.linalg.eigvalsh(found.information[0]) > -1e-9)
+    assert np.trace(found.information[0]) < np.trace(likelihood.score(POSE, looks).information[0])
+    poses = POSE + np.random.default_rng(seed).normal(size=(300, 3)) * 0.5
+    exact = -likelihood.score(poses, mixed).nll
+    tabled = likelihood.log_likelihood(poses, mixed)
+    assert np.median(np.abs(tabled - exact)) < 0.1 * np.std(exact)
+    assert np.abs(tabled - exact).mean() < 0.05 * np.abs(exact).mean()
+
+
+def test_expectation_over_what_a_tag_that_may_be_dead_can_do() -> None:
+    """One antenna, two rounds: all that can be read, each as likely as the states make it."""
+    tags = TagArray(np.array(((2.0, 0.5, 1.0),)), np.full(1, np.nan))
+    likelihood = RfidLikelihood(RfidModel((Antenna(z=1.0),), (BeamModel(p0=0.7),), 0.0, 0.0), tags)
+    q, dead = float(likelihood.probabilities(np.zeros((1, 3)), 0)[0, 0]), 0.3
+    odds = np.array((math.log(dead / (1.0 - dead)),))
+    values, chances = [], []
+    for k, ways in enumerate((1.0, 2.0, 1.0)):
+        looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, 2), np.array(((k,),)), odds)
+        score = likelihood.score(np.zeros(3), looks)
+        values.append(score.nll[0])
+        chances.append((1.0 - dead) * ways * q**k * (1.0 - q) ** (2 - k) + (dead if k == 0 else 0.0))
+        mean, variance = score.expected[0], score.variance[0]
+    assert mean == pytest.approx(np.dot(chances, values), rel=1e-6)
+    assert variance == pytest.approx(np.dot(chances, np.square(values)) - mean**2, rel=1e-6)
+
+
+def test_silence_tells_less_where_the_pose_is_uncertain() -> None:
+    likelihood, looks, mixed = doubtful(1)
+    at_once = likelihood.silence(POSE, np.zeros((3, 3)), mixed)
+    each, _, _ = likelihood.by_tag(POSE, looks)
+    silent = np.isfinite(mixed.odds) & ~mixed.hits.any(axis=0)
+    assert at_once[silent] == pytest.approx(each[silent] - out_of_reach(likelihood, looks), abs=1e-6)
+    assert not at_once[~silent].any()
+    uncertain = likelihood.silence(POSE, np.diag((0.2, 0.2, 0.1)) ** 2, mixed)
+    assert np.all(uncertain <= at_once)
+    assert uncertain.sum() < 0.99 * at_once.sum()

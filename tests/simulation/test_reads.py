@@ -12,7 +12,7 @@ import pytest
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.simulation.rfid import draw_reads, read_probabilities
+from factorgraph_loc.simulation.rfid import draw_dead, draw_reads, read_probabilities
 from factorgraph_loc.simulation.settings import FaultSettings
 from factorgraph_loc.tag_map import tag_map
 from factors.rfid import BeamModel
@@ -22,7 +22,8 @@ TIMES = np.arange(1, 2001) * 0.5
 
 def drawn(faults, p, seed=0, rfid=None):
     rfid = rfid or preset("office").rig.rfid
-    return draw_reads(rfid, p, TIMES, FaultSettings.model_validate(faults), np.random.default_rng(seed))
+    rng, settings = np.random.default_rng(seed), FaultSettings.model_validate(faults)
+    return draw_reads(rfid, p, TIMES, settings, draw_dead(settings, p.shape[2], rng), rng)
 
 
 def flat(p):

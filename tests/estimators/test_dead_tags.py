@@ -1,0 +1,139 @@
+"""Dead tags, as a robot can know of them: by the way it goes, not by the whole log."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import Log, cut, join
+from factorgraph_loc.measurements import Odometry, RfidScan, VelocityOdometry
+from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.world import Tag, World
+
+SENSORS = ("odometry", "rfid")
+ESTIMATORS = ["smoother", "batch", "particle_filter", "switching"]
+
+
+@cache
+def office() -> tuple[Log, frozenset[str]]:
+    """A minute with 30 % of the tags dead, and which these are."""
+    log = simulate(preset("office", {"drive": {"duration": 60.0}, "faults": {"dead": 0.3}}), 2)
+    return log, frozenset(log.metadata["dead"].split(", "))
+
+
+def without(log: Log, tags: frozenset[str]) -> Log:
+    left = {name: tag for name, tag in log.world.tags.items() if name not in tags}
+    return replace(log, world=log.world.model_copy(update={"tags": left}))
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
+def test_hardly_worse_than_who_is_told(estimator: str) -> None:
+    """After half a minute; one log, so that the bound is wide. All that are named are dead, and most of the dead are named."""
+    log, dead = office()
+    assert log.reference is not None
+    config = RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {})
+    result, told = run(log, config), run(without(log, dead), config)
+    late = result.t > 30.0
+    errors = [
+        np.sqrt(np.mean(np.sum((r.poses - log.reference.at(r.t, max_gap=0.2))[late, :2] ** 2, axis=1)))
+        for r in (result, told)
+    ]
+    assert errors[0] < 1.25 * errors[1] + 0.01
+    named = set(result.diagnostics.dead_tags)
+    assert named <= dead
+    assert len(named) >= 8  # of 12, some of which the robot hardly passes
+    assert score(result, log)["dead_tags.total"] == len(named)
+    assert any(f"{len(named)} of 40 tags of the map are believed dead" in w for w in result.warnings)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_what_comes_later_changes_no_causal_estimate(estimator: str) -> None:
+    log, _ = office()
+    half = cut(log, 0.0, 12.0)
+    whole, first = run(cut(log, 0.0, 24.0), RunConfig(estimator)), run(half, RunConfig(estimator))
+    count = len(first.t)
+    assert np.array_equal(whole.t[:count], first.t)
+    assert np.array_equal(whole.poses[:count], first.poses)
+    assert np.array_equal(whole.covariances[:count], first.covariances)
+    assert whole.status[:count] == first.status
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
+def test_live_is_as_a_run(estimator: str) -> None:
+    log, _ = office()
+    log = cut(log, 0.0, 15.0)
+    settings = {"lag": None} if estimator == "smoother" else {}
+    result = run(log, RunConfig(estimator, settings, sensors=SENSORS))
+    localizer = fgloc.Localizer(log.rig, log.world, estimator, sensors=SENSORS, settings=settings)
+    prior, _ = resolve_prior(log, None)
+    assert prior is not None
+    localizer.initialize(prior.pose, prior.covariance, prior.t)
+    ticks, found = list(result.t), []
+    for m in log.measurements(SENSORS):
+        while ticks and ticks[0] < m.t:
+            found.append(localizer.estimate(float(ticks.pop(0))).pose)
+        localizer.push(m)
+        if not isinstance(m, Odometry):
+            localizer.estimate()
+    found += [localizer.estimate(float(t)).pose for t in ticks]
+    assert np.array_equal(np.array(found), result.poses)
+    assert localizer.diagnostics().dead_tags == result.diagnostics.dead_tags
+
+
+def robot(estimator: str, **settings: float) -> fgloc.Localizer:
+    """A robot that stands 1 m before a tag."""
+    rfid = RfidSettings(antennas={"ahead": AntennaSettings()}, dead_tags=0.03)
+    world = World(tags={"ahead": Tag(x=1.0, y=0.0), "aside": Tag(x=2.0, y=1.0), "far": Tag(x=30.0, y=0.0)})
+    out = fgloc.Localizer(Rig(rfid=rfid), world, estimator, sensors=SENSORS, settings=settings)
+    out.initialize((0.0, 0.0, 0.0), np.diag((0.02, 0.02, 0.02)) ** 2, 0.0)
+    out.push(VelocityOdometry(0.0, 0.0, 0.0))
+    return out
+
+
+def scan(t: float, tags: Sequence[str] = ("aside",)) -> RfidScan:
+    count = len(tags)
+    nan = np.full(count, np.nan)
+    return RfidScan(t, ("ahead",), np.zeros(count, np.int64), tuple(tags), np.zeros(count), nan, nan, nan)
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter", "switching"])
+def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
+    live = robot(estimator)
+    for i in range(1, 8):
+        live.push(scan(0.1 * i))
+    # seven silences of 0.1 each, from odds of 3 to 97
+    assert live.diagnostics().dead_tags.keys() == {"ahead"}
+    assert live.diagnostics().dead_tags["ahead"] > 0.9
+    live.push(scan(0.8, ("aside", "ahead")))
+    assert not live.diagnostics().dead_tags
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
+def test_a_late_scan_counts_once(estimator: str) -> None:
+    """Each second scan comes after the one that follows it: what is known of the tags is the same, as the robot stands."""
+    in_time, late = robot(estimator), robot(estimator)
+    stamps = [0.05 * k for k in range(1, 7)]
+    for t in stamps:
+        in_time.push(scan(t))
+    for k in (1, 0, 3, 2, 5, 4):
+        late.push(scan(stamps[k]))
+    expected = in_time.diagnostics().dead_tags["ahead"]
+    assert late.diagnostics().dead_tags["ahead"] == pytest.approx(expected, abs=0.02)
+    assert not late.diagnostics().late
+
+
+def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
+    """The robot is carried elsewhere: the tags that it then does not read, where it is thought to be, are not dead."""
+    log = simulate(preset("office", {"drive": {"duration": 80.0}}), 1)
+    carried = join(cut(log, 0.0, 30.0), cut(log, 50.0, 80.0))
+    result = run(carried, RunConfig("smoother"))
+    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
+    assert len(result.diagnostics.dead_tags) <= 1
