@@ -232,6 +232,8 @@ def _doubts(knowledge: Knowledge, searches: Sequence[Consistency]) -> tuple[str,
     if knowledge.rfid is not None:
         for tag in knowledge.rfid.doubts:
             doubts.append(f"Tag {tag.name} seems to be {tag.distance:.1f} m from where the map has it.")
-        if silent := knowledge.rfid.silent:
-            doubts.append(f"{len(silent)} tags of the map are never read, the first is {silent[0]}.")
+        if silent := knowledge.rfid.dead.tags:
+            believed = knowledge.rfid.dead.believed
+            names = f"; believed dead, as they should have been: {', '.join(believed)}" if believed else ""
+            doubts.append(f"{len(silent)} tags of the map are never read{names}.")
     return tuple(doubts)

@@ -223,6 +223,7 @@ def _rfid(calibration: Calibration) -> list[str]:
     return [
         "<h2>RFID</h2>",
         f"<p>{_text(rfid_report.tempering_text(found, calibration.rig))}</p>",
+        f"<p>{_text(rfid_report.dead_text(found))}</p>",
         *tables,
         "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or stretches.</p>",
         _image(rfid_figures.reliability_figure(found)),

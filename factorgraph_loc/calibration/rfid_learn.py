@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.calibration.rfid_choice import Choice, Kind, choose, fit
+from factorgraph_loc.calibration.rfid_dead import DeadTags, dead_tags
 from factorgraph_loc.calibration.rfid_fit import Floor
 from factorgraph_loc.calibration.rfid_mounting import Offset, with_focus, with_offsets
 from factorgraph_loc.calibration.rfid_pairs import Pairs, pairs_of
@@ -40,7 +41,8 @@ class RfidKnowledge:
 
     ``models``, and ``which`` of them each antenna has; ``choice`` of the way they were fitted; ``offsets`` of survey and mounting;
     ``phase``: the focus, where logs have phases; ``share``: exponent at which the reads' scatter along the reference is what the
-    likelihood says; ``doubts``: misplaced tags; ``silent``: tags that no log reads. ``pairs``: what the models were fitted to.
+    likelihood says; ``doubts``: misplaced tags; ``dead``: how many tags are, and which may be. ``pairs``: what the models were
+    fitted to.
     """
 
     models: tuple[DetectionModel, ...]
@@ -51,7 +53,7 @@ class RfidKnowledge:
     phase: PhaseFit | None
     share: float
     doubts: tuple[TagDoubt, ...]
-    silent: tuple[str, ...]
+    dead: DeadTags
     pairs: Pairs
     floor: Floor
 
@@ -89,7 +91,10 @@ def learn_rfid(
         return rig, None
     apart = [rounds_of(log, settings, merged=False) for log in logs]
     share = independent_share(apart, settings, survey, models, which, floor)
-    read = {name for one in rounds for name in one.names}
+    rig = tempered(rig, share**-0.5)
+    dead = dead_tags(logs, rounds, rig)
+    assert rig.rfid is not None
+    rig = rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"dead_tags": dead.share})})
     knowledge = RfidKnowledge(
         models,
         which,
@@ -99,11 +104,11 @@ def learn_rfid(
         phase,
         share,
         misplaced(rounds, settings, survey, models, which, floor),
-        tuple(dict.fromkeys(name for one in rounds for name in one.silent if name not in read)),
+        dead,
         pairs,
         floor,
     )
-    return tempered(rig, share**-0.5), knowledge
+    return rig, knowledge
 
 
 def _placed(

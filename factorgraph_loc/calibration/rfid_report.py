@@ -59,6 +59,14 @@ def tempering_text(found: RfidKnowledge, rig: Rig) -> str:
     )
 
 
+def dead_text(found: RfidKnowledge) -> str:
+    """How many tags are dead, in a sentence."""
+    return (
+        f"Of the tags of the maps {100.0 * found.dead.share:.1f} % are taken for dead before anything is heard of them; "
+        f"{len(found.dead.tags)} were never read, of which {len(found.dead.believed)} should have been."
+    )
+
+
 def rfid_document(found: RfidKnowledge) -> dict[str, Any]:
     """The same as plain values."""
     return {
@@ -86,5 +94,7 @@ def rfid_document(found: RfidKnowledge) -> dict[str, Any]:
         "phase_agreement": None if found.phase is None else [found.phase.before, found.phase.after],
         "independent_share": found.share,
         "misplaced_tags": [{"tag": d.name, "x": d.shift[0], "y": d.shift[1], "p": d.p} for d in found.doubts],
-        "silent_tags": list(found.silent),
+        "silent_tags": list(found.dead.tags),
+        "dead_share": found.dead.share,
+        "dead_tags": dict(found.dead.tags),
     }

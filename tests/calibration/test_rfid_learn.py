@@ -8,6 +8,7 @@ import pytest
 from factorgraph_loc.calibration import rfid_learn
 from factorgraph_loc.calibration.phase import PhaseFit
 from factorgraph_loc.calibration.rfid_choice import Kind
+from factorgraph_loc.calibration.rfid_dead import dead_tags
 from factorgraph_loc.calibration.rfid_fit import Floor, fit_logistic
 from factorgraph_loc.calibration.rfid_learn import learn_rfid
 from factorgraph_loc.calibration.rfid_mounting import SURVEY_PLACES, Place, alternated, moved, with_offsets
@@ -167,3 +168,19 @@ def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
         learn_rfid([log], log.rig, tmp_path / "cart")
     with pytest.raises(InputError, match=r"its rig says nothing of RFID"):
         learn_rfid([log], log.rig.model_copy(update={"rfid": None}), tmp_path / "cart")
+
+
+def test_the_share_of_dead_tags(read_tags):
+    """Six tags are struck off the log: they are named, and so is hardly another; the share is drawn to what is usual."""
+    log = read_tags(seconds=300.0)
+    rig = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"dead_tags": 0.03})})
+    counts = {name: list(log.streams["rfid"].epc).count(name) for name in log.world.tags}
+    gone = set(sorted(counts, key=lambda name: -counts[name])[:6])
+    stream = log.streams["rfid"]
+    silenced = replace(stream, epc=["" if epc in gone else epc for epc in stream.epc])
+    bare = replace(log, streams={**log.streams, "rfid": silenced})
+    found, sound = (dead_tags([one], [rounds_of(one, rig.rfid)], rig) for one in (bare, log))
+    assert set(found.believed) >= gone
+    assert len(found.believed) <= len(gone) + 1
+    assert found.share == pytest.approx((len(found.believed) + 0.6) / (len(log.world.tags) + 20.0), abs=0.01)
+    assert sound.share < 0.04
