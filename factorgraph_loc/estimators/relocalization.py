@@ -44,6 +44,7 @@ CLEAR_WEIGHT = 0.99
 # the largest standard deviations of a clear hypothesis: m (or that of a single range, where this is larger), rad
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
 CLEAR_SIGHTINGS = 4
+FOUND_HEADING = 0.3  # rad, of a heading where the position was known: there is no other place to take it for
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,8 @@ class Relocalizer:
         if _distance(pose, best.pose, best.covariance + covariance) > DIVERGED:
             return None
         position = max(CLEAR_POSITION, self._model.range_sigma)
-        if np.linalg.eigvalsh(covariance[:2, :2])[-1] > position**2 or covariance[2, 2] > CLEAR_HEADING**2:
+        heading = CLEAR_HEADING if self.start is None else FOUND_HEADING
+        if np.linalg.eigvalsh(covariance[:2, :2])[-1] > position**2 or covariance[2, 2] > heading**2:
             return None
         return PosePrior(window.now.t, pose, covariance)
 

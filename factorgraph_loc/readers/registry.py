@@ -31,7 +31,7 @@ READERS: dict[str, str] = {
 # what a reader gives where the format says nothing of the robot
 DEFAULT_RIG = Rig(
     name="default",
-    bearing_range=BearingRangeSettings(range_sigma=0.2, range_sigma_relative=0.05, bearing_sigma=0.05),
+    bearing_range=BearingRangeSettings(range_sigma=0.2, range_sigma_relative=0.1, bearing_sigma=0.05),
 )
 
 
