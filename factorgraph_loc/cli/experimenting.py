@@ -76,12 +76,14 @@ def run(
     except KeyboardInterrupt:
         show.note(f"stopped; what is done is in {prepared.folder}, the same command goes on")
         raise
+    show.warnings(done.warnings)
     for failure in done.failures[:SHOWN]:
         show.note(f"failed: {failure}")
     if len(done.failures) > SHOWN:
         show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
     if json:
-        show.document({"folder": str(prepared.folder), "runs": done.rows.to_dicts(), "failures": done.failures})
+        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
+        show.document({"folder": str(prepared.folder), **found})
     else:
         header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
         show.table(header, lines)

@@ -88,8 +88,7 @@ def run(
         result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
     write_plots(result, loaded, out)
-    for warning in result.warnings:
-        show.note(f"warning: {warning}")
+    show.warnings(result.warnings)
     if json:
         show.document(scores)
         return
@@ -135,10 +134,11 @@ def compare(
     configs = [RunConfig(name, settings[name], used, prior, seed, max_gap) for name in names for seed in chosen]
     with show.progress("runs", counted=True) as report:
         comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
+    show.warnings(comparison.warnings)
     for failure in comparison.failures:
         show.note(f"failed: {failure}")
     if json:
-        show.document({"runs": comparison.rows, "failures": comparison.failures})
+        show.document({"runs": comparison.rows, "failures": comparison.failures, "warnings": comparison.warnings})
     else:
         show.rich_table(comparison_table(comparison.rows))
         for line in verdict(comparison.rows):

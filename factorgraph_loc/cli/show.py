@@ -15,10 +15,20 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
+WARNINGS = 20  # that are printed
+
 
 def note(text: str) -> None:
     """A line for people, on stderr: where results are, what is doubtful."""
     typer.echo(text, err=True)
+
+
+def warnings(texts: Sequence[str]) -> None:
+    """What is doubtful, a line each on stderr; of very many the first, for all stand with the results."""
+    for one in texts[:WARNINGS]:
+        note(f"warning: {one}")
+    if len(texts) > WARNINGS:
+        note(f"warning: {len(texts) - WARNINGS} more stand with the results")
 
 
 def document(content: Any) -> None:

@@ -23,6 +23,7 @@ from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, RULE
+from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Integers, Trajectory
 from factors import se2
@@ -114,14 +115,14 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
     ``learnt.NAME.sigma`` are there for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
-    ``timing.*`` are always there.
+    ``timing.*`` are always there, as are ``warnings``, a list of texts.
     """
     causal = result.causal()
     final = result.final
     if causal is not None:
         final = _from(final, float(causal.t[0]))
     gap = result.max_gap
-    scores: dict[str, Any] = {"scoring.rule": RULE, "scoring.max_gap": gap}
+    scores: dict[str, Any] = {"scoring.rule": RULE, "scoring.max_gap": gap, WARNINGS: list(result.warnings)}
     for kind, trajectory in (("causal", causal), ("final", final)):
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:

@@ -20,6 +20,7 @@ from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.scoring import check_max_gap
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
+from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
 from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
@@ -35,10 +36,11 @@ _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "rep
 @dataclass(frozen=True)
 class Comparison:
     """What came out. ``rows``: one a run, all with the same keys: log, estimator, seed, status (ok, failed), reason, and the scalar
-    scores (None in a failed run). ``failures``: one line a failed run."""
+    scores (None in a failed run), and ``warnings``, a line each. ``failures``: one line a failed run; ``warnings``: each once."""
 
     rows: list[dict[str, Any]]
     failures: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ def compare(
         if tracks:
             plot_log(log, tracks, out / "plots", file_name(log.name))
     failed = [row for row in rows if row["status"] == "failed"]
-    return Comparison(rows, [f"{r['log']}, {r['estimator']}, seed {r['seed']}: {r['reason']}" for r in failed])
+    failures = [f"{r['log']}, {r['estimator']}, seed {r['seed']}: {r['reason']}" for r in failed]
+    return Comparison(rows, failures, lines(rows))
 
 
 def _execute(job: _Job) -> _Outcome:
@@ -183,14 +186,13 @@ def _folder(out: Path, log: str, config: RunConfig) -> Path:
 def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
     row: dict[str, Any] = {"log": job.log.name, "estimator": job.config.estimator, "seed": job.config.seed}
     if isinstance(outcome, _Outcome):
-        scalars = {k: v for k, v in outcome.scores.items() if not isinstance(v, list)}
-        return row | {"status": "ok", "reason": None} | scalars
+        return row | {"status": "ok", "reason": None} | row_of(outcome.scores)
     message = " ".join(str(outcome).split())
     if not isinstance(outcome, FglocError):
         message = f"{type(outcome).__name__}: {message}"
         job.folder.mkdir(parents=True, exist_ok=True)
         write_text(job.folder / _ERROR, "".join(traceback.format_exception(outcome)))
-    return row | {"status": "failed", "reason": message}
+    return row | {"status": "failed", "reason": message} | row_of({WARNINGS: list(job.log.warnings)})
 
 
 def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path) -> None:

@@ -11,6 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.execute import Outcome
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
 from factorgraph_loc.experiments.plan import PlannedRun, plan
@@ -50,10 +51,12 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Done:
-    """What came out: a row a run, see :func:`~factorgraph_loc.experiments.index.load_results`; a line for each failure."""
+    """What came out: a row a run, see :func:`~factorgraph_loc.experiments.index.load_results`; a line for each failure, and each
+    warning once."""
 
     rows: pl.DataFrame
     failures: list[str]
+    warnings: list[str]
 
 
 def prepare(
@@ -116,7 +119,8 @@ def run_experiment(
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key)
         rows = _write_rows(prepared, states)
-    return Done(rows, [_failure(row) for row in rows.iter_rows(named=True) if row["status"] == "failed"])
+    found = rows.to_dicts()
+    return Done(rows, [_failure(row) for row in found if row["status"] == "failed"], lines(found))
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:

@@ -10,13 +10,14 @@ from typing import Any
 import polars as pl
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files import replacing
 
 INDEX = "results.parquet"
 SWEEP = "sweep."
-TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key"}
+TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", WARNINGS}
 
 
 def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
@@ -46,8 +47,9 @@ def load_results(path: str | Path) -> pl.DataFrame:
 
     Columns: ``label``, ``log``, ``estimator``, ``sensors`` (with commas; null for those of the rig), ``prior``, ``seed``,
     ``sweep.KEY`` of each swept setting (null where it does not concern the run), ``status`` (ok, failed), ``kind`` (error, timeout,
-    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, and the scores of
-    :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). InputError if there are no results.
+    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, ``warnings`` (a line
+    each), and the scores of :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). InputError if there are no
+    results.
     """
     file = Path(path) / INDEX if Path(path).is_dir() else Path(path)
     try:

@@ -142,7 +142,7 @@ def run(
         learnt=estimator.learnt(),
         timings=loop.timings(final_seconds, prepared),
         versions=versions,
-        warnings=(
+        warnings=_once(
             *log.warnings,
             *unstated,
             *_doubts(log, sensors),
@@ -322,6 +322,11 @@ def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     if "odometry" not in sensors and "twist" not in sensors:
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
+
+
+def _once(*warnings: str) -> tuple[str, ...]:
+    """Those that are said twice only once."""
+    return tuple(dict.fromkeys(warnings))
 
 
 def _versions() -> dict[str, str]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.evaluation.warned import row_of
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
@@ -90,7 +91,8 @@ class Store:
         return content
 
     def row(self, key: str) -> dict[str, Any]:
-        """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, and the scalar scores of a run, timings among them."""
+        """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, the scalar scores of a run, timings among them, and its
+        ``warnings``, a line each."""
         if (self.path(key) / FAILURE).exists():
             failure = json.loads(self.read(key, FAILURE))
             row = {"status": "failed", "kind": failure["kind"], "reason": failure["reason"]}
@@ -98,7 +100,7 @@ class Store:
             row = {"status": "ok", "kind": None, "reason": None} | json.loads(self.read(key, METRICS))
         with suppress(InputError, ValueError):  # times are not worth a run
             row |= json.loads(self.read(key, TIMINGS))
-        return {name: value for name, value in row.items() if not isinstance(value, list)}
+        return row_of(row)
 
     def track(self, key: str) -> Track:
         """The causal and the final trajectory of a run, with covariances, times [s] from its first estimate."""

@@ -259,6 +259,40 @@ def test_where_estimates_lie_farther_apart_than_allowed_nothing_is_scored(fgloc,
     assert refused.stderr.strip() == "error: max_gap is 0, expected a time above 0 s"
 
 
+@pytest.fixture
+def doubtful_log(short_log, tmp_path):
+    """The log with a reference that ends after a quarter of it."""
+    shutil.copytree(short_log, tmp_path / "doubtful")
+    lines = (short_log / "reference.tum").read_text().splitlines(keepends=True)
+    (tmp_path / "doubtful/reference.tum").write_text("".join(lines[: len(lines) // 4]))
+    return tmp_path / "doubtful"
+
+
+DOUBT = "warning: short: scored over "
+
+
+def test_run_says_what_is_doubtful_and_stores_it(fgloc, doubtful_log, tmp_path):
+    result = fgloc("run", doubtful_log, "-e", "ekf", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    (told,) = [line for line in result.stderr.splitlines() if DOUBT in line]
+    stored = json.loads((tmp_path / "out/metrics.json").read_text())["warnings"]
+    assert f"warning: {stored[0]}" == told
+    assert len(stored) == 1
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_compare_says_what_is_doubtful_once_and_stores_it(fgloc, doubtful_log, tmp_path, jobs):
+    out = tmp_path / "out"
+    result = fgloc("compare", doubtful_log, "-e", "dead_reckoning,ekf", "-o", out, "--jobs", jobs)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.count(DOUBT) == 1
+    text = json.loads((out / "runs/short/ekf/seed0/metrics.json").read_text())["warnings"][0]
+    assert pl.read_csv(out / "results.csv")["warnings"].to_list() == [text, text]
+    assert (out / "report.html").read_text().count(text) == 1
+    again = fgloc("compare", doubtful_log, "-e", "ekf", "-o", tmp_path / "json", "--json")
+    assert json.loads(again.stdout)["warnings"] == [text]
+
+
 def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc, short_log, tmp_path):
     out = tmp_path / "out"
     result = fgloc("compare", short_log, "-e", "dead_reckoning,particle_filter", "-o", out, "--seeds", "0:2")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -49,6 +50,20 @@ def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     page = fgloc("experiment", "report", file)
     assert page.exit_code == 0, page.output
     assert "<html" in (tmp_path / "out" / "lags" / "report.html").read_text().lower()
+
+
+def test_warnings_are_told_once_and_stand_on_the_page(fgloc, file, tmp_path, short_log):
+    shutil.copytree(short_log, tmp_path / "doubtful")
+    lines = (short_log / "reference.tum").read_text().splitlines(keepends=True)
+    (tmp_path / "doubtful/reference.tum").write_text("".join(lines[: len(lines) // 4]))
+    file.write_text(TEXT.format(log=tmp_path / "doubtful"))
+    made = fgloc("experiment", "run", file, "--jobs", 2)
+    assert made.exit_code == 0, made.output
+    assert made.stderr.count("warning: ") == made.stderr.count("warning: short: scored over ") == 1
+    (text,) = set(pl.read_parquet(tmp_path / "out/lags/results.parquet")["warnings"].to_list())
+    assert json.loads(fgloc("experiment", "run", file, "--json").stdout)["warnings"] == [text]
+    fgloc("experiment", "report", file)
+    assert (tmp_path / "out/lags/report.html").read_text().count(text) == 1
 
 
 def test_a_failure_is_named_and_the_exit_code_is_1(fgloc, file, tmp_path):

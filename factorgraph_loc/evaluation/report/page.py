@@ -26,6 +26,7 @@ from factorgraph_loc.evaluation.report.reading import Reading, RunFiles, read_ru
 from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results, score
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
+from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files import write_text
 
 SHOWN = 8  # variants that are visible at first
@@ -90,6 +91,7 @@ class _Page:
             self._sweeps(),
             self._consistency(drawn),
             self._times(),
+            self._warnings(),
             self._failures(),
             self._repeat(experiment, versions or drawn.versions, drawn),
             self._method(),
@@ -254,6 +256,12 @@ class _Page:
         drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self._results, m)) is not None]
         figures = [self._figure(chart, m.title, "A dot is a log, the bar the median over logs.") for m, chart in drawn]
         return self._section("times", "Times", _note(note), tables.timing(self._results, found), *figures)
+
+    def _warnings(self) -> Html | str:
+        if not by_text(self._results.rows):
+            return ""
+        note = "What the runs say of logs, rigs and settings that may spoil the figures."
+        return self._section("warnings", "Warnings", _note(note), tables.warnings(self._results))
 
     def _failures(self) -> Html | str:
         count = sum(row["status"] != "ok" for row in self._results.rows)

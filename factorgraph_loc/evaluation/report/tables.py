@@ -12,6 +12,7 @@ from factorgraph_loc.evaluation.report.markup import Html, join, table, tag
 from factorgraph_loc.evaluation.report.metrics import Metric, number
 from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, label_of, score
 from factorgraph_loc.evaluation.tables import counted
+from factorgraph_loc.evaluation.warned import by_text
 
 TIMINGS = (
     "timing.update_ms_median",
@@ -93,9 +94,17 @@ def failures(results: Results) -> Html:
             for row in failed
             if (label_of(row), str(row.get("kind") or "error"), str(row.get("reason") or "")) == (label, kind, reason)
         ]
-        shown = "; ".join(where[:4]) + (f"; and {len(where) - 4} more" if len(where) > 4 else "")
-        rows.append([label, count, kind, tag("td", reason, class_="text"), tag("td", shown, class_="text")])
+        rows.append([label, count, kind, tag("td", reason, class_="text"), tag("td", _first(where), class_="text")])
     return table(["estimator", "runs", "kind", "reason", "where"], rows)
+
+
+def warnings(results: Results) -> Html:
+    """What is doubtful, and of which runs."""
+    rows = []
+    for text, concerned in by_text(results.rows).items():
+        where = dict.fromkeys(f"{row['log']}, {label_of(row)}" for row in concerned)
+        rows.append([tag("td", text, class_="text"), len(concerned), tag("td", _first(list(where)), class_="text")])
+    return table(["warning", "runs", "where"], rows)
 
 
 def uncertainty(metric: Metric, figure: Pooled) -> str:
@@ -154,6 +163,10 @@ def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float 
         lines.append(f"{len(known)} of {planned} runs")
     is_best = value == best
     return _cell(("● " if is_best else "") + metric.text(value), *lines, class_="best" if is_best else None)
+
+
+def _first(names: Sequence[str]) -> str:
+    return "; ".join(names[:4]) + (f"; and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _poses(runs: Sequence[Row]) -> Html:

@@ -1,0 +1,41 @@
+"""Warnings that concern results: kept with the scores of a run and in its row, and told once however many runs they concern."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, a line each; None without any)
+
+Row = Mapping[str, Any]
+
+
+def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """The scores of a run as cells of a row: lists are left out, but for the warnings, which become one text."""
+    cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
+    return cells | {WARNINGS: "\n".join(scores.get(WARNINGS) or ()) or None}
+
+
+def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The runs that each warning concerns, in the order in which warnings come."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        for text in (row.get(WARNINGS) or "").split("\n"):
+            if text:
+                found.setdefault(text, []).append(row)
+    return found
+
+
+def lines(rows: Sequence[Row]) -> list[str]:
+    """Each warning once; those that do not concern all that ran on their logs name the ones that they do."""
+    told = []
+    for text, concerned in by_text(rows).items():
+        logs = {row["log"] for row in concerned}
+        all_of_them = dict.fromkeys(_label(row) for row in rows if row["log"] in logs)
+        some = dict.fromkeys(_label(row) for row in concerned)
+        told.append(text if len(some) == len(all_of_them) else f"{text} ({', '.join(some)})")
+    return told
+
+
+def _label(row: Row) -> str:
+    return str(row.get("label") or row["estimator"])
