@@ -49,7 +49,7 @@ _ACCURACY = (
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors at N stamps ``t`` (N,) of the reference; NaN where the trajectory has no pose.
+    """Errors at N stamps ``t`` (N,) of the reference, from the first pose to the last; NaN in gaps of the trajectory.
 
     ``poses`` and ``reference`` (N, 3): what is compared with what. ``difference`` (N, 3): estimate minus reference in x, y [m,
     world's frame] and heading [rad, wrapped]. ``position`` (N,): Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the

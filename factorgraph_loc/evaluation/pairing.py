@@ -28,10 +28,9 @@ _USUAL = 3.0  # times the usual distance in time: neighbours that far apart are 
 
 @dataclass(frozen=True)
 class Pairs:
-    """M estimates and true poses at the times ``t`` (M,), stamps of the reference.
+    """M estimates and true poses at the times ``t`` (M,), stamps of the reference from the first estimate to the last.
 
-    ``poses`` (M, 3) and ``covariances`` (M, 3, 3), if there are any: of the estimate, NaN before its first pose, after its last,
-    and in its gaps. ``truth`` (M, 3).
+    ``poses`` (M, 3) and ``covariances`` (M, 3, 3), if there are any: of the estimate, NaN in its gaps. ``truth`` (M, 3).
     """
 
     t: Array
@@ -53,10 +52,10 @@ def thinned(t: Array) -> Integers:
 def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Pairs:
     """The estimates at the reference's stamps, where the trajectory's neighbours lie at most ``max_gap`` [s] apart."""
     rows = thinned(reference.t)
-    t = reference.t[rows]
-    at = _within(t, trajectory.t)
+    at = _within(reference.t[rows], trajectory.t)
+    rows, at = rows[np.isfinite(at)], at[np.isfinite(at)]
     covariances = None if trajectory.covariances is None else trajectory.covariances_at(at, max_gap=max_gap)
-    return Pairs(t, trajectory.at(at, max_gap=max_gap), covariances, reference.poses[rows])
+    return Pairs(reference.t[rows], trajectory.at(at, max_gap=max_gap), covariances, reference.poses[rows])
 
 
 def pairs_in_space(
@@ -78,8 +77,8 @@ def pauses(t: Array) -> Integers:
 
 
 def _within(t: Array, stamps: Array) -> Array:
-    """Times ``t``, those that lie outside ``stamps`` by no more than the tolerance moved to its first or last."""
+    """Times ``t``, those that lie outside ``stamps`` by no more than the tolerance moved to its first or last, others made NaN."""
     if not len(stamps):
-        return t
+        return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])
-    return np.asarray(np.where(np.abs(clipped - t) <= TOLERANCE, clipped, t))
+    return np.asarray(np.where(np.abs(clipped - t) <= TOLERANCE, clipped, np.nan))

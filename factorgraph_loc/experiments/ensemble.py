@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.estimators.base import Status
 from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.evaluation.pairing import thinned
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -87,7 +88,10 @@ def series(trajectory: Trajectory, log: Log, max_gap: float = MAX_GAP) -> Series
     """The errors of a trajectory against the reference of its log, as :func:`~factorgraph_loc.evaluation.metrics.errors`."""
     assert log.reference is not None, "a log to score has a reference"
     e = errors(trajectory, log.reference, max_gap)
-    return Series(e.t, e.position, e.heading, e.nees)
+    t = log.reference.t[thinned(log.reference.t)]
+    columns = np.full((3, len(t)), np.nan)
+    columns[:, np.searchsorted(t, e.t)] = e.position, e.heading, e.nees
+    return Series(t, *columns)
 
 
 def stacked(runs: Sequence[Series]) -> Array:

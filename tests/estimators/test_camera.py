@@ -174,7 +174,8 @@ def test_a_robot_that_is_carried_elsewhere_goes_on_there(name, kind, log):
     assert len(lost) == 1
     assert 5.0 < lost[0] < 7.0
     assert position_errors(result, made)[result.t > lost[0] + 0.2].max() < 0.15
-    assert errors(result.final, made.reference).position[result.t < 4.9].max() < 0.1
+    final = errors(result.final, made.reference)
+    assert final.position[final.t < 4.9].max() < 0.1
 
 
 @pytest.mark.parametrize("name", CONFIGS)

@@ -89,9 +89,9 @@ def test_a_vague_start_is_told_by_the_map(drive):
     log = drive(3, seconds=20.0)
     result = estimated(elsewhere(log, 3.0))
     assert [text for _, text in result.diagnostics.events] == ["camera: found its place in the map"]
-    after = result.causal().t > result.diagnostics.events[0][0]
-    assert errors(result.causal(), log.reference).position[after].max() < 0.1
-    assert errors(result.final, log.reference).position[after].max() < 0.1
+    for trajectory in (result.causal(), result.final):
+        found = errors(trajectory, log.reference)
+        assert found.position[found.t > result.diagnostics.events[0][0]].max() < 0.1
 
 
 def test_without_a_map_points_come_into_the_state(drive):

@@ -42,13 +42,25 @@ def test_what_is_put_is_there_with_its_scores(store):
     assert store.state(KEY, thorough=True) == "ok"
     assert store.read(KEY, METRICS) == FILES[METRICS]
     row = store.row(KEY)
-    assert row == {"status": "ok", "kind": None, "reason": None, "causal.position_rmse": 0.5, "timing.run_seconds": 2.0}
+    assert row == {
+        "status": "ok",
+        "kind": None,
+        "reason": None,
+        "causal.position_rmse": 0.5,
+        "timing.run_seconds": 2.0,
+        "warnings": None,
+    }
 
 
 def test_a_failure_is_a_result_with_a_reason_and_can_be_replaced(store):
     store.put(KEY, {FAILURE: b'{"kind": "timeout", "reason": "it took more than 3 s"}'})
     assert store.state(KEY) == "failed"
-    assert store.row(KEY) == {"status": "failed", "kind": "timeout", "reason": "it took more than 3 s"}
+    assert store.row(KEY) == {
+        "status": "failed",
+        "kind": "timeout",
+        "reason": "it took more than 3 s",
+        "warnings": None,
+    }
     store.put(KEY, FILES)
     assert store.state(KEY) == "ok"
     assert not (store.path(KEY) / FAILURE).exists()
