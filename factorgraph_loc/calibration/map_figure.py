@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +35,34 @@ def tag_figure(log: str, made: MadeTags) -> Figure:
         axis.plot(*np.array(lost).T, "s", color=COLOURS[3], markersize=12, markerfacecolor="none", label="not located")
     for text in list(out.legends):
         text.remove()
+    legend(out, [axis])
+    return out
+
+
+def dropped_figure(
+    log: str,
+    places: Mapping[str, Array],
+    dead: Mapping[str, float],
+    poses: Array,
+    walls: Sequence[tuple[float, ...]] = (),
+) -> Figure:
+    """Tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
+    kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
+    everything = np.concatenate((np.array(list(places.values())), poses[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: dead tags of the map")
+    axis = axes[0, 0]
+    for x1, y1, x2, y2 in walls:
+        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
+    axis.plot(*kept.T, "+", color=COLOURS[0], markersize=9, label="kept", zorder=3)
+    for name in dead:
+        x, y = places[name]
+        axis.plot(x, y, "x", color=COLOURS[1], markersize=9, label="believed dead, dropped", zorder=4)
+        axis.annotate(name[-LABEL:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
     legend(out, [axis])
     return out
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.calibration.mapping import LandmarkMap
     from factorgraph_loc.calibration.point_mapping import PointReport
     from factorgraph_loc.calibration.tag_mapping import MadeTags
+    from factorgraph_loc.experiments.maps import DroppedTags
 
 MAPPERS = ("batch", "smoother", "ekf")  # as factorgraph_loc.experiments.maps has them
 HEADER = ("landmark", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
@@ -69,6 +70,10 @@ def map_(
         float | None,
         typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; else that of the antennas."),
     ] = None,
+    drop_dead: Annotated[
+        bool,
+        typer.Option("--drop-dead", help="Map nothing: write the log's map without the tags that are believed dead."),
+    ] = False,
     prior: Prior = None,
     set_: Settings = None,
     reader: Reader = None,
@@ -85,7 +90,7 @@ def map_(
     picture = maps.picture_beside(out, overwrite=overwrite)  # before anything is read
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     settings = parse_settings(set_ or (), [estimator])[estimator]
-    options = maps.MapOptions(of, estimator, settings, extend, poses, tag_height, prior)
+    options = maps.MapOptions(of, estimator, settings, extend, poses, tag_height, prior, drop_dead)
     made = maps.make_map(loaded, options, partial(show.progress, counted=False))
     made.write(out, overwrite=overwrite)
     for warning in made.warnings:
@@ -100,11 +105,14 @@ def map_(
     typer.echo(f"\nthe map is in {out}, a picture of it in {picture}")
 
 
-def _tell(found: LandmarkMap | MadeTags | PointReport) -> tuple[str, ...]:
+def _tell(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> tuple[str, ...]:
     """Print the table of what was found, where there is one, and return what there is to say of it."""
     from factorgraph_loc.calibration.mapping import LandmarkMap
     from factorgraph_loc.calibration.tag_mapping import MadeTags
+    from factorgraph_loc.experiments.maps import DroppedTags
 
+    if isinstance(found, DroppedTags):
+        return mapping_tags.tell_dropped(found)
     if isinstance(found, LandmarkMap):
         show.table(HEADER, _rows(found))
         typer.echo()
@@ -131,7 +139,7 @@ def _rows(made: LandmarkMap) -> list[tuple[str, ...]]:
     return rows
 
 
-def _document(found: LandmarkMap | MadeTags | PointReport) -> dict[str, Any]:
+def _document(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> dict[str, Any]:
     from factorgraph_loc.calibration.mapping import LandmarkMap
     from factorgraph_loc.calibration.tag_mapping import MadeTags
 

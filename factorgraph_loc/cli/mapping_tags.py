@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from factorgraph_loc.cli import show
 
 if TYPE_CHECKING:
     from factorgraph_loc.calibration.tag_mapping import MadeTags
+    from factorgraph_loc.experiments.maps import DroppedTags
 
 HEADER = ("tag", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 
@@ -43,6 +46,15 @@ def notes(made: MadeTags) -> list[str]:
             f"{len(chance)} tags that the map lacks were read so seldom that no place explains it better than chance"
         )
     return told + [f"not in the map: {name}, {why}" for name, why in others.items() if name not in chance]
+
+
+def tell_dropped(found: DroppedTags) -> tuple[str, ...]:
+    """Print the tags that are dropped, and return what there is to say of them."""
+    if found.dropped:
+        show.table(("dropped tag", "P(dead)"), [(name, f"{dead:.4f}") for name, dead in found.dropped.items()])
+        typer.echo()
+    count = len(found.dropped)
+    return (f"believed dead and not in the new map: {count} of {count + found.kept} tags",)
 
 
 def document(made: MadeTags) -> dict[str, Any]:

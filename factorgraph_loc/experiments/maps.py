@@ -24,6 +24,7 @@ from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log, StartPose
+from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.vision.frontend import with_features
 from factorgraph_loc.world import World, write_world
 from factors import se2
@@ -56,7 +57,8 @@ class MapOptions:
     ``of``: landmarks, tags or points; None: points where the log has images, landmarks where it has sightings of them, else tags.
     ``estimator`` and ``settings``: for landmarks. ``extend``: the log's map stays, what it lacks is added; not for points.
     ``poses``: of the robot, for tags and points: reference, or odometry, which estimates them too; None: the reference if there is
-    one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``prior``: see
+    one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: nothing is mapped, the
+    log's map is written without the tags that are believed dead. ``prior``: see
     :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
     """
 
@@ -67,6 +69,15 @@ class MapOptions:
     poses: str | None = None
     tag_height: float | None = None
     prior: str | None = None
+    drop_dead: bool = False
+
+
+@dataclass(frozen=True)
+class DroppedTags:
+    """An edit of a map: ``dropped`` tags with the probability that they are dead, and how many are ``kept``."""
+
+    dropped: Mapping[str, float]
+    kept: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +89,7 @@ class MadeMap:
 
     world: World
     frame: str
-    details: LandmarkMap | MadeTags | PointReport
+    details: LandmarkMap | MadeTags | PointReport | DroppedTags
     warnings: tuple[str, ...]
     draw: Callable[[], Figure]
 
@@ -105,6 +116,8 @@ def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silen
     fit together or the log, RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
+    if options.drop_dead:
+        return _without_dead(log, options, stages)
     what = _what(log, options)
     if what == "points":
         return _of_points(log, options, stages)
@@ -176,6 +189,23 @@ def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     if options.extend or (not along_reference and made.made.judged):
         frame = "that of the given map"
     return MadeMap(made.world, frame, made, log.warnings, partial(map_figure.tag_figure, log.name, made))
+
+
+def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+    """The map as it is, but for tags that were not read where the smoother says that they should have been."""
+    if options != MapOptions(drop_dead=True, prior=options.prior):
+        raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
+    if "rfid" not in log.streams or not log.world.tags:
+        raise InputError(f"{log.name}: has no reads, or no map of tags, expected both to find tags that are dead")
+    with stages("smoother") as report:
+        result = run(log, RunConfig("smoother", prior=options.prior), lambda share: report(share, 1.0))
+    dead = dict(sorted(result.diagnostics.dead_tags.items(), key=lambda row: -row[1]))
+    world = log.world.model_copy(update={"tags": {n: tag for n, tag in log.world.tags.items() if n not in dead}})
+    details = DroppedTags(dead, len(world.tags))
+    known = tag_map(log.world, log.rig.survey)
+    places = dict(zip(known.names, known.tags.points[:, :2], strict=True))
+    draw = partial(map_figure.dropped_figure, log.name, places, dead, result.final.poses, world.walls)
+    return MadeMap(world, "that of the given map", details, result.warnings, draw)
 
 
 def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:

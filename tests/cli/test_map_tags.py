@@ -57,6 +57,23 @@ def test_a_map_along_the_reference_can_be_used(fgloc, on_disk, room, tmp_path):
     assert errors[1] < max(2.0 * errors[0], 0.2)
 
 
+def test_dead_tags_are_dropped_and_named(fgloc, on_disk, room, tmp_path):
+    """A tag in the middle of the room that is in no read; the others stay as they were, and one that is far away too."""
+    x, y = room.reference.poses[len(room.reference) // 2, :2]
+    tags = {**room.world.tags, "silent": Tag(x=x, y=y, z=1.0), "far": Tag(x=60.0, y=0.0)}
+    folder, out = on_disk(world=room.world.model_copy(update={"tags": tags})), tmp_path / "new.world.toml"
+    result = fgloc("map", folder, "--drop-dead", "-o", out)
+    assert result.exit_code == 0, result.output
+    assert "silent" in result.stdout
+    assert "believed dead and not in the new map: 1 of 10 tags" in result.stdout
+    del tags["silent"]
+    assert read_world(out).tags == tags
+    assert (tmp_path / "new.map.png").exists()
+    refused = fgloc("map", folder, "--drop-dead", "--extend", "-o", tmp_path / "other.world.toml")
+    assert refused.exit_code == 2
+    assert "--drop-dead edits the log's map and maps nothing" in refused.stderr
+
+
 def test_from_odometry_the_map_is_brought_onto_the_given_one(fgloc, on_disk, room, tmp_path):
     result = fgloc("map", on_disk(), "--poses", "odometry", "-o", tmp_path / "a.world.toml", "--json")
     assert result.exit_code == 0, result.output
