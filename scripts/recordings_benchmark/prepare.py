@@ -78,8 +78,9 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
     landmarks: dict[str, Landmark] = {}
     streams: dict[str, Stream] = {}
     if "odom2diff" in tables:
-        t, right, left, _, track = tables["odom2diff"].T[:5]
-        streams["odometry"] = VelocityStream(t, (right + left) / 2.0, (right - left) / track)
+        # as libRSF's own factor takes them (OdometryFactor2DDifferential.h): left before right, and half of the track
+        t, left, right, _, half = tables["odom2diff"].T[:5]
+        streams["odometry"] = VelocityStream(t, (left + right) / 2.0, (right - left) / (2.0 * half))
     else:
         t, *velocity = tables["odom2"].T[:4]
         # a row tells the motion up to its stamp
