@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import read_text, write_text
+from factorgraph_loc.planar import on_floor, rotations_of
 from factors import se2
 from factors.se2 import Array
 
@@ -80,9 +81,11 @@ def averaged(covariances: Array, before: Integers, after: Integers, fraction: Ar
 def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
     """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
 
-    InputError names file and row of what is not so, and of a stamp that is not after the one before.
+    InputError names file and row of what is not so, and of a stamp that is not after the one before; and where poses rise by more
+    than :data:`factorgraph_loc.planar.MOST`.
     """
-    rows, t_ns, poses = read_tum_rows(Path(path))
+    rows, t_ns, table = read_tum_rows(Path(path))
+    poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), [])
     stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
     if len(stuck):
         i = int(stuck[0])
@@ -91,7 +94,8 @@ def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> T
 
 
 def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
-    """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds and planar poses (N, 3)."""
+    """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds, and (N, 7) x, y, z [m] and
+    the quaternion x, y, z, w."""
     rows: list[int] = []
     stamps: list[int] = []
     values: list[list[float]] = []
@@ -110,17 +114,11 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
         rows.append(row)
     if not rows:
         raise InputError(f"{path}: holds no poses, expected at least one row")
-    x, y, _, qx, qy, qz, qw = table = np.array(values).T
-    bad = np.flatnonzero(~np.all(np.isfinite(table), axis=0))
+    table = np.array(values)
+    bad = np.flatnonzero(~np.all(np.isfinite(table), axis=1))
     if len(bad):
         raise bad_field(path, "row", lines[rows[bad[0]] - 1].strip(), "8 finite numbers", row=rows[bad[0]])
-    length = np.sqrt(qx**2 + qy**2 + qz**2 + qw**2)
-    bad = np.flatnonzero(np.abs(length - 1.0) > 0.01)
-    if len(bad):
-        found = float(length[bad[0]])
-        raise bad_field(path, "length of qx qy qz qw", found, "1, a unit quaternion", row=rows[bad[0]])
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    return np.array(rows, dtype=np.int64), np.array(stamps, dtype=np.int64), np.column_stack((x, y, heading))
+    return np.array(rows, dtype=np.int64), np.array(stamps, dtype=np.int64), table
 
 
 def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:

@@ -87,7 +87,7 @@ BAD = {
     "nan": ("1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", ":2: row"),
     "infinite stamp": ("inf 0 0 0 0 0 0 1\n", ":1: row"),
     "huge stamp": ("1e30 0 0 0 0 0 0 1\n", ":1: row"),
-    "no rotation": ("1 0 0 0 0 0 0 0\n", ":1: length of qx qy qz qw is 0.0"),
+    "no rotation": ("1 0 0 0 0 0 0 0\n", ":1: length of the quaternion is 0.0"),
     "same stamp": ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: t is"),
     "going back": ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: t is"),
     "binary": (b"\xff\xfe\x00", "is not text in UTF-8"),

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import nearest
+from factorgraph_loc.planar import on_floor
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Stamper
 from factorgraph_loc.readers.bag_file import Bag, Stamped
-from factorgraph_loc.readers.bag_poses import check_rotations, seven
+from factorgraph_loc.readers.bag_poses import ReferenceTopic, check_rotations, seven
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.reprojection import FORWARD
@@ -42,6 +43,14 @@ class StaticFrames:
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
+    def known(self, source: str, frame: str, base: str) -> Array:
+        """The same; InputError where transforms do not join them."""
+        pose = self.pose(frame, base)
+        if pose is None:
+            there = ", ".join(sorted(self.parents)) or "none"
+            raise InputError(f"{source}: tf_static does not say where {frame} sits on {base}; frames: {there}")
+        return pose
+
     def _up(self, frame: str) -> dict[str, Array]:
         """The poses of ``frame`` in itself and in all frames above it, from near to far."""
         out = {frame: np.eye(4)}
@@ -63,11 +72,11 @@ class _Edge:
 
 
 class FrameReference:
-    """Gathers transforms, and makes of them the way of ``child`` through ``parent``."""
+    """Gathers transforms, and makes of them the way of the topic's ``child`` through its ``parent``."""
 
-    def __init__(self, bag: Bag, topic: str, parent: str, child: str, stamper: Stamper) -> None:
-        self._source = f"{bag.path} {topic}"
-        self._parent, self._child = plain(parent), plain(child)
+    def __init__(self, bag: Bag, topic: ReferenceTopic, stamper: Stamper) -> None:
+        self._source, self._turned = f"{bag.path} {topic.topic}", topic
+        self._parent, self._child = plain(topic.parent or ""), plain(topic.child or "")
         self._stamper = stamper
         self._edges: dict[str, _Edge] = {}
 
@@ -105,8 +114,8 @@ class FrameReference:
             pose[:, :3, :3], pose[:, :3, 3] = at.rotations, at.positions
             poses = pose @ fixed @ poses
         poses = before @ poses
-        heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-        return Trajectory(t, np.column_stack((poses[:, :2, 3], heading)), has_heading=has_heading)
+        flat = on_floor(self._source, poses[:, :3, 3], poses[:, :3, :3], warnings, self._turned)
+        return Trajectory(t, flat, has_heading=has_heading)
 
     def _chain(self, static: StaticFrames) -> list[str]:
         """The frames from the child up to, but without, the parent."""

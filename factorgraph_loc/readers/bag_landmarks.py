@@ -11,6 +11,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.log import BearingRangeStream, SightingStream
 from factorgraph_loc.markers import corner_names
+from factorgraph_loc.planar import Axes, Turned
 from factorgraph_loc.readers import checks, native, native_camera
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_fields import Fields, as_number, as_text, leaves
@@ -18,7 +19,6 @@ from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_frames import StaticFrames
 from factorgraph_loc.readers.bag_rows import Rows
 from factorgraph_loc.readers.tables import NAMES, Table
-from factors.reprojection import FORWARD
 from factors.se2 import Array
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
@@ -38,14 +38,15 @@ DETECTIONS: dict[str, tuple[str, str]] = {
 }
 
 
-class LandmarkTopic(FileModel):
+class LandmarkTopic(Turned):
     """``fields``: where a message has the landmark's name, and its range and bearing, or its place x, y, z in the sensor's frame;
     they are known for the usual detectors of markers. ``frame``: the sensor's, for tf_static to say where it sits; without it
-    ``axes`` tell how its axes stand on the robot: z forward (``optical``) or x forward (``body``)."""
+    ``axes`` tell how its axes stand: z forward (``optical``), x forward (``body``), or a list of them; and ``mounting`` how it is
+    turned on the robot."""
 
     topic: str
     fields: dict[LandmarkField, str] | None = None
-    axes: Literal["optical", "body"] = "optical"
+    axes: Axes = "optical"
     frame: str | None = None
     clock: Clock | None = None
 
@@ -105,15 +106,9 @@ class Landmarks:
             checks.require_finite(self._rows.source, self._rows.rows, axis, places[:, i])
         pose = np.eye(4)
         if self._options.frame is not None:
-            known = frames.pose(self._options.frame, base)
-            if known is None:
-                raise InputError(
-                    f"{self._rows.source}: tf_static does not say where {self._options.frame} sits on {base}; "
-                    f"frames: {', '.join(sorted(frames.parents)) or 'none'}"
-                )
-            pose = known
-        elif self._options.axes == "optical":
-            pose[:3, :3] = FORWARD
+            pose = frames.known(self._rows.source, self._options.frame, base)
+        else:
+            pose[:3, :3] = self._options.turned()
         x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
         return np.hypot(x, y), np.arctan2(y, x)
 

@@ -10,9 +10,11 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, nearest
 from factorgraph_loc.log import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.planar import Turned, about_z
 from factorgraph_loc.readers import checks, motions
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_file import Bag, Stamped
+from factorgraph_loc.readers.bag_frames import StaticFrames
 from factorgraph_loc.readers.bag_poses import POSES, Poses
 from factorgraph_loc.readers.bag_rows import Rows
 from factorgraph_loc.trajectory import Integers
@@ -34,7 +36,7 @@ class WheelSettings(FileModel):
     track: Annotated[float, Field(gt=0.0, le=20.0, description="m")]
 
 
-class OdometryTopic(FileModel):
+class OdometryTopic(Turned):
     """``use``: of odometry its ``pose``, as the motion between messages, or its ``twist``; of wheels their position or velocity by
     the same words. ``wheels`` are needed where the topic is of joints."""
 
@@ -44,10 +46,12 @@ class OdometryTopic(FileModel):
     clock: Clock | None = None
 
 
-class ImuTopic(FileModel):
-    """A topic of an IMU whose z axis points up: its turn rate about it."""
+class ImuTopic(Turned):
+    """A topic of an IMU: its turn rate about the robot's z axis. ``frame``: the IMU's, for tf_static to say how it sits; without it
+    ``axes`` and ``mounting`` do, else its z axis points up."""
 
     topic: str
+    frame: str | None = None
     clock: Clock | None = None
 
 
@@ -58,7 +62,7 @@ class PoseMotion:
     """Odometry from poses of its own frame: the motion from one to the next."""
 
     def __init__(self, bag: Bag, options: OdometryTopic) -> None:
-        self._poses = Poses(bag, options.topic)
+        self._poses = Poses(bag, options.topic, options)
         self.add = self._poses.add
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
@@ -138,14 +142,24 @@ class YawRates:
         topic = bag.topic(options.topic)
         if topic.type != IMU:
             raise InputError(f"{bag.path}: topic {topic.name} is of type {topic.type}, expected {IMU}")
-        self._rows = Rows(f"{bag.path} {options.topic}", 1)
+        if options.frame is not None and options.is_given():
+            raise InputError(f"{bag.path} {topic.name}: tf_static tells of the frame, expected no axes or mounting")
+        self._options = options
+        self._rows = Rows(f"{bag.path} {options.topic}", 3)
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        self._rows.append(item, t_ns, (item.message.angular_velocity.z,))
+        rate = item.message.angular_velocity
+        self._rows.append(item, t_ns, (rate.x, rate.y, rate.z))
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> YawRateStream:
-        t_ns, (w,) = finite_columns(self._rows, ("w",), warnings)
-        return YawRateStream(checks.seconds(t_ns, t0_ns), w)
+    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> YawRateStream:
+        """Turn rates about the robot's z axis; of the IMU's axes only those that are turned about then need be numbers."""
+        turned = self._options.turned()
+        if self._options.frame is not None:
+            turned = frames.known(self._rows.source, self._options.frame, base)[:3, :3]
+        rows, t_ns = self._rows.rows, self._rows.t_ns
+        w = about_z(self._rows.source, rows, self._rows.values, turned)
+        keep = checks.in_order(self._rows.source, rows, t_ns, warnings)
+        return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
 
 
 OdometryRows = PoseMotion | TwistMotion | WheelMotion
@@ -154,12 +168,15 @@ OdometryRows = PoseMotion | TwistMotion | WheelMotion
 def odometry(bag: Bag, options: OdometryTopic) -> OdometryRows:
     """What gathers the odometry of a topic, by the type of its messages."""
     kind = bag.topic(options.topic).type
+    poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
+    if options.is_given() and not poses:
+        raise InputError(f"{bag.path} {options.topic}: axes and mounting are for odometry that comes as poses")
     if kind == JOINTS:
         return WheelMotion(bag, options)
-    if kind in TWISTS or (kind == ODOMETRY and options.use == "twist"):
-        return TwistMotion(bag, options)
-    if kind in POSES:
+    if poses:
         return PoseMotion(bag, options)
+    if kind in TWISTS or kind == ODOMETRY:
+        return TwistMotion(bag, options)
     known = ", ".join(sorted({*POSES, *TWISTS, JOINTS}))
     raise InputError(f"{bag.path}: topic {options.topic} is of type {kind}, expected one of {known}")
 

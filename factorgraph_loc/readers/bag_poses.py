@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
 from factorgraph_loc.log import StartPose
+from factorgraph_loc.planar import AS_IT_IS, UNIT, Turned, on_floor, rotations_of
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_file import Bag, Stamped
@@ -26,10 +26,9 @@ POSES: dict[str, Callable[[Any], Any]] = {
     WITH_COVARIANCE: attrgetter("pose.pose"),
     "geometry_msgs/msg/TransformStamped": attrgetter("transform"),
 }
-UNIT = 0.01  # what the length of a quaternion may be off
 
 
-class ReferenceTopic(FileModel):
+class ReferenceTopic(Turned):
     """A topic of poses, or of tf, and then the frames: the robot is ``child`` in the world ``parent``. ``has_heading``: whether the
     heading means something."""
 
@@ -40,7 +39,7 @@ class ReferenceTopic(FileModel):
     clock: Clock | None = None
 
 
-class StartTopic(FileModel):
+class StartTopic(Turned):
     """A topic whose first pose is a known start, with its covariance."""
 
     topic: str
@@ -50,8 +49,9 @@ class StartTopic(FileModel):
 class Poses:
     """Gathers the poses of a topic; points are poses whose heading means nothing."""
 
-    def __init__(self, bag: Bag, name: str) -> None:
+    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
         topic = bag.topic(name)
+        self._turned = turned
         self._are_points = topic.type == POINT
         if topic.type not in POSES and not self._are_points:
             known = ", ".join(sorted({*POSES, POINT}))
@@ -73,7 +73,11 @@ class Poses:
     def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
         """Stamps (N,) and planar poses (N, 3), of equal stamps the last; InputError names the message of what is wrong."""
         rows, t_ns = self.rows.rows, self.rows.t_ns
-        poses = planar(self.rows.source, rows, self.rows.values)
+        values, turns = self.rows.values, None
+        check_rotations(self.rows.source, rows, values)
+        if not self._are_points:
+            turns = rotations_of(self.rows.source, rows, values[:, 3:])
+        poses = on_floor(self.rows.source, values[:, :3], turns, warnings, self._turned)
         keep = checks.in_order(self.rows.source, rows, t_ns, warnings)
         return t_ns[keep], poses[keep]
 
@@ -85,8 +89,9 @@ class Poses:
 class Start:
     """Gathers the first pose with covariance of a topic: where the robot is known to start."""
 
-    def __init__(self, bag: Bag, name: str) -> None:
+    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
         topic = bag.topic(name)
+        self._turned = turned
         if topic.type != WITH_COVARIANCE:
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
         self._source = f"{bag.path} {name}"
@@ -96,12 +101,15 @@ class Start:
         if self._found is None:
             self._found = (t_ns, item.message.pose)
 
-    def pose(self, t0_ns: int) -> StartPose:
+    def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
         """InputError if a variance of x, y or heading is not above zero."""
         assert self._found is not None
         t_ns, told = self._found
         first = np.ones(1, dtype=np.int64)
-        pose = planar(self._source, first, np.array([seven(told.pose)]))[0]
+        values = np.array([seven(told.pose)])
+        check_rotations(self._source, first, values)
+        turns = rotations_of(self._source, first, values[:, 3:])
+        pose = on_floor(self._source, values[:, :3], turns, warnings, self._turned)[0]
         variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
         for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
             if not 0.0 < variance < np.inf:
@@ -113,14 +121,6 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
     """x, y, z [m] and the quaternion x, y, z, w of a pose, or of a transform."""
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
-
-
-def planar(source: str, rows: Integers, table: Array) -> Array:
-    """Poses (N, 3) of positions and quaternions (N, 7), which are checked."""
-    check_rotations(source, rows, table)
-    qx, qy, qz, qw = table[:, 3:].T
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    return np.column_stack((table[:, :2], heading))
 
 
 def check_rotations(source: str, rows: Integers, table: Array) -> None:

@@ -176,7 +176,7 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)
     if "imu" in log.streams and "imu" not in log.rig.sensors:
-        if log.rig == readers.DEFAULT_RIG:
+        if log.rig is readers.DEFAULT_RIG:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
             warnings.append("the gyro is used only where sensors name imu: those of the rig do not")

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, ColumnMapping, read_mapped
+from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, ColumnMapping, Mapped, read_mapped
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import Log, Stream
+from factorgraph_loc.planar import Turned, about_z
 from factorgraph_loc.readers import native
 from factorgraph_loc.readers.mapped_poses import (
     OdometryFile,
@@ -26,20 +27,27 @@ from factorgraph_loc.readers.native_rfid import Rounds, read_rounds
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import NAMES, Table
 from factorgraph_loc.world import World
+from factors.se2 import Array
 
+RATES = ("wx", "wy", "wz")
 SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
-    "imu": (("t", "w"),),
+    "imu": (("t", "w"), ("t", *RATES)),
     "bearing_range": (("t", "landmark", "range"), ("t", "landmark", "bearing"), ("t", "landmark", "range", "bearing")),
     "camera": (("t", "file"),),
     "sightings": (("t", "landmark", "u", "v"),),
 }
-UNITS = {"w": RATE, "range": LENGTH, "bearing": ANGLE, "u": PURE, "v": PURE}
+UNITS = {"w": RATE, **dict.fromkeys(RATES, RATE), "range": LENGTH, "bearing": ANGLE, "u": PURE, "v": PURE}
 
 
 class SensorFile(ColumnMapping):
     """``clock_offset`` [s]: added to all stamps."""
 
     clock_offset: Offset = 0.0
+
+
+class ImuFile(SensorFile, Turned):
+    """``columns``: t and w, the turn rate about an axis that points up; or wx, wy and wz, about axes of which ``axes`` and
+    ``mounting`` say how they stand on the robot."""
 
 
 class ImageFile(SensorFile):
@@ -57,7 +65,7 @@ class Options(FileModel):
     several RFID readers by any names, in place of ``rfid``."""
 
     odometry: OdometryFile | None = None
-    imu: SensorFile | None = None
+    imu: ImuFile | None = None
     rfid: RfidFile | None = None
     readers: dict[str, RfidFile] = Field(default_factory=dict)
     inventories: InventoryFile | None = None
@@ -121,8 +129,20 @@ def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) ->
     numbers = {name: mapped.numbers(name, UNITS[name]) for name in mapped.fields if name in UNITS}
     if sensor == "bearing_range":
         numbers = {name: numbers.get(name, np.full(len(mapped.rows), np.nan)) for name in ("range", "bearing")}
+    if isinstance(mapping, ImuFile):
+        numbers = {"w": _about_z(mapped, mapping, numbers)}
     names = {name: texts_of(mapped, name) for name in mapped.fields if name in NAMES}
     return Table(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+
+
+def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Array:
+    if "w" not in numbers:
+        return about_z(mapped.path, mapped.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
+    if mapping.is_given():
+        raise InputError(
+            f"{mapped.path}: axes and mounting are for rates about three axes, expected columns wx, wy, wz"
+        )
+    return numbers["w"]
 
 
 def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | None:

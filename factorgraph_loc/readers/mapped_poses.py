@@ -11,8 +11,9 @@ from pydantic import Field
 from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, SPEED, ColumnMapping, Mapped, read_mapped
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import IncrementStream, VelocityStream
+from factorgraph_loc.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.readers import checks, motions
-from factorgraph_loc.readers.space_poses import headings_of, read_kitti
+from factorgraph_loc.readers.space_poses import read_kitti
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows
 from factors import se2
 from factors.se2 import Array
@@ -20,13 +21,13 @@ from factors.se2 import Array
 Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
 
 QUATERNION = ("qx", "qy", "qz", "qw")
-POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION))
+POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
 ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
 LEAST_AROUND = 300.0  # no robot turns by so many radians from one row to the next
 UNITS = {"v": SPEED, "w": RATE, "heading": ANGLE, "dtheta": ANGLE, **dict.fromkeys(QUATERNION, PURE)}
 
 
-class OdometryFile(ColumnMapping):
+class OdometryFile(ColumnMapping, Turned):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
     quaternion (poses, of which only the motion between them counts); left, right (ways of the wheels, with their ``track``).
     ``clock_offset`` [s]: added to all stamps."""
@@ -35,7 +36,7 @@ class OdometryFile(ColumnMapping):
     clock_offset: Offset = 0.0
 
 
-class ReferenceFile(ColumnMapping):
+class ReferenceFile(ColumnMapping, Turned):
     """Where the robot really was. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
 
     format: Literal["columns", "tum", "kitti"] = "columns"
@@ -65,7 +66,7 @@ def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tup
         left, right = motions.between_ways(path, t_ns, ways, scales, warnings).T
         arc, turn = (left + right) / 2.0, (right - left) / options.track
         return t_ns, _after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
-    poses = _planar(path, mapped.rows[keep], kept)
+    poses = _planar(path, mapped.rows[keep], kept, options, warnings)
     return t_ns, _after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
 
 
@@ -84,18 +85,22 @@ def read_reference(
         raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
     shift = round(options.clock_offset * 1e9)
     if options.format == "tum":
-        rows, t_ns, poses = read_tum_rows(path)
+        rows, t_ns, table = read_tum_rows(path)
+        poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), warnings, options)
         t_ns = t_ns + shift
     elif times is not None:
         rows, t_ns, space = read_kitti(path, times)
-        t_ns, poses = t_ns + shift, space.planar().poses
+        known = (
+            options if options.axes else Turned(axes="body", mounting=options.mounting)
+        )  # the format says how they stand
+        t_ns, poses = t_ns + shift, on_floor(path, space.positions, space.rotations, warnings, known)
     else:
         mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
         if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
             raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
         rows = mapped.rows
         t_ns, columns = _columns(mapped, options.clock_offset)
-        poses = _planar(path, rows, columns)
+        poses = _planar(path, rows, columns, options, warnings)
     keep = checks.in_order(path, rows, t_ns, warnings)
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
 
@@ -113,16 +118,19 @@ def _scale(options: OdometryFile, field: str) -> float:
     return LENGTH.get(unit, 1.0) if isinstance(unit, str) else float(unit)
 
 
-def _planar(path: Path, rows: Integers, columns: dict[str, Array]) -> Array:
+def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:
     if "qw" in columns:
-        heading = headings_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
-    else:
-        heading = columns.get("heading", np.zeros(len(rows)))
-        around = np.abs(np.diff(heading, prepend=heading[0]))
-        if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
-            i = degrees[0]
-            expected = 'radians; it seems to go around at 360: units.heading = "deg"'
-            raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
+        rotations = rotations_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
+        places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))
+        return on_floor(path, places, rotations, warnings, turned)
+    if turned.is_given():
+        raise InputError(f"{path}: axes and mounting are for poses with a quaternion, expected columns qx, qy, qz, qw")
+    heading = columns.get("heading", np.zeros(len(rows)))
+    around = np.abs(np.diff(heading, prepend=heading[0]))
+    if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
+        i = degrees[0]
+        expected = 'radians; it seems to go around at 360: units.heading = "deg"'
+        raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
 
 

@@ -29,6 +29,7 @@ from factorgraph_loc.log import (
     VelocityStream,
     YawRateStream,
 )
+from factorgraph_loc.planar import on_floor, rotations_of
 from factorgraph_loc.points import POINTS_SUFFIX
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.manifests import StartSettings
@@ -199,7 +200,8 @@ def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRang
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
     if not path.is_file():
         return None
-    rows, t_ns, poses = read_tum_rows(inside(path.parent, path.name, path.parent))
+    rows, t_ns, table = read_tum_rows(inside(path.parent, path.name, path.parent))
+    poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), warnings)
     keep = checks.in_order(path, rows, t_ns, warnings)
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
 

@@ -120,7 +120,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     t0_ns = int(t_ns[0])
     streams: dict[str, Stream] = {"odometry": moved}
     if gathered.imu:
-        streams["imu"] = gathered.imu.stream(t0_ns, warnings)
+        streams["imu"] = gathered.imu.stream(frames, options.base_frame, t0_ns, warnings)
     if gathered.rfid:
         streams["rfid"] = gathered.rfid.rounds(warnings).stream(t0_ns)
     if gathered.bearing_range:
@@ -138,7 +138,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         world=World(name=name),
         streams=streams,
         reference=_reference(gathered, options, frames, t0_ns, warnings),
-        start=gathered.start.pose(t0_ns) if gathered.start else None,
+        start=gathered.start.pose(t0_ns, warnings) if gathered.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={"clock": clock} | ({"robot": "; ".join(notes)} if notes else {}),
@@ -171,14 +171,14 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
         topic = options.reference
         stamper = listeners.stamper(topic.topic, topic.clock)
         if bag.topic(topic.topic).type not in TF:
-            out.reference = Poses(bag, topic.topic)
+            out.reference = Poses(bag, topic.topic, topic)
         elif topic.parent is None or topic.child is None:
             raise InputError(f"{bag.path} {topic.topic}: reference.parent and reference.child are missing: two frames")
         else:
-            out.reference = FrameReference(bag, topic.topic, topic.parent, topic.child, stamper)
+            out.reference = FrameReference(bag, topic, stamper)
         listeners.add(topic.topic, out.reference, stamper)
     if options.start:
-        out.start = Start(bag, options.start.topic)
+        out.start = Start(bag, options.start.topic, options.start)
         listeners.add(options.start.topic, out.start, listeners.stamper(options.start.topic, options.start.clock))
     return out
 

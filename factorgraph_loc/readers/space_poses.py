@@ -9,37 +9,19 @@ from typing import Literal
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
-from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.column_mapping import PURE, ColumnMapping, read_mapped
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.planar import rotations_of
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns
 from factorgraph_loc.readers.tables import Table
 from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors import reprojection
-from factors.se2 import Array
 
-UNIT = 0.01  # what the length of a quaternion may be off
 ORTHONORMAL = 2e-3  # and a rotation matrix: KITTI's have seven digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
-
-
-def rotations_of(path: Path, rows: Integers, quaternions: Array) -> Array:
-    """Rotations (N, 3, 3) of quaternions (N, 4) as x, y, z, w; InputError at one that is no unit quaternion."""
-    length = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(~(np.abs(length - 1.0) <= UNIT))
-    if len(bad):
-        i = int(bad[0])
-        raise bad_field(path, "length of the quaternion", float(length[i]), "1", row=int(rows[i]))
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
-
-
-def headings_of(path: Path, rows: Integers, quaternions: Array) -> Array:
-    """Where the first axis points, seen from above (N,) [rad]."""
-    rotations = rotations_of(path, rows, quaternions)
-    return np.asarray(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
 
 
 def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:

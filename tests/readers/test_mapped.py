@@ -195,6 +195,37 @@ def test_ticks_of_two_wheels_are_metres_by_a_factor(hall, with_options, one):
     np.testing.assert_allclose(odometry.dtheta, (0.0, 0.0, np.pi / 2))
 
 
+def test_a_gyro_by_its_three_axes(hall, with_options, one, refused):
+    (hall.parent / "run" / "gyro.csv").write_text("t,a,b,c\n1,10,20,90\n2,0,30,0\n")
+    options = f"""{WHEELS}
+[options.imu]
+file = "gyro.csv"
+columns = {{ t = "t", wx = "a", wy = "b", wz = "c" }}
+units = {{ t = "s", wx = "deg/s", wy = "deg/s", wz = "deg/s" }}
+"""
+    np.testing.assert_allclose(np.degrees(one(with_options(options)).streams["imu"].w), (90.0, 0.0))
+    down = one(with_options(options + 'axes = "x -z y"\n'))
+    np.testing.assert_allclose(np.degrees(down.streams["imu"].w), (20.0, 30.0))
+    one_axis = options.replace('wx = "a", wy = "b", wz = "c"', 'w = "c"').replace('wx = "deg/s", wy = "deg/s", wz', "w")
+    refused(with_options(one_axis + 'axes = "optical"\n'), "axes and mounting are for rates about three axes")
+
+
+def test_a_reference_in_space_by_mapping(hall, with_options, one, refused):
+    rows = "1,0,-9,0,0,0,0,1\n2,1,-4,2,0,0,0,1\n3,2,-1,4,0,0,0,1\n"
+    (hall.parent / "run" / "space.csv").write_text("t,x,y,z,qx,qy,qz,qw\n" + rows)
+    names = ", ".join(f'{name} = "{name}"' for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw"))
+    options = f"""{WHEELS}
+[options.reference]
+file = "space.csv"
+columns = {{ {names} }}
+units = {{ t = "s" }}
+"""
+    refused(with_options(options), "space.csv: poses rise by 4.0 m, expected a robot on a floor")
+    log = one(with_options(options + 'axes = "optical"\n'))
+    np.testing.assert_allclose(log.reference.poses, [(0, 0, 0), (2, -1, 0), (4, -2, 0)], atol=1e-12)
+    assert any("poses rise by 8.00 m" in warning for warning in log.warnings)
+
+
 def test_other_sensors_by_mapping(hall, with_options, one):
     folder = hall.parent / "run"
     (folder / "gyro.csv").write_text("t,z\n1,90\n2,0\n")

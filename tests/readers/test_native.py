@@ -292,7 +292,11 @@ def logs(draw: st.DrawFn) -> Log:
     poses = np.column_stack([column(len(t_reference), st.floats(-3, 3)) for _ in range(3)])
     return Log(
         name=draw(names),
-        rig=Rig(imu=ImuSettings(bias=0.01), bearing_range=BearingRangeSettings(range_sigma=0.2)),
+        rig=Rig(
+            sensors=("odometry", "imu", "bearing_range"),
+            imu=ImuSettings(bias=0.01),
+            bearing_range=BearingRangeSettings(range_sigma=0.2),
+        ),
         world=World(landmarks={name: Landmark(x=draw(finite), y=draw(finite)) for name in landmarks}),
         streams={
             "odometry": odometry,

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
+from scipy.spatial.transform import Rotation
 
 from factors import se2
 from factors.reprojection import mounting
@@ -173,17 +174,104 @@ def test_wheels_that_tell_their_speed_alone(maker, refuse):
     refuse(maker, "/joints:1: has 0 numbers of position for 2 joints", "odometry.use", odometry=options)
 
 
-def test_the_gyro(maker, read):
-    for i in range(COUNT):
+def add_imu(maker, rates):
+    """A message of an IMU for each of ``rates`` (N, 3)."""
+    for i, (x, y, z) in enumerate(rates):
         t = T0 + 100 * MS * i
-        vectors = [maker.make("geometry_msgs/msg/Vector3", x=7.0, y=8.0, z=0.1 * i) for _ in range(2)]
+        vectors = [maker.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for _ in range(2)]
         turn = maker.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
         spread = {
             f"{name}_covariance": np.zeros(9) for name in ("orientation", "angular_velocity", "linear_acceleration")
         }
         told = {"orientation": turn, "angular_velocity": vectors[0], "linear_acceleration": vectors[1]}
         maker.write("/imu", t, "sensor_msgs/msg/Imu", header=maker.header(t), **told, **spread)
-    np.testing.assert_allclose(read(maker, imu={"topic": "/imu"}).streams["imu"].w, 0.1 * np.arange(COUNT))
+
+
+def test_the_gyro(maker, read):
+    add_imu(maker, [(math.nan, 8.0, 0.1 * i) for i in range(COUNT)])
+    log = read(maker, imu={"topic": "/imu"})
+    np.testing.assert_allclose(log.streams["imu"].w, 0.1 * np.arange(COUNT))
+    assert "imu" in log.rig.sensors
+
+
+@pytest.mark.parametrize(
+    ("options", "axis"),
+    [
+        ({"axes": "optical"}, (0.0, -1.0, 0.0)),  # y points down
+        ({"axes": "y z x"}, (1.0, 0.0, 0.0)),
+        ({"mounting": {"roll": math.pi}}, (0.0, 0.0, -1.0)),  # upside down
+        ({"mounting": {"roll": 0.3}}, (0.0, math.sin(0.3), math.cos(0.3))),
+        ({"mounting": {"pitch": 0.3}}, (-math.sin(0.3), 0.0, math.cos(0.3))),
+        ({"mounting": {"yaw": 1.0}}, (0.0, 0.0, 1.0)),
+        ({"frame": "imu_link"}, (0.0, 0.0, -1.0)),
+    ],
+)
+def test_a_gyro_that_is_mounted_otherwise(maker, read, options, axis):
+    add_frames(
+        maker, "/tf_static", T0, transform(maker, T0, "base_link", "imu_link", (0, 0, 0), quaternion=(1.0, 0, 0, 0))
+    )
+    rates = np.random.default_rng(0).normal(size=(COUNT, 3))
+    add_imu(maker, rates.tolist())
+    np.testing.assert_allclose(read(maker, imu={"topic": "/imu", **options}).streams["imu"].w, rates @ axis, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "fragments"),
+    [
+        ({"axes": "x y"}, ("imu.axes is 'x y'", "the three axes that point ahead, left and up")),
+        ({"axes": "y x z"}, ("right-handed",)),
+        ({"frame": "imu_link"}, ("tf_static does not say where imu_link sits on base_link",)),
+        ({"frame": "imu_link", "axes": "body"}, ("expected no axes or mounting",)),
+        ({"mounting": {"roll": 90.0}}, ("imu.mounting.roll is 90.0",)),
+    ],
+)
+def test_a_wrong_mounting(maker, refuse, options, fragments):
+    add_imu(maker, [(0.0, 0.0, 0.1)] * COUNT)
+    refuse(maker, *fragments, imu={"topic": "/imu", **options})
+
+
+def add_poses(maker, poses):
+    """Poses in space, of positions and quaternions (N, 7)."""
+    for i, (x, y, z, *q) in enumerate(poses):
+        pose = maker.make(
+            "geometry_msgs/msg/Pose",
+            position=maker.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=maker.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))),
+        )
+        t = T0 + 100 * MS * i
+        maker.write("/truth", t, "geometry_msgs/msg/PoseStamped", header=maker.header(t), pose=pose)
+
+
+@pytest.mark.parametrize(
+    ("rise", "tilt", "told"),
+    [
+        (0.2, 0.1, None),
+        (0.5, 0.1, "poses rise by 0.50 m, which is left out"),
+        (0.0, 0.5, "poses tilt by up to 29 degrees, which is left out"),
+        (2.0, 0.5, "poses rise by 2.00 m and tilt by up to 29 degrees"),
+        (92.0, 0.0, None),
+    ],
+)
+def test_poses_that_leave_the_floor(maker, read, refuse, rise, tilt, told):
+    q = (math.sin(tilt / 2.0), 0.0, 0.0, math.cos(tilt / 2.0))
+    add_poses(maker, [(0.1 * i, 0.0, 5.0 + rise * i / (COUNT - 1), *q) for i in range(COUNT)])
+    if rise > 3.0:
+        refuse(maker, "/truth: poses rise by 92.0 m, expected a robot on a floor", reference={"topic": "/truth"})
+        return
+    log = read(maker, reference={"topic": "/truth"})
+    warnings = [w for w in log.warnings if "/truth" in w and "poses" in w]
+    assert len(warnings) == (told is not None)
+    assert told is None or told in warnings[0]
+    np.testing.assert_allclose(log.reference.poses, [(0.1 * i, 0.0, 0.0) for i in range(COUNT)], atol=1e-12)
+
+
+def test_axes_and_mounting_of_poses(maker, read):
+    """A camera that looks to the left, in the frame of a camera: its z axis is ahead, and it goes along that frame's z."""
+    left = Rotation.from_euler("y", -90, degrees=True).as_quat()  # in optical axes y points down
+    add_poses(maker, [(-0.1 * i, -4.0 * i, 0.5 * i, *left) for i in range(COUNT)])
+    turned = {"axes": "optical", "mounting": {"yaw": math.pi / 2}}
+    reference = read(maker, reference={"topic": "/truth", **turned}).reference
+    np.testing.assert_allclose(reference.poses, [(0.5 * i, 0.1 * i, 0.0) for i in range(COUNT)], atol=1e-12)
 
 
 def test_images_without_loss(maker, read, one):
