@@ -6,9 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from factorgraph_loc.calibration import odometry, sightings
+from factorgraph_loc.calibration.constants import UNCERTAIN, Learnt, describe
 from factorgraph_loc.calibration.noise import NoiseFit, fit_noise
 from factorgraph_loc.calibration.rfid_choice import Kind
 from factorgraph_loc.calibration.rfid_learn import RfidKnowledge, learn_rfid
@@ -28,39 +27,9 @@ BETTER_KIND = (
     0.9  # ranges are taken to be of the other kind, distance or depth, if then their spread is below this share
 )
 ROUNDS = 2  # of constants and scatter in turn
-# the constants that an estimator can learn on each run, with the most that the rig takes
-UNCERTAIN: dict[str, dict[str, float]] = {
-    "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0),
-    "bearing_range": {"x": 10.0, "y": 10.0}
-    | dict.fromkeys(("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0),
-}
 EXTEROCEPTIVE = ("bearing_range", "rfid")  # what a robot knows its place by
-_FIRST_SIGMA = 0.1  # m, of a sensor of which nothing is known
-
-
-@dataclass(frozen=True)
-class Learnt:
-    """One constant.
-
-    ``gain``: what it is worth on data it was not fitted to, in nats; ``kept``: whether the rig has ``fitted``, or still
-    ``before``. ``error``: standard error of ``fitted``. ``per_log``: of each log alone, or of the halves of a single one.
-    ``uncertainty``: how much it differs between logs, None where that is not known or the rig has no place for it.
-    """
-
-    sensor: str
-    name: str
-    before: float
-    fitted: float
-    error: float
-    gain: float
-    kept: bool
-    why: str
-    per_log: tuple[float, ...]
-    uncertainty: float | None
-
-    @property
-    def value(self) -> float:
-        return self.fitted if self.kept else self.before
+RANGE_KIND = "bearing_range.range_kind"
+FIRST_SENSOR = BearingRangeSettings(range_sigma=0.1)  # of which nothing is known
 
 
 @dataclass(frozen=True)
@@ -68,7 +37,7 @@ class Knowledge:
     """What the logs say. ``rig`` has the scatter as noise; ``noise`` is None where the reference has no heading.
 
     ``windows``: of 2 s, by log; ``seen``: by log, none without landmarks; ``rfid``: None without reads of tags; ``notes``: what
-    could not be learnt, one line each.
+    could not be learnt, one line each. ``wheels`` and ``sensor``: the fits that the constants are chosen from.
     """
 
     rig: Rig
@@ -79,19 +48,49 @@ class Knowledge:
     correlations: tuple[Correlation, ...]
     notes: tuple[str, ...]
     rfid: RfidKnowledge | None = None
+    wheels: WheelsFit | None = None
+    sensor: SensorFit | None = None
 
 
-def learn(logs: Sequence[Log], rig: Rig, grids: Path | None = None, rfid_kind: Kind | None = None) -> Knowledge:
+@dataclass(frozen=True)
+class WheelsFit:
+    """All constants of the odometry fitted together, from ``start`` and with ``sigmas`` (3,) of the residuals; ``gain`` (P, K): see
+    :func:`~factorgraph_loc.calibration.robust.gains`; ``denied``: names of those that windows at rest deny."""
+
+    everything: Fit
+    gain: Array
+    denied: tuple[str, ...]
+    sigmas: Array
+    start: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """All constants of the landmark sensor fitted together to the sightings ``seen``; ``settings``: with these and their scatter,
+    of the kind of ranges that fits best. ``gain`` as of :class:`WheelsFit`."""
+
+    everything: Fit
+    gain: Array
+    settings: BearingRangeSettings
+    seen: tuple[Sightings, ...]
+
+
+def learn(
+    logs: Sequence[Log],
+    rig: Rig,
+    grids: Path | None = None,
+    rfid_kind: Kind | None = None,
+    *,
+    by_log: bool = True,
+) -> Knowledge:
     """The rig that ``logs`` tell, starting from ``rig``, whose values stay where a log cannot tell them better.
 
     ``grids`` and ``rfid_kind``: see :func:`~factorgraph_loc.calibration.rfid_learn.learn_rfid`; for logs with reads of tags.
-    Raises InputError if a log is too short.
+    ``by_log``: see :func:`settled`. Raises InputError if a log is too short.
     """
     logs = [replace(log, rig=rig) for log in logs]
-    notes = []
-    learnt: list[Learnt] = []
-    noise: NoiseFit | None = None
     windows: tuple[Windows, ...] = ()
+    wheels: WheelsFit | None = None
     if has_heading(logs[0]):
         windows = tuple(cut(log, odometry.WINDOW) for log in logs)
         for one in windows:
@@ -100,36 +99,70 @@ def learn(logs: Sequence[Log], rig: Rig, grids: Path | None = None, rfid_kind: K
                     f"{one.log.name}: odometry and reference overlap in {len(one.begin)} windows of {odometry.WINDOW:g} s, "
                     f"expected {MIN_WINDOWS} or more"
                 )
-        found, noise = _learn_odometry(windows, logs, rig)
+        wheels = _fit_wheels(windows, rig)
+    seen: tuple[Sightings, ...] = ()
+    sensor: SensorFit | None = None
+    if "bearing_range" in logs[0].streams:
+        seen = tuple(sightings_with(log) for log in logs)
+        sensor = _fit_sightings(seen, rig.bearing_range or FIRST_SENSOR)
+    learnt, rfid = rig, None
+    if "rfid" in logs[0].streams:
+        if grids is None:
+            raise ValueError("logs with reads of tags need a place for grids")
+        learnt, rfid = learn_rfid(logs, rig, grids, rfid_kind)
+    knowledge = Knowledge(learnt, (), None, windows, seen, (), (), rfid, wheels, sensor)
+    return settled(knowledge, logs, rig, by_log=by_log)
+
+
+def settled(
+    knowledge: Knowledge,
+    logs: Sequence[Log],
+    rig: Rig,
+    accepted: Collection[str] | None = None,
+    *,
+    by_log: bool = True,
+) -> Knowledge:
+    """What is learnt of wheels and landmark sensor with those constants alone that are worth it and ``accepted``, by their names
+    with the sensor's; None: all that are worth it.
+
+    What depends on the constants, noise, scatter and uncertainty, is learnt for these. ``rig``: that with which ``logs`` came.
+    Unless ``by_log``, no log is looked at alone: then there are neither uncertainties nor correlations.
+    """
+    logs = [replace(log, rig=rig) for log in logs]
+    notes = []
+    learnt: list[Learnt] = []
+    noise: NoiseFit | None = None
+    out = knowledge.rig.model_copy(update={"odometry": rig.odometry, "bearing_range": rig.bearing_range})
+    if knowledge.wheels is not None:
+        found, noise = _settle_wheels(knowledge.wheels, knowledge.windows, logs, rig, accepted, by_log=by_log)
         learnt += found
-        rig = _with_odometry(rig, found, noise)
+        out = _with_odometry(out, found, noise)
     else:
         notes.append(
             "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
         )
-    seen: tuple[Sightings, ...] = ()
     correlations: tuple[Correlation, ...] = ()
-    if "bearing_range" in logs[0].streams:
-        seen = tuple(sightings_with(log) for log in logs)
-        found, sensor = _learn_sensor(seen, rig)
+    if knowledge.sensor is not None:
+        found, sensor = _settle_sightings(knowledge.sensor, rig.bearing_range or FIRST_SENSOR, accepted, by_log=by_log)
         learnt += found
         if rig.bearing_range is not None and sensor.range_kind != rig.bearing_range.range_kind:
             notes.append(
                 f"The ranges fit better as the {sensor.range_kind} than as the {rig.bearing_range.range_kind}."
             )
-        rig = rig.model_copy(update={"bearing_range": sensor})
-        correlations = tuple(sightings.correlation(one, sensor) for one in seen)
-    rfid: RfidKnowledge | None = None
-    if "rfid" in logs[0].streams:
-        if grids is None:
-            raise ValueError("logs with reads of tags need a place for grids")
-        rig, rfid = learn_rfid(logs, rig, grids, rfid_kind)
-    rig = sensing(_uncertainties(rig, learnt), logs[0])
+        out = out.model_copy(update={"bearing_range": sensor})
+        correlations = tuple(sightings.correlation(one, sensor) for one in knowledge.seen if by_log)
     if len(logs) == 1:
         notes.append(
             "One log cannot tell what differs between runs: the uncertainties of constants are those of the input rig."
         )
-    return Knowledge(rig, tuple(learnt), noise, windows, seen, correlations, tuple(notes), rfid)
+    return replace(
+        knowledge,
+        rig=sensing(_uncertainties(out, learnt), logs[0]),
+        constants=tuple(learnt),
+        noise=noise,
+        correlations=correlations,
+        notes=tuple(notes),
+    )
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
@@ -150,7 +183,7 @@ def sightings_with(log: Log) -> Sightings:
     return seen
 
 
-def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -> tuple[list[Learnt], NoiseFit]:
+def _fit_wheels(windows: Sequence[Windows], rig: Rig) -> WheelsFit:
     constants = odometry.constants_of(windows[0], rig.odometry)
     model = rig.odometry_model()
     start = {c.name: c.neutral for c in constants}
@@ -161,7 +194,20 @@ def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -
         start = everything.as_dict()
     denied = odometry.denied_at_rest(everything, windows)
     gain = gains(everything, folds([one.begin for one in windows], BLOCKS), denied)
-    kept = [c for c, g in zip(constants, gain, strict=True) if is_worth(g)]
+    return WheelsFit(everything, gain, denied, sigmas, start)
+
+
+def _settle_wheels(
+    wheels: WheelsFit,
+    windows: Sequence[Windows],
+    logs: Sequence[Log],
+    rig: Rig,
+    accepted: Collection[str] | None,
+    *,
+    by_log: bool,
+) -> tuple[list[Learnt], NoiseFit]:
+    model, constants, sigmas, start = rig.odometry_model(), wheels.everything.constants, wheels.sigmas, wheels.start
+    kept = _kept("odometry", constants, wheels.gain, accepted)
     pooled = odometry.fit_odometry(windows, model, kept, sigmas, start) if kept else None
     model = odometry.with_constants(model, pooled.as_dict() if pooled else {})
     apart = _apart("odometry", constants, start, kept)
@@ -169,13 +215,13 @@ def _learn_odometry(windows: Sequence[Windows], logs: Sequence[Log], rig: Rig) -
     alone = [
         {n: v for some in apart for n, v in odometry.fit_odometry([one], model, some, sigmas, start).as_dict().items()}
         for one in parts
+        if by_log
     ]
-    learnt = _describe("odometry", everything, pooled, alone, gain, len(logs), denied)
+    learnt = describe("odometry", wheels.everything, pooled, alone, wheels.gain, len(logs), wheels.denied)
     return learnt, fit_noise(logs, model)
 
 
-def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], BearingRangeSettings]:
-    before = rig.bearing_range or BearingRangeSettings(range_sigma=_FIRST_SIGMA)
+def _fit_sightings(seen: Sequence[Sightings], before: BearingRangeSettings) -> SensorFit:
     seen = [one.thinned(MOST_SIGHTINGS) for one in seen]
     everything, settings = _fit_and_scatter(seen, before)
     if sightings.could_be_depths(seen):
@@ -183,10 +229,18 @@ def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], Be
         found, changed = _fit_and_scatter(seen, other)
         if sightings.range_spread(seen, changed) < BETTER_KIND * sightings.range_spread(seen, settings):
             everything, settings = found, changed
-    constants, start = everything.constants, everything.as_dict()
     gain = gains(everything, folds([one.t for one in seen], BLOCKS))
-    kept = [c for c, g in zip(constants, gain, strict=True) if is_worth(g)]
-    settings = settings.model_copy(update={c.name: c.neutral for c in constants})
+    return SensorFit(everything, gain, settings, tuple(seen))
+
+
+def _settle_sightings(
+    sensor: SensorFit, before: BearingRangeSettings, accepted: Collection[str] | None, *, by_log: bool
+) -> tuple[list[Learnt], BearingRangeSettings]:
+    seen, constants, start = sensor.seen, sensor.everything.constants, sensor.everything.as_dict()
+    kept = _kept("bearing_range", constants, sensor.gain, accepted)
+    settings = sensor.settings.model_copy(update={c.name: c.neutral for c in constants})
+    if accepted is not None and RANGE_KIND not in accepted:
+        settings = settings.model_copy(update={"range_kind": before.range_kind})
     pooled = sightings.fit_sensor(seen, settings, kept, start) if kept else None
     settings = settings.model_copy(update=pooled.as_dict() if pooled else {})
     apart = _apart("bearing_range", constants, start, kept)
@@ -194,9 +248,19 @@ def _learn_sensor(seen: Sequence[Sightings], rig: Rig) -> tuple[list[Learnt], Be
     alone = [
         {n: v for some in apart for n, v in sightings.fit_sensor([one], settings, some, start).as_dict().items()}
         for one in parts
+        if by_log
     ]
-    learnt = _describe("bearing_range", everything, pooled, alone, gain, len(seen))
+    learnt = describe("bearing_range", sensor.everything, pooled, alone, sensor.gain, len(seen))
     return learnt, sightings.with_scatter(seen, settings)
+
+
+def _kept(sensor: str, constants: Sequence[Constant], gain: Array, accepted: Collection[str] | None) -> list[Constant]:
+    """Those that predict better what they were not fitted to, and are ``accepted``."""
+    return [
+        c
+        for c, g in zip(constants, gain, strict=True)
+        if is_worth(g) and (accepted is None or f"{sensor}.{c.name}" in accepted)
+    ]
 
 
 def _fit_and_scatter(seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
@@ -221,59 +285,6 @@ def _apart(
     kept = list(kept)
     learnable = [c for c in constants if c.name in UNCERTAIN[sensor] and c.is_inside(found[c.name]) and c not in kept]
     return [some for some in ([*kept, *learnable] if learnable else [], kept) if some]
-
-
-def _describe(
-    sensor: str,
-    everything: Fit,
-    pooled: Fit | None,
-    alone: Sequence[Mapping[str, float]],
-    gain: Array,
-    logs: int,
-    denied: Collection[str] = (),
-) -> list[Learnt]:
-    """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one."""
-    values, errors = everything.as_dict(), everything.errors_as_dict()
-    kept = [] if pooled is None else [c.name for c in pooled.constants]
-    if pooled is not None:
-        values |= pooled.as_dict()
-        errors |= pooled.errors_as_dict()
-    out = []
-    for c, gained in zip(everything.constants, gain, strict=True):
-        parts = np.array([found[c.name] for found in alone if c.name in found])
-        value = values[c.name] if c.name in kept else c.neutral
-        spread = 0.0
-        if len(parts) > 1:  # about the mean that was fitted to them, or about a value that was not
-            spread = float(np.sqrt(np.sum((parts - value) ** 2) / (len(parts) - (c.name in kept))))
-        error = max(errors[c.name], spread / np.sqrt(len(parts)) if len(parts) and c.name in kept else 0.0)
-        uncertainty = None
-        if c.name in UNCERTAIN[sensor] and logs > 1:
-            uncertainty = max(spread, error) / (abs(value) if "scale" in c.name else 1.0)
-        out.append(
-            Learnt(
-                sensor,
-                c.name,
-                before=c.neutral,
-                fitted=values[c.name],
-                error=error,
-                gain=float(np.sum(gained)),
-                kept=c.name in kept,
-                why="not kept: windows in which the robot stood deny it"
-                if c.name in denied
-                else _why(c, values[c.name], gained),
-                per_log=tuple(parts.tolist()),
-                uncertainty=uncertainty,
-            )
-        )
-    return out
-
-
-def _why(constant: Constant, value: float, gain: Array) -> str:
-    if not constant.is_inside(value):
-        return f"not kept: the fit stopped at its bound {value:.3g}"
-    if is_worth(gain):
-        return "kept: it predicts data it was not fitted to better"
-    return "not kept: without it, data it was not fitted to are predicted as well or better"
 
 
 def _with_odometry(rig: Rig, learnt: Sequence[Learnt], noise: NoiseFit) -> Rig:

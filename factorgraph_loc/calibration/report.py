@@ -10,7 +10,9 @@ from typing import Any
 
 from factorgraph_loc.calibration import figures, rfid_figures, rfid_report
 from factorgraph_loc.calibration.calibrate import Calibration, Scores
-from factorgraph_loc.calibration.learn import Learnt
+from factorgraph_loc.calibration.constants import Learnt
+from factorgraph_loc.calibration.selection import MODEL, NOISE, SCATTER
+from factors.se2 import Array
 
 UNITS = {
     "speed_bias": "m/s",
@@ -52,6 +54,19 @@ def constants_table(constants: Sequence[Learnt]) -> Rows:
     return header, rows
 
 
+def judgements_table(calibration: Calibration) -> Rows:
+    """What the estimator says of each learnt parameter, on stretches that had no part in what was learnt: with it and without."""
+    figures_of = (f"{how} {name}" for name in FIGURES for how in ("new", "old"))
+    header = ("parameter", "judged", "gain", "standard error", *figures_of)
+    rows: list[tuple[str, ...]] = []
+    for one in calibration.judgements:
+        pairs = zip(one.new[0].tolist(), one.old[0].tolist(), [n for _, n in FIGURES.values()], strict=True)
+        figures = [number(value, digits) for new, old, digits in pairs for value in (new, old)]
+        verdict = "accepted" if one.accepted else "refused"
+        rows.append((_parameters(one.names), verdict, number(one.gain, 3), number(one.error, 3), *figures))
+    return header, rows
+
+
 def accuracy_table(calibration: Calibration) -> Rows:
     """The EKF on each log with the input rig, the new one, and one learnt from the other logs."""
     header = ("log", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
@@ -73,7 +88,7 @@ def rfid_tables(calibration: Calibration) -> list[Rows]:
     found = calibration.knowledge.rfid
     if found is None:
         return []
-    tables = [rfid_report.offsets_table(found), rfid_report.models_table(found)]
+    tables = [rfid_report.offsets_table(found), rfid_report.models_table(found, accepted=calibration.accepts(MODEL))]
     return [*tables, rfid_report.tags_table(found)] if found.doubts else tables
 
 
@@ -102,6 +117,18 @@ def document(calibration: Calibration) -> dict[str, Any]:
             }
             for c in calibration.knowledge.constants
         ],
+        "judged": [
+            {
+                "parameters": list(one.names),
+                "accepted": one.accepted,
+                "why": one.why,
+                "gain": one.gain,
+                "gain_error": one.error,
+                "new": _figures(one.new),
+                "old": _figures(one.old),
+            }
+            for one in calibration.judgements
+        ],
         "odometry_outliers": None if noise is None else noise.outliers,
         "odometry_widened": None if noise is None else noise.widened,
         "noise_factor": None if trial is None else trial.factor,
@@ -109,13 +136,24 @@ def document(calibration: Calibration) -> dict[str, Any]:
             log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
             for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=False)
         },
-        "rfid": None if rfid is None else rfid_report.rfid_document(rfid),
+        "rfid": None if rfid is None else rfid_report.rfid_document(rfid, accepted=calibration.accepts(MODEL)),
         "before": scores(calibration.before),
         "after": scores(calibration.after),
         "held_out": scores(calibration.held_out),
         "doubts": list(calibration.doubts),
         "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
     }
+
+
+def _parameters(names: Sequence[str]) -> str:
+    """Names of one section, which is said once."""
+    section = names[0].partition(".")[0]
+    return f"{section}." + ", ".join(name.removeprefix(f"{section}.") for name in names)
+
+
+def _figures(values: Array) -> dict[str, float]:
+    names = (figure for figure, _ in FIGURES.values())
+    return {f"{kind}.{name}": float(values[k, i]) for i, name in enumerate(names) for k, kind in enumerate(KINDS)}
 
 
 def page(calibration: Calibration) -> str:
@@ -128,13 +166,14 @@ def page(calibration: Calibration) -> str:
         "<h2>Constants</h2>",
         "<p>A constant is kept if it predicts data better that it was not fitted to: "
         + ("the other logs" if len(calibration.logs) > 1 else "another fifth of the log")
-        + ". Else the rig keeps the value of the input. "
+        + f", and if the {_estimator(calibration)} is better with it. Else the rig keeps the value of the input. "
         + ("<i>Each log alone</i> says how much it differs between runs." if len(calibration.logs) > 1 else "")
         + "</p>",
         _table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
         *_noise(calibration),
         *_rfid(calibration),
+        *_judgements(calibration),
         f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
         "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is too sure. "
         + (
@@ -191,6 +230,8 @@ def _noise(calibration: Calibration) -> list[str]:
     trial = calibration.consistency.trial if calibration.consistency else None
     out = []
     if noise is not None:
+        if not calibration.accepts(NOISE):
+            out.append("<p>The noise of the odometry below is refused: the rig has that of the input.</p>")
         rows = [
             (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
             for error, g in noise.growth.items()
@@ -204,10 +245,12 @@ def _noise(calibration: Calibration) -> list[str]:
     scatter, rig = calibration.knowledge.rig.bearing_range, calibration.rig.bearing_range
     if not calibration.knowledge.seen or scatter is None or rig is None:
         return out
+    if not calibration.accepts(SCATTER):
+        out.append("<p>The noise of the sightings is refused: the rig has that of the input.</p>")
     names = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
     rows = [(f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(rig, n))) for n, unit in names.items()]
     out.append(_table(("noise of the sightings", "scatter", "in the rig"), rows))
-    if trial is not None:
+    if trial is not None and calibration.accepts(SCATTER):
         out.append(
             f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
             f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
@@ -229,6 +272,19 @@ def _rfid(calibration: Calibration) -> list[str]:
         _image(rfid_figures.reliability_figure(found)),
         "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the model.</p>",
         _image(rfid_figures.field_figure(found)),
+    ]
+
+
+def _judgements(calibration: Calibration) -> list[str]:
+    if not calibration.judgements:
+        return []
+    whose = "the other logs" if len(set(calibration.logs)) > 1 else "the other parts of the log"
+    return [
+        "<h2>What pays</h2>",
+        f"<p>The {_estimator(calibration)} ran on stretches with what {whose} tell of each parameter (new), and without (old). The "
+        "rig has what makes its score, which holds errors and consistency, better by more nats a pose than chance would, and no "
+        "error larger by more than 2 %. What is refused has the value of the input rig.</p>",
+        _table(*judgements_table(calibration)),
     ]
 
 

@@ -59,12 +59,13 @@ class RfidKnowledge:
 
 
 def learn_rfid(
-    logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None
+    logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None, *, placed: bool = True
 ) -> tuple[Rig, RfidKnowledge | None]:
     """The rig with what ``logs`` tell about its RFID; ``grids``: path and beginning of the names of learnt grids.
 
     Logs that hold the same reads count once. With a ``kind`` the models are fitted in that way, and that is all: no choice, no
-    doubts, and None in place of the knowledge. InputError if the rig has no antennas or a log has too few rounds.
+    doubts, and None in place of the knowledge. Unless ``placed``, tags and antennas stay where
+    ``rig`` has them. InputError if the rig has no antennas or a log has too few rounds.
     """
     settings = rig.rfid
     if settings is None:
@@ -77,7 +78,10 @@ def learn_rfid(
     rounds = [rounds_of(log, settings) for log in logs]
     survey = _about_the_middle(rounds, rig.survey)
     facing = any(np.any(np.isfinite(one.tags.facing)) for one in rounds)
-    settings, survey, offsets, phase = _placed(logs, rounds, settings, survey, floor, facing=facing)
+    offsets: tuple[Offset, ...] = ()
+    phase: PhaseFit | None = None
+    if placed:
+        settings, survey, offsets, phase = _placed(logs, rounds, settings, survey, floor, facing=facing)
     pairs = pairs_of(rounds, settings, survey)
     names = tuple(settings.all_antennas())
     choice = None if kind is not None else choose(pairs, floor, len(names), facing=facing)

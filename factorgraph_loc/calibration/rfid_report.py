@@ -25,8 +25,9 @@ def offsets_table(found: RfidKnowledge) -> Rows:
     return header, rows
 
 
-def models_table(found: RfidKnowledge) -> Rows:
-    """The ways to model detection, by what they are worth on reads that had no part in the fit."""
+def models_table(found: RfidKnowledge, *, accepted: bool) -> Rows:
+    """The ways to model detection, by what they are worth on reads that had no part in the fit. ``accepted``: whether the rig has
+    the best."""
     header = ("model of detection", "smoothness", "held-out nats a round and tag", "worst fold", "")
     rows: list[tuple[str, ...]] = [
         (
@@ -34,7 +35,7 @@ def models_table(found: RfidKnowledge) -> Rows:
             f"{t.kind.smoothness:g}" if t.kind.smoothness else "-",
             f"{t.nll:.4f}",
             f"{max(t.by_fold):.4f}",
-            "in the rig" if t is found.choice.best else "",
+            "" if t is not found.choice.best else "in the rig" if accepted else "refused",
         )
         for t in found.choice.trials
     ]
@@ -67,8 +68,8 @@ def dead_text(found: RfidKnowledge) -> str:
     )
 
 
-def rfid_document(found: RfidKnowledge) -> dict[str, Any]:
-    """The same as plain values."""
+def rfid_document(found: RfidKnowledge, *, accepted: bool) -> dict[str, Any]:
+    """The same as plain values; ``accepted``: see :func:`models_table`."""
     return {
         "offsets": [
             {
@@ -87,7 +88,7 @@ def rfid_document(found: RfidKnowledge) -> dict[str, Any]:
                 "smoothness": t.kind.smoothness,
                 "held_out_nll": t.nll,
                 "by_fold": list(t.by_fold),
-                "kept": t is found.choice.best,
+                "kept": accepted and t is found.choice.best,
             }
             for t in found.choice.trials
         ],

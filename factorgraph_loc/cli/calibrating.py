@@ -55,5 +55,7 @@ def calibrate(
         for table in report.rfid_tables(found):
             show.table(*table)
             typer.echo()
+    show.table(*report.judgements_table(found))
+    typer.echo()
     show.table(*report.accuracy_table(found))
     typer.echo(f"\nthe rig is in {out}, the report in {page}")

@@ -38,6 +38,18 @@ def test_the_report_needs_no_other_file(calibrated):
     assert "heading_rate_bias" in page
 
 
+def test_what_the_estimator_accepts_and_what_it_refuses_is_listed_with_its_figures(calibrated):
+    _, report, result = calibrated
+    header, *rows = [
+        line.split() for line in result.stdout.splitlines() if line.startswith(("parameter", "odometry.noise"))
+    ]
+    assert {"judged", "gain"} <= set(header)
+    assert rows
+    assert rows[0][1] in {"accepted", "refused"}
+    assert float(rows[0][4]) > 0.0
+    assert "What pays" in report.read_text()
+
+
 def test_what_is_there_is_not_replaced_unasked(fgloc, short_log, calibrated):
     out, _, _ = calibrated
     before = out.read_bytes()
@@ -55,6 +67,8 @@ def test_json_is_one_document(fgloc, short_log, calibrated):
     assert found["files"] == {"rig": str(out), "report": str(report)}
     assert {c["name"] for c in found["constants"]} >= {"scale_distance", "heading_rate_bias", "range_scale"}
     assert found["after"]["short"]["causal.position_rmse"] > 0.0
+    assert {name for one in found["judged"] for name in one["parameters"]} >= {"odometry.noise"}
+    assert all({"accepted", "new", "old", "gain", "gain_error"} <= set(one) for one in found["judged"])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,96 @@
+"""What became of each constant that was fitted, and how well it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.calibration.robust import Constant, Fit, is_worth
+from factors.se2 import Array
+
+# the constants that an estimator can learn on each run, with the most that the rig takes
+UNCERTAIN: dict[str, dict[str, float]] = {
+    "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0),
+    "bearing_range": {"x": 10.0, "y": 10.0}
+    | dict.fromkeys(("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """One constant.
+
+    ``gain``: what it is worth on data it was not fitted to, in nats; ``kept``: whether the rig has ``fitted``, or still
+    ``before``. ``error``: standard error of ``fitted``. ``per_log``: of each log alone, or of the halves of a single one.
+    ``uncertainty``: how much it differs between logs, None where that is not known or the rig has no place for it.
+    """
+
+    sensor: str
+    name: str
+    before: float
+    fitted: float
+    error: float
+    gain: float
+    kept: bool
+    why: str
+    per_log: tuple[float, ...]
+    uncertainty: float | None
+
+    @property
+    def value(self) -> float:
+        return self.fitted if self.kept else self.before
+
+
+def describe(
+    sensor: str,
+    everything: Fit,
+    pooled: Fit | None,
+    alone: Sequence[Mapping[str, float]],
+    gain: Array,
+    logs: int,
+    denied: Collection[str] = (),
+) -> list[Learnt]:
+    """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one."""
+    values, errors = everything.as_dict(), everything.errors_as_dict()
+    kept = [] if pooled is None else [c.name for c in pooled.constants]
+    if pooled is not None:
+        values |= pooled.as_dict()
+        errors |= pooled.errors_as_dict()
+    out = []
+    for c, gained in zip(everything.constants, gain, strict=True):
+        parts = np.array([found[c.name] for found in alone if c.name in found])
+        value = values[c.name] if c.name in kept else c.neutral
+        spread = 0.0
+        if len(parts) > 1:  # about the mean that was fitted to them, or about a value that was not
+            spread = float(np.sqrt(np.sum((parts - value) ** 2) / (len(parts) - (c.name in kept))))
+        error = max(errors[c.name], spread / np.sqrt(len(parts)) if len(parts) and c.name in kept else 0.0)
+        uncertainty = None
+        if c.name in UNCERTAIN[sensor] and logs > 1:
+            uncertainty = max(spread, error) / (abs(value) if "scale" in c.name else 1.0)
+        out.append(
+            Learnt(
+                sensor,
+                c.name,
+                before=c.neutral,
+                fitted=values[c.name],
+                error=error,
+                gain=float(np.sum(gained)),
+                kept=c.name in kept,
+                why="not kept: windows in which the robot stood deny it"
+                if c.name in denied
+                else _why(c, values[c.name], gained),
+                per_log=tuple(parts.tolist()),
+                uncertainty=uncertainty,
+            )
+        )
+    return out
+
+
+def _why(constant: Constant, value: float, gain: Array) -> str:
+    if not constant.is_inside(value):
+        return f"not kept: the fit stopped at its bound {value:.3g}"
+    if is_worth(gain):
+        return "kept: it predicts data it was not fitted to better"
+    return "not kept: without it, data it was not fitted to are predicted as well or better"
