@@ -27,7 +27,7 @@ from factorgraph_loc.estimators.base import (
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files import nearest
-from factorgraph_loc.measurements import Exteroceptive, IncrementOdometry, Odometry, Tick
+from factorgraph_loc.measurements import TICK_RATE, Exteroceptive, IncrementOdometry, Odometry, Tick
 from factorgraph_loc.pushed import ALL_SENSORS, RfidRead, checked, numbers, scan_of, sensor_of
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory import Trajectory
@@ -55,8 +55,8 @@ class Localizer:
     nothing to close. Stamps are seconds by any clock that all sensors share; the offsets that the rig knows are added here. One
     lock guards the estimator: who pushes waits while another's measurement is taken in, so that nothing piles up.
 
-    The same measurements in the same order, and estimates pulled at the same times, give the same results. InputError if the
-    settings, sensors or ``history`` are wrong.
+    The same measurements in the same order give the same results, whatever is asked in between. InputError if the settings,
+    sensors or ``history`` are wrong.
     """
 
     def __init__(
@@ -100,6 +100,8 @@ class Localizer:
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected one")
+        if start is not None and not math.isnan(start.t):
+            new.initialize(start)
         with self._lock:
             self._begin_anew(new, start)
 
@@ -145,6 +147,8 @@ class Localizer:
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the newest stamp of all measurements, or at ``t`` if that is later still, where the odometry leads.
 
+        It changes nothing: what is measured before ``t`` will not be late.
+
         Before there is anything to tell it is ``unlocalized``, and not a number. RunFailedError if the estimator has failed.
         """
         with self._lock:
@@ -153,19 +157,21 @@ class Localizer:
     def belief(self) -> Belief:
         """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them."""
         with self._lock:
-            self._estimate(None)
-            return Belief(()) if self._estimator is None else copy.deepcopy(self._estimator.belief())
+            if self._estimator is None or not self._is_under_way(self._newest):
+                return Belief(())
+            return copy.deepcopy(self._estimator.belief(self._newest))
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of the past, with what came later, at the times that an estimate was pulled: of the last ``history``
-        seconds, or somewhat more."""
+        """The best estimate of the past, with what came later: ten times a second from the start to before the newest stamp, of the
+        last ``history`` seconds, or somewhat more."""
         with self._lock:
-            if self._estimator is None or not self._started:
+            if self._estimator is None or not self._ticks:
                 return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
-            return self._estimator.trajectory()
+            return copy.deepcopy(self._estimator.trajectory())
 
     def learnt(self) -> Learnt:
-        """What is estimated beside the pose: constants of the sensors, landmarks, points."""
+        """What is estimated beside the pose: constants of the sensors, landmarks, points; with what came later, as
+        :meth:`trajectory` has them, and in the time that this takes."""
         with self._lock:
             return Learnt() if self._estimator is None else copy.deepcopy(self._estimator.learnt())
 
@@ -177,7 +183,8 @@ class Localizer:
     def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None) -> None:
         self._estimator = estimator
         self._prior = prior  # its time is NaN until the first measurement tells it
-        self._started = False
+        self._start = None if prior is None or math.isnan(prior.t) else prior.t  # the time of the first tick
+        self._ticks = 0  # how many there were
         self._newest = self._newest_increment = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # nothing has changed since
 
@@ -194,16 +201,24 @@ class Localizer:
             return
         m = replace(m, t=m.t + self._rig.time_offset(sensor))
         self._check_stamp(m)
-        if self._prior is not None and math.isnan(self._prior.t):
-            self._prior = replace(self._prior, t=m.t)
+        if self._start is None:
+            self._start = m.t
+            if self._prior is not None:
+                self._prior = replace(self._prior, t=m.t)
+                estimator.initialize(self._prior)
         self._newest, self._last = max(self._newest, m.t), None
-        if isinstance(m, Odometry):
-            self._start_by(m.t, inclusive=False)
-        elif not self._start_by(m.t, inclusive=True):
+        self._pass_time(estimator, self._start, m.t)
+        if not isinstance(m, Odometry) and not self._is_under_way(m.t):
             estimator.diagnostics.ignore("before the start")
             return
         estimator.process(m)
         self._tidy(estimator)
+
+    def _pass_time(self, estimator: Estimator, start: float, t: float) -> None:
+        """Let the ticks of before ``t`` come, as in a run of a log: after all that was measured by then."""
+        while (tick := start + self._ticks / TICK_RATE) < t:
+            estimator.process(Tick(tick))
+            self._ticks += 1
 
     def _check_stamp(self, m: Odometry | Exteroceptive) -> None:
         where = f"{type(m).__name__} at {m.t:.3f} s"
@@ -219,15 +234,9 @@ class Localizer:
                 )
             self._newest_increment = m.t
 
-    def _start_by(self, t: float, *, inclusive: bool) -> bool:
-        """Whether the estimator has begun by ``t``: odometry of the very start comes before that."""
-        if not self._started and self._estimator is not None:
-            if self._prior is None:
-                self._started = True
-            elif t > self._prior.t or (inclusive and t == self._prior.t):
-                self._estimator.initialize(self._prior)
-                self._started = True
-        return self._started and (self._prior is None or t >= self._prior.t)
+    def _is_under_way(self, t: float) -> bool:
+        """Whether there is something to tell of ``t``: it is not before the start, nor before the first measurement."""
+        return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:
         if t is not None and not math.isfinite(t):
@@ -235,18 +244,15 @@ class Localizer:
         at = self._newest if t is None else max(self._newest, t)
         if self._last is not None and self._last.t == at:
             return copy.deepcopy(self._last)
-        if self._estimator is None or not math.isfinite(self._newest) or not self._start_by(at, inclusive=True):
+        if self._estimator is None or not math.isfinite(self._newest) or not self._is_under_way(at):
             return PoseEstimate(math.nan, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         if at > self._newest + AHEAD:
             raise InputError(
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected their clock"
             )
-        self._estimator.process(Tick(at))
-        self._newest = at
-        found = self._estimator.estimate()
+        found = self._estimator.estimate(at)
         if found.status != "unlocalized" and not np.all(np.isfinite(found.pose)):
             raise RunFailedError(f"{self._name}: the estimate at {at:.3f} s is not finite; initialize() it anew")
-        self._tidy(self._estimator)
         # the estimator may use its arrays again
         self._last = copy.deepcopy(replace(found, t=at))
         return copy.deepcopy(self._last)
@@ -256,7 +262,7 @@ class Localizer:
         if self._newest < self._tidied + TIDY_INTERVAL:
             return
         self._tidied = self._newest
-        if isinstance(estimator, ForgettingEstimator) and self._started:
+        if isinstance(estimator, ForgettingEstimator) and self._ticks:
             estimator.forget(self._newest - self._history)
         found = estimator.diagnostics
         for innovations in found.nis.values():

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from factors.se2 import Array
 
+TICK_RATE = 10  # Hz, the grid on which trajectories are written
+
 
 @dataclass(frozen=True, slots=True)
 class VelocityOdometry:
@@ -111,7 +113,7 @@ class CameraFrame:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No measurement: time has passed, and an estimate is wanted."""
+    """No measurement: time has passed, and the trajectory is wanted at this stamp."""
 
     t: float
 

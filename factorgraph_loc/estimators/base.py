@@ -140,6 +140,18 @@ class Diagnostics:
     def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
         self.nis.setdefault(sensor, []).append((t, nis, dof))
 
+    def copy(self) -> Diagnostics:
+        """One of its own with the same content."""
+        return Diagnostics(
+            {name: list(rows) for name, rows in self.nis.items()},
+            {name: list(values) for name, values in self.residuals.items()},
+            dict(self.ignored),
+            dict(self.rejected),
+            dict(self.late),
+            list(self.events),
+            dict(self.dead_tags),
+        )
+
     def mark(self) -> Written:
         """What there is now, for :meth:`since`."""
         rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
@@ -175,12 +187,16 @@ def _added(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int
 
 
 class Estimator(Protocol):
-    """An estimator. It is given measurements in the order of arrival and can be asked at any time."""
+    """An estimator. It is given measurements in the order of arrival and can be asked at any time.
+
+    Only what it is given changes it: whatever is asked, and however often, all later answers are the same to the last bit.
+    """
 
     diagnostics: Diagnostics
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; before that every estimate is ``unlocalized``.
+        """Start from a Gaussian; before that every estimate is ``unlocalized``. Odometry of before the start may come earlier or
+        later than this, but not after the first measurement of another kind.
 
         A prior without a heading is given only to an estimator of which :func:`finds_heading` is true: no estimate is
         ``localized`` until what is seen has told the heading.
@@ -189,14 +205,14 @@ class Estimator(Protocol):
     def process(self, measurement: Measurement) -> None:
         """Take one measurement; one that is late by more than ``max_delay`` is counted and dropped."""
 
-    def estimate(self) -> PoseEstimate:
-        """The pose at the newest time seen, from the measurements so far."""
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The pose at the newest time seen, from the measurements so far, or at ``t`` if that is later, as the odometry leads."""
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The whole belief behind :meth:`estimate`."""
 
     def learnt(self) -> Learnt:
-        """Constants estimated on the way."""
+        """Constants estimated on the way, with what came later, as :meth:`trajectory` has them."""
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
@@ -208,6 +224,14 @@ class SpaceEstimator(Protocol):
 
     def space_trajectory(self) -> Trajectory3:
         """:meth:`Estimator.trajectory` in space, with covariances (N, 6, 6)."""
+
+
+@runtime_checkable
+class ConcludingEstimator(Protocol):
+    """An estimator whose final trajectory is a solution of its own, which may have something to tell."""
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the solution adds to them."""
 
 
 @runtime_checkable

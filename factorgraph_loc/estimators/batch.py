@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.estimators.base import Belief, Learnt, PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Belief, Diagnostics, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
@@ -93,16 +93,16 @@ class Batch(GraduatedGraph):
         else:
             super().process(measurement)
 
-    def estimate(self) -> PoseEstimate:
+    def estimate(self, t: float | None = None) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
         if self._ahead is not None:
-            return replace(self._ahead.estimate(), status="unlocalized")
-        guess = super().estimate()
+            return replace(self._ahead.estimate(t), status="unlocalized")
+        guess = super().estimate(t)
         return guess if self._prior is None else replace(guess, status="unlocalized")
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`."""
-        return super().belief() if self._ahead is None else self._ahead.belief()
+        return super().belief(t) if self._ahead is None else self._ahead.belief(t)
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
@@ -111,6 +111,10 @@ class Batch(GraduatedGraph):
     def trajectory(self) -> Trajectory:
         """The optimum at the stamps of the ticks, from the start on; empty if there was none."""
         return super().trajectory() if self._ahead is None else self._ahead.trajectory()
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the final trajectory adds to them."""
+        return super().final_diagnostics() if self._ahead is None else self._ahead.final_diagnostics()
 
     def _final(self) -> tuple[Array, Array]:
         """The optimum over the whole log."""

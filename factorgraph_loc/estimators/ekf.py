@@ -129,19 +129,23 @@ class Ekf(Filter):
             super().initialize(prior)
             return
         self._wait(prior.t)
-        start = KnownPosition(prior, self._motion.state(prior.t), self._motion)
+        start = KnownPosition(prior, self._motion)
         self._search = HeadingSearch(self._setup, self._motion, start, self._finder)
 
-    def estimate(self) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick; ``ambiguous`` while its heading is sought."""
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; ``ambiguous`` while its heading is
+        sought."""
         if self._search is None:
-            return super().estimate()
-        likeliest = self._search.belief(self._t).modes[0]
-        return PoseEstimate(self._t, likeliest.pose, likeliest.covariance, "ambiguous")
+            return super().estimate(t)
+        at = self._t if t is None else max(t, self._t)
+        likeliest = self._search.belief(at).modes[0]
+        return PoseEstimate(at, likeliest.pose, likeliest.covariance, "ambiguous")
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; of all headings while that is sought."""
-        return super().belief() if self._search is None else self._search.belief(self._t)
+        if self._search is None:
+            return super().belief(t)
+        return self._search.belief(self._t if t is None else max(t, self._t))
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
@@ -242,6 +246,7 @@ class Ekf(Filter):
         if self._search is None:
             super()._begin(m)
             return
+        self._search.start.settle()
         if m.t < max(self._search.start.t, self._t - self._max_delay):
             self._drop_late(m)
             return

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import bisect
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field
@@ -80,17 +81,20 @@ class Filter(ABC):
         self._smooth = settings.smooth
         calibrates = getattr(settings, "self_calibration", False)
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
+        self._rng: np.random.Generator | None = None  # of a filter that draws
         self._state: Any = None
         self._t = -math.inf
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._moves = (
+            False  # whether the odometry at the state's time counts: at a start rows of before it may still come
+        )
         self._ticks: list[float] = []
         self._records: list[Any] = []
         self._taken: deque[_Taken] = deque()  # the last ones, as far back as one may be late
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian."""
-        self._t = prior.t
-        self._odometry = self._motion.state(prior.t)
+        self._t, self._odometry, self._moves = prior.t, self._motion.state(prior.t), False
         self._state = self._start(prior)
         self._taken.clear()
 
@@ -116,15 +120,15 @@ class Filter(ABC):
         else:
             self._take_late(measurement)
 
-    def estimate(self) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick, not a number before the start."""
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; not a number before the start."""
         if self._state is None:
             return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
-        return self._estimate()
+        return self._at(t)._estimate()
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`."""
-        return gaussian_belief(self.estimate())
+        return gaussian_belief(self.estimate(t))
 
     def learnt(self) -> Learnt:
         """Nothing, unless the filter says otherwise."""
@@ -174,11 +178,29 @@ class Filter(ABC):
         """The state from a measurement alone, for an unknown start; None where it does not tell one."""
         return None
 
+    def _at(self, t: float | None) -> Self:
+        """The filter itself, or one that is ahead of it, by what :meth:`_take` would do at ``t``: it is there to be read."""
+        if t is None or t <= self._t or self._state is None:
+            return self
+        ahead = copy.copy(self)
+        ahead._rng = copy.deepcopy(self._rng)
+        ahead._move(t)
+        return ahead
+
+    def _move(self, t: float) -> None:
+        """Go on to ``t``, or stay if that is now."""
+        if not self._moves:
+            self._odometry, self._moves = self._motion.state(self._t), True
+        if t > self._t:
+            odometry = self._motion.state(t)
+            self._predict(self._motion.relative(self._odometry, odometry))
+            self._t, self._odometry = t, odometry
+
     def _begin(self, m: Exteroceptive | Tick) -> None:
         """Start without a prior, at the first measurement that tells something of the pose."""
         if isinstance(m, Tick):
             return
-        self._t, self._odometry = m.t, self._motion.state(m.t)
+        self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
         self._state = self._seek(m)
         if self._state is not None:
             self._records.append(self._record())
@@ -186,12 +208,10 @@ class Filter(ABC):
             self.diagnostics.ignore("before the start")
 
     def _take(self, m: Exteroceptive | Tick) -> None:
+        self._move(self._t)
         before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         mark = self.diagnostics.mark()
-        if m.t > self._t:
-            odometry = self._motion.state(m.t)
-            self._predict(self._motion.relative(self._odometry, odometry))
-            self._t, self._odometry = m.t, odometry
+        self._move(m.t)
         if isinstance(m, Tick):
             self._ticks.append(m.t)
         elif isinstance(m, RfidScan):

@@ -42,6 +42,12 @@ class Kept(Sequence[T], Generic[T]):
         self._items += items
         return self
 
+    def copy(self) -> Kept[T]:
+        """A list of its own with the same items and numbers."""
+        out = Kept(self._items)
+        out.first = self.first
+        return out
+
     def forget(self, before: int) -> None:
         """Forget the items with numbers below ``before``."""
         count = min(max(0, before - self.first), len(self._items))

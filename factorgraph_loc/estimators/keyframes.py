@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import bisect
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -55,6 +56,15 @@ from factors.rfid_factor import RfidFactor
 from factors.se2 import Array
 
 
+@dataclass(frozen=True)
+class Conclusion:
+    """A graph that is solved to its end: poses (M, 3) and body-frame covariances (M, 3, 3) of all its keyframes."""
+
+    graph: KeyframeGraph
+    poses: Array
+    covariances: Array
+
+
 class KeyframeGraph(ABC):
     """Keyframes and constants; how they come to be, and what is done with them, is the business of the classes below."""
 
@@ -78,6 +88,8 @@ class KeyframeGraph(ABC):
         self._keyframes: Kept[Keyframe] = Kept()
         self._keyframe_times: Kept[float] = Kept()
         self._ticks: list[TickAt] = []
+        self._anchored = False  # whether the odometry of the first keyframe counts: rows of before it may still come
+        self._conclusion: Conclusion | None = None  # the end, until something is taken
         self._damping = 0.0  # the largest that covariances were computed with
         self._t = -math.inf
         self._prior: PosePrior | None = None
@@ -92,11 +104,12 @@ class KeyframeGraph(ABC):
         self._pose = np.array(prior.pose, dtype=float)
         self._covariance = se2.world_to_body(prior.pose, prior.covariance)
         first = Keyframe(0, prior.t, self._motion.state(prior.t), None)
-        self._keyframes, self._keyframe_times = Kept([first]), Kept([prior.t])
+        self._keyframes, self._keyframe_times, self._anchored = Kept([first]), Kept([prior.t]), False
         self._begin(first)
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
+        self._conclusion = None
         if isinstance(measurement, Odometry):
             self._motion.add(measurement)
         elif self._prior is None:
@@ -106,22 +119,37 @@ class KeyframeGraph(ABC):
         else:
             self._take(measurement)
 
-    def estimate(self) -> PoseEstimate:
-        """The newest keyframe, moved along the odometry since."""
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The newest keyframe, moved along the odometry since, to the newest time or to ``t`` if that is later."""
         if self._prior is None:
             return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        at = self._t if t is None else max(t, self._t)
         pose, covariance = self._pose, self._covariance
-        if self._t > self._keyframes[-1].t:
-            since = self._since(self._keyframes[-1], self._t)
+        if at > self._keyframes[-1].t:
+            since = self._since(self._keyframes[-1], at)
             pose, covariance = se2.compose(pose, since.delta), propagate(covariance, since)
-        return PoseEstimate(self._t, pose, se2.body_to_world(pose, covariance), "localized")
+        return PoseEstimate(at, pose, se2.body_to_world(pose, covariance), "localized")
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`."""
-        return gaussian_belief(self.estimate())
+        return gaussian_belief(self.estimate(t))
 
     def learnt(self) -> Learnt:
-        """The constants and landmarks that are estimated."""
+        """The constants and landmarks that are estimated, as the final trajectory has them."""
+        return self._learnt() if self._prior is None else self._concluded().graph._learnt()
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
+        if self._prior is None:
+            return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+        end = self._concluded()
+        return end.graph._between(end.poses, end.covariances)
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the final trajectory adds to them."""
+        return self.diagnostics if self._prior is None else self._concluded().graph.diagnostics
+
+    def _learnt(self) -> Learnt:
         values: dict[str, tuple[float, float]] = {}
         for key, prefix, constants in (
             (ODOMETRY_KEY, "", self._odometry_constants),
@@ -141,13 +169,24 @@ class KeyframeGraph(ABC):
         positions, covariances = self._departed[0] | self._constants, self._departed[1] | self._spreads
         return Learnt(values, points, self._unknown.learnt(positions, covariances))
 
-    def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
-        if self._prior is None:
-            return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
-        if waiting := self._gather():
-            self._attach(self._keyframes[-1], Addition(waiting), None)
-        return self._between(*self._final())
+    def _concluded(self) -> Conclusion:
+        """The graph as it is at its end, which is solved beside it: nothing that comes later shall depend on who asked."""
+        if self._conclusion is None:
+            graph = copy.copy(self)
+            graph.diagnostics = self.diagnostics.copy()
+            graph._keyframes = self._keyframes.copy()
+            for place, keyframe in enumerate(self._keyframes, start=self._keyframes.first):
+                graph._keyframes[place] = replace(keyframe, nodes=list(keyframe.nodes))
+            graph._keyframes[-1].nodes += self._waiting_nodes()
+            graph._constants, graph._spreads = dict(self._constants), dict(self._spreads)
+            self._conclusion = Conclusion(graph, *graph._final())
+        return self._conclusion
+
+    def _anchor(self) -> None:
+        """At the first measurement after a start: the odometry there is what has come by now."""
+        if not self._anchored:
+            first = self._keyframes[-1]
+            first.odometry, self._anchored = self._motion.state(first.t), True
 
     @abstractmethod
     def _take(self, m: Exteroceptive | Tick) -> None:
@@ -158,7 +197,7 @@ class KeyframeGraph(ABC):
         """Count a measurement that is too late."""
 
     @abstractmethod
-    def _gather(self) -> list[Node]:
+    def _waiting_nodes(self) -> list[Node]:
         """What waits on the newest keyframe and is in no graph yet."""
 
     @abstractmethod
@@ -167,7 +206,10 @@ class KeyframeGraph(ABC):
 
     @abstractmethod
     def _final(self) -> tuple[Array, Array]:
-        """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3)."""
+        """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3).
+
+        The graph may change its keyframes, constants and diagnostics, which are its own then; all else may only be read.
+        """
 
     @abstractmethod
     def _begin(self, first: Keyframe) -> None:
@@ -188,7 +230,8 @@ class KeyframeGraph(ABC):
         return self._keyframes[bisect.bisect_right(self._keyframe_times, t, self._keyframe_times.first) - 1]
 
     def _since(self, keyframe: Keyframe, t: float) -> Increment:
-        return self._recalibrated(self._motion.relative(keyframe.odometry, self._motion.state(t)))
+        start = keyframe.odometry if self._anchored else self._motion.state(keyframe.t)
+        return self._recalibrated(self._motion.relative(start, self._motion.state(t)))
 
     def _recalibrated(self, increment: Increment) -> Increment:
         if ODOMETRY_KEY not in self._constants:

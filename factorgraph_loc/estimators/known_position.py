@@ -22,13 +22,22 @@ HEADINGS = 72  # at which hypotheses begin
 START_KEPT = 300.0  # s that a robot may take to find its heading, for its trajectory to begin at the start
 
 
-@dataclass(frozen=True)
+@dataclass
 class KnownPosition:
-    """The start; see the module. ``odometry``: at the time of the ``prior``."""
+    """The start; see the module."""
 
     prior: PosePrior
-    odometry: ChainState
     motion: Motion
+    _odometry: ChainState | None = None
+
+    @property
+    def odometry(self) -> ChainState:
+        """That at the time of the prior, by all rows that have come by now, or by the time that it was settled."""
+        return self.motion.state(self.t) if self._odometry is None else self._odometry
+
+    def settle(self) -> None:
+        """At the first measurement: the odometry of before has come."""
+        self._odometry = self.odometry
 
     @property
     def t(self) -> float:

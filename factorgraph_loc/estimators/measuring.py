@@ -65,6 +65,7 @@ class MeasuringGraph(KeyframeGraph):
         self._new_landmarks: NewLandmarks[tuple[int, BearingRangeFactor]] = NewLandmarks()
 
     def _take(self, m: Exteroceptive | Tick) -> None:
+        self._anchor()
         if isinstance(m, Tick):
             self._pass_time(m.t)
             return
@@ -195,10 +196,14 @@ class MeasuringGraph(KeyframeGraph):
 
     def _gather(self) -> list[Node]:
         """The scans from the newest keyframe, which are in no graph yet."""
-        keyframe = self._keyframes[-1]
-        nodes = [Node((keyframe.key,), factor, ROWS) for factor in self._scans.gather()]
-        keyframe.nodes += nodes
+        nodes = self._waiting_nodes()
+        self._keyframes[-1].nodes += nodes
+        self._scans.gather()
         return nodes
+
+    def _waiting_nodes(self) -> list[Node]:
+        key = self._keyframes[-1].key
+        return [Node((key,), factor, ROWS) for factor in self._scans.waiting()]
 
     def _add_keyframe(self, t: float, m: BearingRange | Pixels | None) -> None:
         newest = self._keyframes[-1]

@@ -14,6 +14,7 @@ A start with an unknown heading is such a place: particles there face anywhere.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +36,7 @@ from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.scan_monitor import Silence
 from factorgraph_loc.estimators.scan_tracker import ScanTracker
 from factorgraph_loc.estimators.seen_points import Pixels
-from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan
+from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan, Tick
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
 from factors import bearing_range, odometry, se2
@@ -69,11 +70,14 @@ class ParticleFilter(Filter):
     takes_scans = True
     takes_pixels = True
     _state: Cloud
+    _rng: np.random.Generator
 
     def __init__(self, setup: Setup, settings: ParticleFilterSettings) -> None:
         super().__init__(setup, settings)
         self._settings = settings
         self._rng = setup.rng
+        # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time
+        (self._smoothing_rng,) = setup.rng.spawn(1)
         self._odometry_constants = self._sensor_constants = NOTHING
         sensor = setup.rig.bearing_range
         if settings.self_calibration:
@@ -85,13 +89,15 @@ class ParticleFilter(Filter):
         self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
         self._pixels = PixelTracker(setup, self._motion, self.diagnostics)
         self._lost = False
+        self._from: KnownPosition | None = None
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
         if self._state is None:
             return Belief(())
-        modes = (Mode(1.0, *self._state.moments),) if self._state.localized else self._state.modes()
-        return Belief(modes, self._state.poses, self._state.weights)
+        cloud = self._at(t)._state
+        modes = (Mode(1.0, *cloud.moments),) if cloud.localized else cloud.modes()
+        return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
         """The constants that are estimated."""
@@ -113,8 +119,9 @@ class ParticleFilter(Filter):
             records = [r for r in records if r.t >= kept[0].t]
             if kept[-1] is not self._records[-1]:
                 kept.append(replace(self._records[-1], cloud=self._state))
+            rng = copy.deepcopy(self._smoothing_rng)
             simulation = BackwardSimulation(
-                kept, self._increment, self._moved, self._rng, self._settings.smoothing_trajectories
+                kept, self._increment, self._moved, rng, self._settings.smoothing_trajectories
             )
             found = [simulation.at(r) for r in records]
         poses = np.array([pose for pose, _ in found]).reshape(-1, 3)
@@ -127,15 +134,21 @@ class ParticleFilter(Filter):
 
     def _start(self, prior: PosePrior) -> Cloud:
         if not prior.has_heading:
-            start = KnownPosition(prior, self._odometry, self._motion)
+            start = KnownPosition(prior, self._motion)
             self._seek_from(start)
             poses = start.drawn(self._rng, self._settings.particles, self._odometry)
             return replace(self._cloud(poses), localized=False)
         self._scans.start(found=False)
         return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
 
+    def _take(self, m: Exteroceptive | Tick) -> None:
+        if self._from is not None:
+            self._from.settle()
+        super()._take(m)
+
     def _seek_from(self, start: KnownPosition | None) -> None:
         """Tell the searches what is known of the start, as long as its heading is sought."""
+        self._from = start
         for part in (self._landmarks, self._scans, self._pixels):
             part.seek_from(start)
 

@@ -78,7 +78,7 @@ class RelocatingGraph(MeasuringGraph):
             super().initialize(prior)
             return
         self._t = prior.t
-        self._seek_from(KnownPosition(prior, self._motion.state(prior.t), self._motion))
+        self._seek_from(KnownPosition(prior, self._motion))
 
     def _seek_from(self, start: KnownPosition | None) -> None:
         """Tell the searches what is known of the start."""
@@ -92,6 +92,7 @@ class RelocatingGraph(MeasuringGraph):
         if isinstance(measurement, Odometry):
             super().process(measurement)
         elif self._prior is None:
+            self._conclusion = None
             self._search(measurement)
         else:
             super().process(measurement)
@@ -100,39 +101,41 @@ class RelocatingGraph(MeasuringGraph):
             elif not isinstance(measurement, Tick) and self._monitor.suspicious_since is not None:
                 self._doubt(self._monitor.suspicious_since)
 
-    def estimate(self) -> PoseEstimate:
+    def estimate(self, t: float | None = None) -> PoseEstimate:
         """The newest keyframe, moved along the odometry since; before the start the likeliest place, if there is any.
 
         ``ambiguous`` before one place is clear, and while the landmarks are not where they are expected.
         """
         if self._prior is not None:
             status: Status = "ambiguous" if self._doubted or self._scans.silent else "localized"
-            return replace(super().estimate(), status=status)
-        modes = self._modes()
+            return replace(super().estimate(t), status=status)
+        at = self._t if t is None else max(t, self._t)
+        modes = self._modes(at)
         if not modes:
-            return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
-        return PoseEstimate(self._t, modes[0].pose, modes[0].covariance, "ambiguous")
+            return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; before the start all places that the sightings allow, and the particles of who
         seeks by scans."""
         if self._prior is not None:
-            return super().belief()
-        modes = tuple(self._modes())
+            return super().belief(t)
+        at = self._t if t is None else max(t, self._t)
+        modes = tuple(self._modes(at))
         if self._finder is None or self._searched is None or self._camera.newest is not None:
             return Belief(modes)
         poses, weights = self._finder.particles
-        since = self._motion.relative(self._searched, self._motion.state(self._t))
+        since = self._motion.relative(self._searched, self._motion.state(at))
         return Belief(modes, se2.compose(poses, since.delta), weights)
 
-    def _modes(self) -> list[Mode]:
+    def _modes(self, t: float) -> list[Mode]:
         found = self._relocalizer.hypotheses if self._finder is None else self._finder.hypotheses
         at = self._searched
         if self._camera.newest is not None:
             found, at = self._camera.hypotheses, self._camera.newest
         if at is None:
-            return [] if self._start is None else [self._start.mode(self._motion.state(self._t))]
-        since = self._motion.relative(at, self._motion.state(self._t))
+            return [] if self._start is None else [self._start.mode(self._motion.state(t))]
+        since = self._motion.relative(at, self._motion.state(t))
         return [
             Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
             for h in found
@@ -164,6 +167,8 @@ class RelocatingGraph(MeasuringGraph):
 
     def _search(self, m: Exteroceptive | Tick) -> None:
         """Before the start: see whether what was seen tells one place by now, and start there."""
+        if self._start is not None:
+            self._start.settle()
         if self._start is not None and m.t < max(self._start.t, self._t - self._graph_settings.max_delay):
             self._drop_late(m)
             return

@@ -83,21 +83,25 @@ class Smoother(RelocatingGraph):
         self._ticks = [tick for tick in self._ticks if tick.keyframe >= self._keyframes.first]
 
     def _final(self) -> tuple[Array, Array]:
-        """Full history: the whole graph, solved to the end. With a window: each pose as it left the window."""
-        if self._waiting.nodes:
-            self._update([], {})
+        """Full history: the whole graph, solved to the end. With a window: each pose as it left that, the others as they are
+        now; those that wait for the solver as they were expected."""
+        waiting = self._waiting.values
         if not self._settings.smooth:
             estimates = list(self._filtered)
         elif isinstance(self._solver, FullHistory):
-            values = {k.key: self._solver.value(k.key) for k in self._keyframes}
-            return self._optimum(values | {key: self._solver.value(key) for key in self._constants})
+            keys = [*(k.key for k in self._keyframes), *self._constants]
+            return self._optimum(waiting | {key: self._solver.value(key) for key in keys if key not in waiting})
         else:
             try:
-                for key in self._constants:
+                for key in self._constants.keys() - waiting.keys():
                     self._constants[key], self._spreads[key] = self._marginal(key)
-                estimates = [*self._left, *(self._marginal(k.key) for k in self._keyframes[len(self._left) :])]
+                open_ones = self._keyframes[len(self._left) :]
+                now = [self._filtered[k.index] if k.key in waiting else self._marginal(k.key) for k in open_ones]
             except RuntimeError as error:
                 raise self._unsolved(error) from error
+            estimates = [*self._left, *now]
+        if self._waiting.nodes or self._waiting_nodes():
+            estimates[-1] = self._pose, self._covariance
         return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
 
     def _optimum(self, start: Values) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.estimators.base import PoseEstimate, PosePrior
+from factorgraph_loc.estimators.base import Diagnostics, PoseEstimate, PosePrior
 from factorgraph_loc.estimators.marginals import IndeterminateError, covariances, damped
 from factorgraph_loc.estimators.monoslam import Monoslam, MonoslamSettings
 from factorgraph_loc.estimators.monoslam_sighting import Match
@@ -82,6 +82,7 @@ class SpaceBatch(Monoslam):
         self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
         self._images: dict[tuple[float, bool], _Image] = {}
         self._prior: PosePrior | None = None
+        self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the end, until something is taken
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a pose in space; InputError for one on a floor alone."""
@@ -94,16 +95,31 @@ class SpaceBatch(Monoslam):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
+        self._conclusion = None
         if isinstance(measurement, Twist):
             self._chain.add(measurement.t, measurement.v, measurement.w)
         super().process(measurement)
 
-    def estimate(self) -> PoseEstimate:
+    def estimate(self, t: float | None = None) -> PoseEstimate:
         """The filter's guess: not an estimate to be scored, as the problem is only solved at the end."""
-        return replace(super().estimate(), status="unlocalized")
+        return replace(super().estimate(t), status="unlocalized")
 
     def space_trajectory(self) -> Trajectory3:
         """The optimum over the whole log, at the stamps of the ticks."""
+        return self._concluded()[0]
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the final trajectory adds to them."""
+        return self._concluded()[1]
+
+    def _concluded(self) -> tuple[Trajectory3, Diagnostics]:
+        """The final trajectory, and the diagnostics with what it adds to them."""
+        if self._conclusion is None:
+            diagnostics = self.diagnostics.copy()
+            self._conclusion = self._solution(diagnostics), diagnostics
+        return self._conclusion
+
+    def _solution(self, diagnostics: Diagnostics) -> Trajectory3:
         past = {t: robot for t, robot, _ in self._past()}
         t = np.array(sorted(past))
         values = gtsam.Values()
@@ -114,7 +130,7 @@ class SpaceBatch(Monoslam):
         values, linear = _solved(motion, images, values)
         ticks = np.unique(np.array(self._ticks))
         rows = np.searchsorted(t, ticks).tolist()
-        spreads = self._covariances(linear, rows, t)
+        spreads = _covariances(linear, rows, t, diagnostics)
         poses = [values.atPose3(i) for i in rows]
         return Trajectory3(
             ticks,
@@ -122,17 +138,6 @@ class SpaceBatch(Monoslam):
             np.array([pose.rotation().matrix() for pose in poses]).reshape(-1, 3, 3),
             np.array([spreads[i] for i in rows]).reshape(-1, 6, 6),
         )
-
-    def _covariances(self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array) -> dict[int, Array]:
-        """The covariances (6, 6) of the poses ``rows``, of those at ``t``; RunFailedError where they are not determined."""
-        try:
-            found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
-        except IndeterminateError as error:
-            what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
-            raise RunFailedError(f"space_batch: the measurements do not determine {what}") from error
-        if found.damping:
-            self.diagnostics.events.append((float(t[-1]), damped(found.damping)))
-        return found.by_key
 
     def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
         if len(match.pixels):
@@ -158,6 +163,20 @@ class SpaceBatch(Monoslam):
             step = gtsam.Pose3(gtsam.Rot3(moved.rotation), moved.shift)
             graph.add(gtsam.BetweenFactorPose3(i, i + 1, step, noise))
         return graph
+
+
+def _covariances(
+    linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
+) -> dict[int, Array]:
+    """The covariances (6, 6) of the poses ``rows``, of those at ``t``; RunFailedError where they are not determined."""
+    try:
+        found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
+    except IndeterminateError as error:
+        what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
+        raise RunFailedError(f"space_batch: the measurements do not determine {what}") from error
+    if found.damping:
+        diagnostics.events.append((float(t[-1]), damped(found.damping)))
+    return found.by_key
 
 
 def _solved(

@@ -70,7 +70,7 @@ class Switching:
         for part in (self._tags, self._vision):
             for shared in fields(Diagnostics):
                 setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))
-        # both filters take the odometry: the second would count what is late or ignored once more
+        # both filters take the odometry: the second would count what is late once more
         self._vision.diagnostics.late = {}
         self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
         self._active: Filter = self._tags if by_scans else self._vision
@@ -97,19 +97,21 @@ class Switching:
             self._ticks.append(measurement.t)
         if isinstance(measurement, Tick) or isinstance(measurement, RfidScan) == (self._active is self._tags):
             self._active.process(measurement)
+            late = self._vision.diagnostics.late
+            self.diagnostics.late |= {sensor: count for sensor, count in late.items() if sensor != "odometry"}
             self._record()
         elif isinstance(measurement, RfidScan):
             self.diagnostics.ignore("rfid while no tag is read", len(measurement.antennas))
         else:
             self.diagnostics.ignore("landmarks while tags are read")
 
-    def estimate(self) -> PoseEstimate:
+    def estimate(self, t: float | None = None) -> PoseEstimate:
         """The estimate of the filter that has the word."""
-        return self._active.estimate()
+        return self._active.estimate(t)
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The belief of the filter that has the word."""
-        return self._active.belief()
+        return self._active.belief(t)
 
     def learnt(self) -> Learnt:
         """Nothing."""
@@ -117,8 +119,6 @@ class Switching:
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates at the ticks, or the causal ones with ``smooth`` off."""
-        late = self._vision.diagnostics.late
-        self.diagnostics.late |= {sensor: count for sensor, count in late.items() if sensor != "odometry"}
         times = sorted(self._records)
         records = [self._records[t] for t in times]
         found = [(r.pose, r.covariance) for r in records[-1:]]

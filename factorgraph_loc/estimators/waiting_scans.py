@@ -86,10 +86,14 @@ class WaitingScans:
         return tags.updated([window], pose, covariance)
 
     def gather(self) -> list[RfidFactor]:
-        """What waits, which waits no longer: all reads and misses as one factor."""
-        waiting, self._waiting = self._waiting, []
-        looks = [factor.seen for factor in waiting if isinstance(factor.seen, Looks)]
-        factors = [factor for factor in waiting if not isinstance(factor.seen, Looks)]
+        """What waits, which waits no longer."""
+        factors, self._waiting = self.waiting(), []
+        return factors
+
+    def waiting(self) -> list[RfidFactor]:
+        """What waits: all reads and misses as one factor."""
+        looks = [factor.seen for factor in self._waiting if isinstance(factor.seen, Looks)]
+        factors = [factor for factor in self._waiting if not isinstance(factor.seen, Looks)]
         if looks and self.tags.likelihood is not None:
             factors.append(RfidFactor(self.tags.likelihood, together(looks)))
         return factors

@@ -19,7 +19,14 @@ import numpy as np
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Estimator, PoseEstimate, PosePrior, SpaceEstimator, finds_heading
+from factorgraph_loc.estimators.base import (
+    ConcludingEstimator,
+    Estimator,
+    PoseEstimate,
+    PosePrior,
+    SpaceEstimator,
+    finds_heading,
+)
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.experiments.doubts import (
@@ -35,11 +42,10 @@ from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.measurements import Measurement, Odometry, Tick
+from factorgraph_loc.measurements import TICK_RATE, Measurement, Odometry, Tick
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
-TICK_RATE = 10  # Hz, the grid on which trajectories are written
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
 
 
@@ -118,6 +124,9 @@ def run(
     if not np.all(np.isfinite(final.poses)):
         raise RunFailedError(f"{config.estimator} on {log.name}: the final trajectory holds poses that are not finite")
 
+    diagnostics = estimator.diagnostics
+    if isinstance(estimator, ConcludingEstimator):
+        diagnostics = estimator.final_diagnostics()
     versions = _versions()
     effective = {
         "log": log.name,
@@ -138,7 +147,7 @@ def run(
         covariances=np.array([e.covariance for e in loop.estimates]).reshape(-1, 3, 3),
         status=tuple(e.status for e in loop.estimates),
         final=final,
-        diagnostics=estimator.diagnostics,
+        diagnostics=diagnostics,
         learnt=estimator.learnt(),
         timings=loop.timings(final_seconds, prepared),
         versions=versions,
@@ -251,8 +260,8 @@ class _Loop:
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
+        e = self._estimator.estimate(t)
         self._estimator.process(Tick(t))
-        e = self._estimator.estimate()
         if e.status != "unlocalized" and not np.all(np.isfinite(e.pose)):
             name = type(self._estimator).__name__
             raise RunFailedError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")

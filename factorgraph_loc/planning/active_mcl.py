@@ -62,6 +62,7 @@ class ActiveMcl(Filter):
     supports_unknown_start = True
     takes_scans = True
     _state: Cloud
+    _rng: np.random.Generator
 
     def __init__(self, setup: Setup, settings: ActiveMclSettings, space: FreeSpace) -> None:
         super().__init__(setup, settings)
@@ -69,11 +70,12 @@ class ActiveMcl(Filter):
         self._tags = KnownTags(setup, self.diagnostics)
         self._landmarks = KnownLandmarks(setup, self.diagnostics)
 
-    def belief(self) -> Belief:
+    def belief(self, t: float | None = None) -> Belief:
         """The particles with their weights, and their modes."""
         if self._state is None:
             return Belief(())
-        return Belief(self._state.modes(), self._state.poses, self._state.weights)
+        cloud = self._at(t)._state
+        return Belief(cloud.modes(), cloud.poses, cloud.weights)
 
     def trajectory(self) -> Trajectory:
         """The same as the causal estimates."""

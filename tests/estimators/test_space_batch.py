@@ -9,11 +9,13 @@ from scipy.stats import chi2
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.evaluation import space
 from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import FeatureStream, Log, RightSightingStream, SightingStream, TwistStream, cut
-from factorgraph_loc.measurements import CameraFrame
+from factorgraph_loc.measurements import CameraFrame, Tick
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.readers import load
 from factorgraph_loc.rig import Rig, TwistSettings
@@ -193,3 +195,30 @@ def test_recorded_starry_night(data_root):
     assert np.median(np.abs(space.pose_errors(result.final_space, batch.final_space)[:, 3:])) < 0.002
     found = space.spread_of(space.reprojection_residuals(batch.final_space, log))
     assert found["u_mad"] < 0.5 * space.spread_of(space.reprojection_residuals(log.reference3, log))["u_mad"]
+
+
+@pytest.mark.parametrize("name", ["monoslam", "space_batch"])
+def test_asking_changes_no_answer(name):
+    """What is known at the end is the same to the last bit, whatever was asked on the way."""
+    log = carried(4)
+    sensors, prior = RIG.sensors, resolve_prior(log, None)[0]
+    quiet, asked = (
+        create(name, Setup(RIG, log.world, sensors, np.random.default_rng(1)), settings_of(name, {})) for _ in range(2)
+    )
+    for estimator in (quiet, asked):
+        estimator.initialize(prior)
+        for i, m in enumerate(log.measurements(sensors)):
+            estimator.process(m)
+            if i % 10 == 9:
+                estimator.process(Tick(m.t))
+            if estimator is asked and i % 50 == 30:
+                estimator.estimate(m.t + 1.0)
+                estimator.belief(m.t + 0.5)
+                estimator.learnt()
+                estimator.trajectory()
+    for _ in range(2):
+        found, expected = asked.space_trajectory(), quiet.space_trajectory()
+        np.testing.assert_array_equal(found.positions, expected.positions)
+        np.testing.assert_array_equal(found.covariances, expected.covariances)
+    assert repr(asked.diagnostics) == repr(quiet.diagnostics)
+    np.testing.assert_array_equal(asked.estimate().pose, quiet.estimate().pose)

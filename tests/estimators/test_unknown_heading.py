@@ -201,7 +201,7 @@ def test_the_start_as_a_constraint():
     for t, x, y, turn in ((0.0, 0.0, 0.0, 0.0), (1.0, 0.5, 0.1, 0.7), (2.0, 0.4, -0.1, 0.3)):
         motion.add(IncrementOdometry(t, x, y, turn))
     position, covariance = np.array((1.0, -2.0)), np.array(((0.04, 0.01), (0.01, 0.09)))
-    start = KnownPosition(PosePrior.at_position(0.0, position, covariance), motion.state(0.0), motion)
+    start = KnownPosition(PosePrior.at_position(0.0, position, covariance), motion)
     now = motion.state(2.0)
     moved = motion.relative(start.odometry, now)
     poses = start.candidates(now)

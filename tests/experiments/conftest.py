@@ -70,11 +70,12 @@ class Fake:
         if self.calls[-1][0] == "Tick":
             self.ticks.append(measurement.t)
 
-    def estimate(self):
-        self.calls.append(("estimate", self.t))
-        pose = self.pose if self.t < self.settings.broken_at else np.full(3, np.nan)
-        status = "localized" if self.t >= self.settings.localized_at else "unlocalized"
-        return PoseEstimate(self.t, pose, np.eye(3), status)
+    def estimate(self, t=None):
+        at = self.t if t is None else t
+        self.calls.append(("estimate", at))
+        pose = self.pose if at < self.settings.broken_at else np.full(3, np.nan)
+        status = "localized" if at >= self.settings.localized_at else "unlocalized"
+        return PoseEstimate(at, pose, np.eye(3), status)
 
     def learnt(self):
         return Learnt({"scale": (1.0, 0.1)})

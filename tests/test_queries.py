@@ -1,0 +1,174 @@
+"""Asking changes nothing: whatever is asked of a localizer, and when, all later answers are the same to the last bit."""
+
+import struct
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.log import Log, SightingStream, VelocityStream
+from factorgraph_loc.measurements import BearingRange
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import World
+from factors import reprojection
+
+ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")
+BOTH, SEEN = ("odometry", "rfid", "bearing_range"), ("odometry", "sightings")
+CASES = {
+    "dead_reckoning": ("dead_reckoning", BOTH, {}, None),
+    "ekf": ("ekf", ("odometry", "bearing_range"), {"landmarks": "extended"}, None),
+    "particle_filter": ("particle_filter", BOTH, {"particles": 60, "smoothing_trajectories": 10}, None),
+    "particle_filter, anywhere": ("particle_filter", ("odometry", "bearing_range"), {"particles": 60}, "unknown"),
+    "switching": ("switching", BOTH, {"particles": 60}, None),
+    "smoother": ("smoother", BOTH, {"lag": None}, None),
+    "smoother, window": ("smoother", BOTH, {"lag": 1.5}, None),
+    "smoother, anywhere": ("smoother", ("odometry", "bearing_range"), {"lag": 1.5}, "unknown"),
+    "smoother, maps": ("smoother", ("odometry", "bearing_range"), {"landmarks": "unknown", "lag": None}, None),
+    "batch": ("batch", BOTH, {}, None),
+}
+BY_SIGHT = {
+    "ekf": ("ekf", SEEN, {}, None),
+    "ekf, anywhere": ("ekf", SEEN, {}, "unknown"),
+    "particle_filter": ("particle_filter", SEEN, {"particles": 60, "smoothing_trajectories": 10}, None),
+    "monoslam": ("monoslam", SEEN, {}, None),
+    "smoother": ("smoother", SEEN, {"lag": None}, None),
+    "smoother, window": ("smoother", SEEN, {"lag": 1.5}, None),
+    "smoother, maps": ("smoother", SEEN, {"landmarks": "unknown", "lag": None}, None),
+    "batch, maps": ("batch", SEEN, {"landmarks": "unknown"}, None),
+}
+
+
+@pytest.fixture(scope="module")
+def log():
+    """A short drive of a robot that learns constants of its odometry, with landmarks of which some come late."""
+    changes = {"drive": {"duration": 4.0}, "world": {"tags": 12, "landmarks": 12}}
+    log = fgloc.simulate("office", 3, changes=changes)
+    uncertainty = log.rig.odometry.uncertainty.model_copy(update={"scale_distance": 0.05})
+    odometry = log.rig.odometry.model_copy(update={"uncertainty": uncertainty})
+    return replace(log, rig=log.rig.model_copy(update={"odometry": odometry}))
+
+
+def bits(value):
+    """All that a value holds, to be compared to the last bit."""
+    if is_dataclass(value):
+        return tuple(bits(getattr(value, field.name)) for field in fields(value))
+    if isinstance(value, dict):
+        return tuple((bits(key), bits(value[key])) for key in sorted(value))
+    if isinstance(value, (list, tuple)):
+        return tuple(bits(item) for item in value)
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    return struct.pack("d", value) if isinstance(value, float) else repr(value)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A short drive in a room whose points a camera sees by name."""
+    t = np.arange(0.0, 2.5, 0.05)
+    rng = np.random.default_rng(2)
+    points = PointMap.of(tuple(f"p{i}" for i in range(30)), rng.uniform((3.0, -2.0, 0.2), (6.0, 2.0, 2.0), (30, 3)))
+    camera = CameraSettings(fx=500.0, fy=500.0, cx=320.0, cy=240.0, z=0.9)
+    poses = np.column_stack((0.3 * t, 0.0 * t, 0.0 * t))
+    rows = [
+        (at, i, *pixel) for at in t[2::4] for i, pixel in enumerate(pixels(camera, points, (0.3 * at, 0.0, 0.0), rng))
+    ]
+    stamps, names, u, v = zip(*rows, strict=True)
+    sightings = SightingStream(np.array(stamps), [f"p{i}" for i in names], np.array(u), np.array(v))
+    odometry = VelocityStream(t, np.full(len(t), 0.3), np.zeros(len(t)))
+    rig = Rig(sensors=("odometry", "sightings"), camera=camera)
+    streams = {"odometry": odometry, "sightings": sightings}
+    return Log("seen", rig, World(points=points), streams, Trajectory(t, poses))
+
+
+def pixels(camera, points, pose, rng):
+    found, _ = reprojection.predict(camera.model(), np.array(pose), points.positions)
+    return found + rng.standard_normal(found.shape)
+
+
+def started(log, case):
+    name, sensors, options, prior = case
+    localizer = fgloc.Localizer(log.rig, log.world, name, settings=options, sensors=sensors, seed=5)
+    start, _ = resolve_prior(log, prior)
+    if start is None:
+        localizer.initialize()
+    else:
+        localizer.initialize(start.pose, start.covariance, start.t)
+    rows = list(log.measurements(sensors))
+    late = {m.t for i, m in enumerate(m for m in rows if isinstance(m, BearingRange)) if i % 3 == 1}
+    return localizer, sorted(rows, key=lambda m: m.t + 0.3 * (isinstance(m, BearingRange) and m.t in late))
+
+
+def answers(localizer):
+    return {what: bits(getattr(localizer, what)()) for what in ASKED}
+
+
+questions = st.lists(st.tuples(st.floats(0.0, 1.0), st.sampled_from(ASKED), st.floats(0.0, 5.0)), max_size=12)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_asking_changes_no_answer(log, case):
+    unchanged(log, case)
+
+
+@pytest.mark.parametrize("case", BY_SIGHT.values(), ids=BY_SIGHT)
+def test_asking_changes_no_answer_of_a_camera(seen, case):
+    unchanged(seen, case)
+
+
+def unchanged(log, case):
+    """What is asked on the way changes nothing that is told at the end."""
+    expected, rows = started(log, case)
+    for m in rows:
+        expected.push(m)
+    expected = answers(expected)
+
+    @given(asked=questions)
+    @settings(max_examples=8, deadline=None)
+    def check(asked):
+        localizer, rows = started(log, case)
+        for i, m in enumerate(rows):
+            localizer.push(m)
+            for share, what, ahead in asked:
+                if int(share * (len(rows) - 1)) == i:
+                    if what == "estimate":
+                        localizer.estimate(m.t + ahead)
+                    getattr(localizer, what)()
+        assert answers(localizer) == expected
+
+    check()
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_what_comes_later_changes_no_answer_of_before(log, case):
+    """The first half of a log tells what it tells where the second half is to follow."""
+    half, rows = started(log, case)
+    whole, _ = started(log, case)
+    middle = len(rows) // 2
+    for m in rows[:middle]:
+        half.push(m)
+    told = answers(half)
+    for i, m in enumerate(rows):
+        if i == middle:
+            assert answers(whole) == told
+        whole.push(m)
+    assert answers(half) == told
+
+
+@pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother"])
+def test_looking_ahead_drops_nothing(log, name):
+    """An estimate for a second and a half ahead, each second, leaves what is measured until then in time."""
+    localizer, rows = started(log, (name, BOTH, {"particles": 60} if name == "particle_filter" else {}, None))
+    asked = 0.0
+    for m in rows:
+        localizer.push(m)
+        if m.t > asked + 1.0:
+            asked = m.t
+            assert localizer.estimate(m.t + 1.5).t == m.t + 1.5
+    assert localizer.diagnostics().late == {}
