@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 
+import factorgraph_loc as fgloc
 from factorgraph_loc.readers.bag_file import open_bag
 from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, read_fields, remarks
 
@@ -113,3 +114,27 @@ def test_images_and_what_tells_of_their_camera(proposal):
     found, _, text = proposal(fill)
     assert found.options["camera"] == {"topic": "/front/image_raw/compressed"}
     assert "no CameraInfo belongs to the images" in text
+
+
+def test_what_is_proposed_of_odometry_and_a_gyro_is_used_by_a_run(proposal, tmp_path):
+    """Odometry as poses that go straight on, and a gyro that says a circle: the heading of the run is the gyro's."""
+
+    def fill(made):
+        zero = np.zeros(9)
+        for i in range(31):
+            t = T0 + 100_000_000 * i
+            made.odometry("/odom", t, (0.05 * i, 0.0, 0.0))
+            turn = made.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+            rate = made.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.3)
+            told = {"orientation": turn, "angular_velocity": rate, "linear_acceleration": rate}
+            told |= {f"{name}_covariance": zero for name in tuple(told)}
+            made.write("/imu/data", t + 20_000_000, "sensor_msgs/msg/Imu", header=made.header(t + 20_000_000), **told)
+
+    found, _, text = proposal(fill)
+    assert found.uses == {"/odom": "odometry", "/imu/data": "imu"}
+    (tmp_path / "run.toml").write_text(text)
+    log = fgloc.read_log(tmp_path / "run.toml")
+    result = fgloc.run(log, "ekf", prior="0,0,0").result
+    assert result.config["sensors"] == ["odometry", "imu"]
+    assert result.diagnostics.ignored == {}
+    assert result.final.poses[-1, 2] == pytest.approx(0.9, abs=0.02)
