@@ -1,0 +1,215 @@
+"""What an estimator says at a time is the same whether the log goes on or not: every estimator on every sensor."""
+
+from dataclasses import fields, replace
+from functools import cache
+from itertools import compress
+
+import cv2
+import numpy as np
+import pytest
+from camera_world import simulate as simulate_room
+from camera_world import with_frames
+from test_space_batch import carried
+
+from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.registry import ESTIMATORS
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.log import ImageStream, YawRateStream, cut
+from factorgraph_loc.points import PointMap
+from factorgraph_loc.readers import load
+from factorgraph_loc.rfid_settings import PhaseSettings, RssiSettings
+from factorgraph_loc.rig import ImuSettings
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation import simulate as simulate_office
+from factorgraph_loc.world import World
+
+READS = ("odometry", "rfid")
+FEW = {"particles": 150, "min_particles": 100, "smooth": False}
+SETTINGS = {
+    "ekf": {"smooth": False},
+    "particle_filter": FEW,
+    "switching": {"particles": FEW["particles"], "smooth": False},
+    "smoother": {"smooth": False},
+    "monoslam": {"smooth": False},
+}
+
+
+def prefix(log, end):
+    """What arrived by the time ``end`` [s]: a late row arrives with the latest one before it."""
+
+    def until(name, stream):
+        keep = np.maximum.accumulate(stream.t + log.rig.time_offset(name)) <= end
+        columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+        kept = {k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns.items()}
+        return replace(stream, **kept)
+
+    return replace(log, streams={name: until(name, stream) for name, stream in log.streams.items()})
+
+
+@cache
+def plaza():
+    (log,) = load("plaza2")
+    start = log.span()[0]
+    part = cut(log, start, start + 24.0)
+    return replace(part, start=log.start)
+
+
+@cache
+def office():
+    """Reads with strength and phase; some tags are first read in the second half, others never."""
+    world = {"tags": 12, "landmarks": 20}
+    log = simulate_office(preset("office", {"drive": {"duration": 14.0}, "phase": {}, "rssi": {}, "world": world}), 3)
+    strength = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3)
+    phase = PhaseSettings(tempering=0.5, max_range=4.0)
+    rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})
+    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+
+
+def late():
+    """Each other look arrives after the one that follows it."""
+    log = office()
+    stream = log.streams["bearing_range"]
+    looks = np.unique(stream.t, return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(looks)), looks ^ 1))
+    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    moved = {k: v[order] if isinstance(v, np.ndarray) else [v[i] for i in order] for k, v in columns.items()}
+    return replace(log, streams=log.streams | {"bearing_range": replace(stream, **moved)})
+
+
+def turning():
+    """With a gyro."""
+    log = office()
+    wheels = log.streams["odometry"]
+    t = np.arange(0.0, 14.0, 0.05)
+    rate = np.interp(t, wheels.t[1:], wheels.dtheta[1:] / np.diff(wheels.t)) + 0.01
+    rig = log.rig.model_copy(update={"imu": ImuSettings()})
+    return replace(log, rig=rig, streams=log.streams | {"imu": YawRateStream(t, rate)})
+
+
+@cache
+def room():
+    return simulate_room(seconds=8.0)
+
+
+@cache
+def frames():
+    return with_frames(room(), clutter=30)
+
+
+LOGS = {
+    "ranges": (plaza, {}),
+    "landmarks": (office, {"sensors": ("odometry", "bearing_range")}),
+    "late landmarks": (late, {"sensors": ("odometry", "bearing_range")}),
+    "rfid": (office, {"sensors": READS}),
+    "rssi": (office, {"sensors": (*READS, "rssi")}),
+    "phase": (office, {"sensors": (*READS, "phase")}),
+    "gyro": (turning, {"sensors": ("odometry", "imu", "bearing_range")}),
+    "sightings": (room, {}),
+    "camera": (frames, {}),
+    "space": (lambda: carried(0), {}),
+    "unknown start by landmarks": (office, {"sensors": ("odometry", "bearing_range"), "prior": "unknown"}),
+    "unknown start by tags": (office, {"sensors": READS, "prior": "unknown"}),
+    "unknown start by features": (frames, {"prior": "unknown"}),
+}
+
+
+def attempt(log, config):
+    """What a run gives, or why it is refused."""
+    try:
+        return run(log, config)
+    except InputError as error:
+        return str(error)
+
+
+def check(log, config, middle):
+    """The estimates until ``middle`` are those of a log that ends there, to the bit; or both are refused for the same reason."""
+    short = prefix(log, middle)
+    whole, part = attempt(log, config), attempt(short, config)
+    if isinstance(whole, str):
+        assert part == whole
+        assert "on a floor" in whole or "cannot start from an unknown pose" in whole
+        return
+    n = len(part.t)
+    assert whole.t[n - 1] > middle - 0.4
+    assert len(whole.t) > n
+    np.testing.assert_array_equal(part.t, whole.t[:n])
+    assert part.status == whole.status[:n]
+    np.testing.assert_array_equal(part.poses, whole.poses[:n])
+    np.testing.assert_array_equal(part.covariances, whole.covariances[:n])
+    if part.causal_space is not None:
+        m = len(part.causal_space)
+        np.testing.assert_array_equal(part.causal_space.positions, whole.causal_space.positions[:m])
+        np.testing.assert_array_equal(part.causal_space.covariances, whole.causal_space.covariances[:m])
+
+
+@pytest.mark.parametrize("kind", LOGS)
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_causal_estimates_do_not_know_what_comes(name, kind):
+    make, more = LOGS[kind]
+    log = make()
+    first, last = log.span()
+    check(log, RunConfig(name, SETTINGS.get(name, {}), **more), (first + last) / 2.0)
+
+
+@pytest.mark.parametrize("recorded", ["mrclam6-robot1", "woods-r1", "rfid-aisle-run13", "starry_night"])
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_nor_on_recorded_logs(name, recorded, data_root):
+    (log,) = load(recorded, data_root=data_root)
+    first, _ = log.span()
+    check(prefix(log, first + 8.0), RunConfig(name, SETTINGS.get(name, {})), first + 4.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "settings"),
+    [
+        ("ekf", "landmarks", {"landmarks": "unknown"}),
+        ("smoother", "landmarks", {"landmarks": "unknown"}),
+        ("smoother", "sightings", {"landmarks": "unknown"}),
+        ("smoother", "camera", {"landmarks": "unknown"}),
+        ("smoother", "camera", {"visual_odometry": True}),
+        ("monoslam", "camera", {"landmarks": "unknown"}),
+        ("smoother", "landmarks", {"lag": 3.0}),
+        ("smoother", "rfid", {"lag": 3.0}),
+        ("smoother", "landmarks", {"self_calibration": False}),
+    ],
+)
+def test_nor_with_other_settings(name, kind, settings):
+    make, more = LOGS[kind]
+    log = make()
+    first, last = log.span()
+    check(log, RunConfig(name, SETTINGS[name] | settings, **more), (first + last) / 2.0)
+
+
+@pytest.mark.parametrize("name", ["smoother", "monoslam"])
+def test_nor_do_features_that_are_found_in_images(name, tmp_path):
+    rng = np.random.default_rng(1)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (120, 240), dtype=np.uint8), (0, 0), 1.5)
+    files = [tmp_path / f"{k}.png" for k in range(12)]
+    for k, file in enumerate(files):
+        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 160])
+    settings = CameraSettings(
+        width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 60}
+    )
+    log = room()
+    rig = log.rig.model_copy(update={"camera": settings, "sensors": ("odometry", "camera")})
+    streams = {
+        "odometry": cut(log, 0.0, 2.6).streams["odometry"],
+        "camera": ImageStream(0.13 + 0.2 * np.arange(12), files),
+    }
+    log = replace(log, rig=rig, streams=streams, world=World(points=PointMap.of((), np.empty((0, 3)))))
+    config = RunConfig(name, SETTINGS[name] | {"landmarks": "unknown"}, prior="0,0,0")
+    check(log, config, 1.3)
+
+
+def test_a_look_ahead_would_be_seen():
+    """The test itself: a log whose first half depends on its second fails it."""
+    log = office()
+    short = prefix(log, 7.0)
+    config = RunConfig("ekf", SETTINGS["ekf"], ("odometry", "bearing_range"))
+    seen = set(short.streams["bearing_range"].landmark)
+    less = log.world.model_copy(
+        update={"landmarks": {n: m for n, m in log.world.landmarks.items() if n in sorted(seen)[1:]}}
+    )
+    whole, part = run(log, config), run(replace(short, world=less), config)
+    assert np.abs(part.poses - whole.poses[: len(part.t)]).max() > 1e-6
