@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.experiments.compare import compare
+from factorgraph_loc.experiments.doubts import dead_tags
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.log import RfidStream
 from factorgraph_loc.rfid_settings import RfidSettings
@@ -60,23 +62,26 @@ def test_what_the_rig_lists_and_the_reads_lack_is_left_out(reading, fake):
     assert not any("rssi" in warning for warning in result.warnings)
 
 
-def test_tags_that_are_never_read_are_left_out(reading, fake):
+def test_an_estimator_is_given_all_tags_whatever_the_log_reads_later(reading, fake):
     result = run(reading, RunConfig("fake", sensors=ALL[:2]))
-    assert set(fake.made.setup.world.tags) == {"a"}
-    assert set(fake.made.setup.world.landmarks) == {"a", "b"}
-    (warning,) = (warning for warning in result.warnings if "never read" in warning)
-    assert warning == "straight: 2 of 3 tags of the map are never read and are left out: b, c"
-    assert set(reading.world.tags) == {"a", "b", "c"}
-    result = run(reading, RunConfig("fake", sensors=("odometry",)))
     assert set(fake.made.setup.world.tags) == {"a", "b", "c"}
-    assert not any("never read" in warning for warning in result.warnings)
+    assert not any("tags of the map" in warning for warning in result.warnings)
 
 
-def test_no_tag_of_the_map_is_ever_read(reading, fake):
+def test_tags_that_are_believed_dead_are_named(reading):
+    found = Diagnostics(dead_tags={"b": 0.7, "c": 0.999})
+    assert dead_tags(reading, found) == (
+        "straight: 2 of 3 tags of the map are believed dead, as they were not read from where they should have been: "
+        "c (> 99 %), b (70 %)",
+    )
+    assert dead_tags(reading, Diagnostics()) == ()
+
+
+@pytest.mark.usefixtures("fake")
+def test_no_tag_of_the_map_is_ever_read(reading):
     stream = replace(reading.streams["rfid"], epc=["", "x"])
     result = run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL[:2]))
-    assert fake.made.setup.world.tags == {}
-    assert any("3 of 3 tags of the map are never read" in warning for warning in result.warnings)
+    assert any("none of the 3 tags of the map is read" in warning for warning in result.warnings)
 
 
 def test_compare_takes_the_same_sensors(reading, tmp_path):
@@ -95,7 +100,9 @@ def test_a_log_of_tags_alone_that_never_tells_the_place_says_so_of_tags(reading)
     assert run(alone, config).warnings[-1] == "straight: never localized: its tags leave several places possible"
     stream = replace(reading.streams["rfid"], epc=["x", "x"])
     unread = run(replace(alone, streams=dict(reading.streams) | {"rfid": stream}), config)
-    assert unread.warnings[-1] == "straight: never localized: no tag of the map was read"
+    # silences alone leave most of the map, and it is said that no tag was read
+    assert unread.warnings[-1] == "straight: never localized: its tags leave several places possible"
+    assert "straight: none of the 3 tags of the map is read" in unread.warnings
 
 
 def test_an_estimator_without_tags_says_so():
