@@ -356,7 +356,7 @@ class KeyframeGraph(ABC):
 
 def _is_astray(node: Node, values: Values) -> bool:
     factor = node.factor
-    if not isinstance(factor, ReprojectionFactor) or not factor.free:
+    if not isinstance(factor, ReprojectionFactor) or not factor.free or any(key not in values for key in node.keys):
         return False
     return factor.is_astray(values[node.keys[0]], values[node.keys[-1]])
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -23,6 +23,7 @@ from factorgraph_loc.estimators.marginals import IndeterminateError, covariances
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window, read_all
+from factorgraph_loc.estimators.summary import Summary
 from factorgraph_loc.estimators.unknown_points import HORIZON
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point, is_pose
 from factors import se2
@@ -38,6 +39,8 @@ NOWHERE: Mapping[int, Array] = {}
 # Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
 JUMPED = 50.0
 ITERATIONS_AFTER_FAILURE = 10
+# m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
+NEAR_POINTS = 0.02
 LOOKED_BACK = HORIZON + 1  # newest keyframes that are never forgotten: points that wait are looked for in them
 
 
@@ -78,6 +81,8 @@ class Smoother(RelocatingGraph):
         t = min(before, self._t - self._settings.max_delay)
         count = bisect.bisect_right(self._keyframe_times, t, self._keyframe_times.first) - 1
         count = min(count, len(self._left), len(self._keyframes) - LOOKED_BACK)
+        if count > self._keyframes.first:
+            count = min(count, self._solver.oldest)  # it may have to be built anew
         for kept in (self._keyframes, self._keyframe_times, self._filtered, self._left):
             kept.forget(count)
         self._ticks = [tick for tick in self._ticks if tick.keyframe >= self._keyframes.first]
@@ -118,7 +123,7 @@ class Smoother(RelocatingGraph):
         del self._filtered[newest.index :]
         self._filtered.append((self._pose, self._covariance))
         try:
-            self._start_again(newest)
+            self._start_again(newest, self._solver.summary(failed=False))
         except RuntimeError as error:
             raise self._unsolved(error) from error
 
@@ -157,23 +162,23 @@ class Smoother(RelocatingGraph):
     def _update(self, nodes: Sequence[Node], values: Values) -> None:
         newest = self._keyframes[-1]
         nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
-        self._solved = newest.t
+        self._solved, guess = newest.t, self._filtered[newest.index]
         self._leave(newest.t, [k for k in self._constants if k not in values and not is_point(k)])
         try:
             self._solver.update(nodes, values, newest.t)
-            self._check_jump(newest)
+            self._check_jump(newest, guess)
             self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {self._reason(error)}"))
-            self._rebuild(newest)
+            self._rebuild(newest, guess)
         while self._failed:
             self.diagnostics.reject(f"factor: {self._failed.pop()}")
 
-    def _check_jump(self, newest: Keyframe) -> None:
+    def _check_jump(self, newest: Keyframe, guess: Guess) -> None:
         """RuntimeError if points that are estimated took the newest pose where it cannot be."""
         if self._unknown is None:
             return
-        pose, spread = self._filtered[newest.index]
+        pose, spread = guess
         off = se2.log(se2.between(pose, self._solver.value(newest.key)))
         if not off @ np.linalg.solve(spread, off) < JUMPED:
             raise RuntimeError("the estimate jumped")
@@ -242,58 +247,76 @@ class Smoother(RelocatingGraph):
                 self._departed[0][key], self._departed[1][key] = self._constants[key], self._spreads[key]
             del self._constants[key], self._spreads[key]
 
-    def _rebuild(self, newest: Keyframe) -> None:
+    def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
         """A new solver after the old one failed, from what that told before; then without what may throw. RunFailedError where
         nothing helps."""
         failure = RuntimeError()
+        summary = self._solver.summary(failed=True)
         near = read_all(self._last, [*(k.key for k in self._keyframes), *self._constants])
         for throws in (True, False, False):
+            self._filtered[newest.index] = guess
             try:
-                self._start_again(newest, near, throws=throws)
+                self._start_again(newest, summary, near, throws=throws)
+                if summary is not None and any(_has_pose(node) for node in newest.nodes):
+                    self._check_jump(newest, guess)
             except RuntimeError as error:
                 failure = error
             else:
                 return
-            if not throws and newest.nodes:
-                self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", len(newest.nodes))
-                newest.nodes.clear()
+            count = sum(_has_pose(node) for node in newest.nodes)
+            if not throws and count:
+                self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
+                newest.nodes[:] = [node for node in newest.nodes if not _has_pose(node)]  # priors of points
         raise self._unsolved(failure) from failure
 
-    def _start_again(self, newest: Keyframe, near: Mapping[int, Array] = NOWHERE, throws: bool = False) -> None:
+    def _start_again(
+        self, newest: Keyframe, summary: Summary | None, near: Mapping[int, Array] = NOWHERE, throws: bool = False
+    ) -> None:
         """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
         throw where a point gets behind a camera, at a tenth of the time.
 
-        The oldest keyframe of a window carries its last estimate as prior, which its own factors are part of, and so do
-        constants and landmarks.
+        A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
+        begins with the priors.
         """
         self._solver, self._waiting, self._solved = self._new_solver(), Addition(), newest.t
-        oldest, *others = self._keyframes[len(self._left) :]
-        pose, spread = self._filtered[oldest.index]
-        pose = near.get(oldest.key, pose)
-        means, spreads = self._constants, self._spreads
-        nodes: list[Node] = []
-        if oldest.index == 0:
-            assert self._prior is not None
-            pose, spread = np.asarray(self._prior.pose), se2.world_to_body(self._prior.pose, self._prior.covariance)
-            means, spreads = self._constant_priors()
-            nodes += oldest.nodes
-        noise = gtsam.noiseModel.Gaussian.Covariance(spread)
-        nodes.append(Node((oldest.key,), native=gtsam.PriorFactorPose2(oldest.key, gtsam.Pose2(*pose), noise)))
-        for key, mean in means.items():
-            noise = gtsam.noiseModel.Gaussian.Covariance(spreads[key])
-            nodes.append(Node((key,), native=gtsam.PriorFactorVector(key, mean, noise)))
-        guesses = {k.key: self._filtered[k.index][0] for k in (oldest, *others)} | self._constants
+        keyframes = self._keyframes[0 if summary is None else summary.oldest :]
+        guesses = {k.key: self._filtered[k.index][0] for k in keyframes} | self._constants
+        known: Collection[int] = () if summary is None else summary.keys
+        guesses |= {key: value for key, value in self._departed[0].items() if key in known}
         guesses |= {key: value for key, value in near.items() if key in guesses}
-        self._drop_astray(others, guesses)
+        self._drop_astray(keyframes[1:], guesses)
+        if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
+            guesses |= read_all(summary.at, guesses)
+        factors = self._priors() if summary is None else summary.on(guesses)
+        nodes = [n for k in keyframes for n in k.nodes if _is_missing(n, guesses, known)]
         if near and isinstance(self._solver, FullHistory):
             guesses = self._problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
-        for keyframe in others:
-            there = (node for node in keyframe.nodes if all(not is_pose(k) or k >= oldest.key for k in node.keys))
-            nodes += [self._odometry_node(keyframe), *there]
         if not throws:
-            nodes = [node if node.factor is None else replace(node, native=None) for node in nodes]
-        self._solver.update(nodes, guesses, newest.t)
+            nodes = [n if n.factor is None or not _has_pose(n) else replace(n, native=None) for n in nodes]
+        nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
+        self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
         self._read(newest, self._constants)
+
+    def _priors(self) -> list[gtsam.NonlinearFactor]:
+        """What is known before any measurement."""
+        assert self._prior is not None
+        noise = gtsam.noiseModel.Gaussian.Covariance(se2.world_to_body(self._prior.pose, self._prior.covariance))
+        start = gtsam.PriorFactorPose2(self._keyframes[0].key, gtsam.Pose2(*self._prior.pose), noise)
+        means, spreads = self._constant_priors()
+        return [
+            start,
+            *(
+                gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(spreads[key]))
+                for key, mean in means.items()
+            ),
+        ]
+
+    def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
+        """The time of each variable of a window that begins; points are as if they were seen now."""
+        now = keyframes[-1].t
+        oldest = -math.inf if self._settings.lag is None else now - self._settings.lag - MARGIN
+        stamps = {key: now if key in self._constants else oldest for key in values}
+        return stamps | {k.key: k.t for k in keyframes}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
         factor, keys = self._odometry_factor(keyframe)
@@ -310,6 +333,19 @@ class Smoother(RelocatingGraph):
         parameters.relinearizeSkip = self._settings.relinearize_skip if self._unknown is None else 1
         if self._settings.lag is None:
             return FullHistory(parameters, self._settings.relinearize_threshold)
-        parameters.setRelinearizeThreshold(self._settings.relinearize_threshold)
+        threshold = self._settings.relinearize_threshold
+        parameters.setRelinearizeThreshold(threshold if self._unknown is None else min(threshold, NEAR_POINTS))
         parameters.findUnusedFactorSlots = True
         return Window(parameters, self._settings.lag, self._failed.append)
+
+
+def _is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
+    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
+    it holds the priors of points, and what hangs on a pose that is gone."""
+    if any(key not in present for key in node.keys):
+        return False
+    return _has_pose(node) or node.keys[0] not in known
+
+
+def _has_pose(node: Node) -> bool:
+    return any(is_pose(key) for key in node.keys)

@@ -17,6 +17,7 @@ from typing import Any, Protocol, cast
 import gtsam
 import numpy as np
 
+from factorgraph_loc.estimators.summary import Summary, oldest_pose
 from factorgraph_loc.estimators.variables import Node, Values, gather, is_point, is_pose, read, to_gtsam
 from factors.graph import custom_factor, jacobian_factor, pose_array, read_pose, read_vector
 from factors.se2 import Array
@@ -41,6 +42,22 @@ class Solver(Protocol):
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
         """All factors, linearised where the solver has them, and the sizes of their variables by key."""
+
+    def begin(
+        self,
+        factors: Iterable[gtsam.NonlinearFactor],
+        nodes: Sequence[Node],
+        values: Values,
+        stamps: Mapping[int, float],
+    ) -> None:
+        """The first update, with the time of each variable, and with ``factors`` of GTSAM's besides."""
+
+    @property
+    def oldest(self) -> int:
+        """The index of the oldest pose in the graph before the last update."""
+
+    def summary(self, *, failed: bool) -> Summary | None:
+        """What is known of all that is no more in the graph, before the last update if that ``failed``; None where all is there."""
 
 
 class FullHistory:
@@ -84,11 +101,29 @@ class FullHistory:
             linear.slot = slots[linear.slot]
         self._updates += 1
 
+    def begin(
+        self,
+        factors: Iterable[gtsam.NonlinearFactor],
+        nodes: Sequence[Node],
+        values: Values,
+        stamps: Mapping[int, float],
+    ) -> None:
+        natives = [Node(tuple(factor.keys()), native=factor) for factor in factors]
+        self.update([*natives, *nodes], values, 0.0)
+
+    @property
+    def oldest(self) -> int:
+        return 0
+
+    def summary(self, *, failed: bool) -> Summary | None:
+        return None
+
     def value(self, key: int) -> Array:
         return read(self._isam, key)
 
     def covariance(self, key: int) -> Array:
-        return np.asarray(self._isam.marginalCovariance(key))
+        with _gtsam():
+            return np.asarray(self._isam.marginalCovariance(key))
 
     def estimates(self) -> gtsam.Values:
         return self._isam.calculateEstimate()
@@ -116,16 +151,30 @@ class Window:
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag + MARGIN, parameters)
         self._sizes: dict[int, int] = {}  # of the variables that are no poses
         self._on_failure = on_failure
+        # before the last update: all factors, and where they were linearised
+        self._before = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        self._sizes |= {key: len(value) for key, value in values.items() if not is_pose(key)}
-        graph = gtsam.NonlinearFactorGraph()
-        for node in nodes:
-            graph.add(node.native if node.native is not None else self._custom(node))
         stamps: dict[int, float] = dict.fromkeys(values, t)
         # what is constant never leaves the window, points do when they are seen no more
         stamps |= dict.fromkeys((key for key in self._sizes if not is_point(key)), t)
         stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
+        self.begin((), nodes, values, stamps)
+
+    def begin(
+        self,
+        factors: Iterable[gtsam.NonlinearFactor],
+        nodes: Sequence[Node],
+        values: Values,
+        stamps: Mapping[int, float],
+    ) -> None:
+        self._sizes |= {key: len(value) for key, value in values.items() if not is_pose(key)}
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        for node in nodes:
+            graph.add(node.native if node.native is not None else self._custom(node))
+        self._before = self._smoother.getFactors(), self._smoother.getLinearizationPoint()
         with _gtsam():
             self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
@@ -133,13 +182,22 @@ class Window:
         return read(self._smoother, key)
 
     def covariance(self, key: int) -> Array:
-        return np.asarray(self._smoother.marginalCovariance(key))
+        with _gtsam():
+            return np.asarray(self._smoother.marginalCovariance(key))
 
     def estimates(self) -> gtsam.Values:
         return self._smoother.calculateEstimate()
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
         return _linear(self._smoother.getISAM2())
+
+    @property
+    def oldest(self) -> int:
+        return oldest_pose(self._before[0].keyVector())
+
+    def summary(self, *, failed: bool) -> Summary | None:
+        graph, at = self._before if failed else (self._smoother.getFactors(), self._smoother.getLinearizationPoint())
+        return Summary.of(graph, at) if graph.size() else None
 
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""

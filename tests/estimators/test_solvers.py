@@ -2,13 +2,17 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.solvers import FullHistory, read_all
+from factorgraph_loc.estimators.solvers import FullHistory, Window, read_all
+from factorgraph_loc.estimators.summary import Summary
 from factorgraph_loc.estimators.variables import pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.rig import OdometryUncertainty
+from factors import se2
+from tests.estimators import camera_world
 
 START = "0,0,0"  # its standard deviations are 0.05 m, 0.05 m, 0.05 rad
 SIGMA = 0.05
@@ -39,6 +43,47 @@ def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):
 
     run(log, RunConfig("smoother", {"landmarks": "unknown"}, prior=START), watch=watch)
     assert np.allclose(sigmas, SIGMA, rtol=1e-4)
+
+
+def test_a_window_that_is_built_anew_counts_nothing_twice(monkeypatch):
+    """The failing update has been applied when it raises. The poses that are left are where they were, and known as well."""
+    log = camera_world.simulate(1, 20.0)
+    config = RunConfig("smoother", {"landmarks": "unknown", "lag": 6.0})
+    expected = run(log, config)
+    update, calls = Window.update, []
+
+    def failing(self, *arguments):
+        update(self, *arguments)
+        calls.append(None)
+        if len(calls) == 25:
+            raise RuntimeError("made to fail")
+
+    monkeypatch.setattr(Window, "update", failing)
+    result = run(log, config)
+    ((t, event),) = result.diagnostics.events
+    assert 10.0 < t < 15.0
+    assert event == "solver rebuilt: made to fail"
+    after = result.t > t
+    ratio = np.linalg.det(result.covariances[after]) / np.linalg.det(expected.covariances[after])
+    assert np.all((ratio > 0.8) & (ratio < 1.25))
+    apart = result.poses - expected.poses
+    apart[:, 2] = se2.wrap(apart[:, 2])
+    squared = [d @ np.linalg.solve(c, d) for d, c in zip(apart[after], expected.covariances[after], strict=True)]
+    assert np.max(squared) < 1.0  # the points are linearised at another update
+
+
+def test_what_is_absent_is_marginalised_out_of_a_summary():
+    graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.1, 0.1, 0.02)))
+    for i in range(2):
+        at.insert(pose_key(i), gtsam.Pose2(float(i), 0.0, 0.1))
+    step = gtsam.BetweenFactorPose2(pose_key(0), pose_key(1), gtsam.Pose2(1.0, 0.0, 0.0), noise)
+    graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(0.0, 0.0, 0.0), noise))
+    graph.add(gtsam.LinearContainerFactor(step.linearize(at), at))
+    (left,) = Summary.of(graph, at).on({pose_key(1)})
+    marginal = gtsam.Marginals(graph, at).marginalCovariance(pose_key(1))
+    assert list(left.keys()) == [pose_key(1)]
+    assert np.allclose(np.linalg.inv(left.linearize(at).information()), marginal, rtol=1e-6)
 
 
 @pytest.mark.parametrize("skip", [1, 10])
