@@ -59,9 +59,9 @@ class OdometryNoise(FileModel):
     """How the error grows: along the track [m], across it [m], in heading [rad]. What is not given is that of wheels of which
     nothing is known, indoors."""
 
-    along: GrowthSettings = GrowthSettings(per_distance=0.08, per_rotation=0.02, per_time=0.01)
-    lateral: GrowthSettings = GrowthSettings(per_distance=0.04, per_rotation=0.02, per_time=0.01)
-    heading: GrowthSettings = GrowthSettings(per_distance=0.06, per_rotation=0.1, per_time=0.005)
+    along: GrowthSettings = GrowthSettings(per_distance=0.05, per_time=0.005)
+    lateral: GrowthSettings = GrowthSettings(per_distance=0.02, per_time=0.005)
+    heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05, per_time=0.002)
 
 
 class OdometryUncertainty(FileModel):

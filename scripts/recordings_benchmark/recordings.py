@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,14 @@ def section(options: Options) -> Report:
     logs = options.out / "logs"
     jobs = [Job(recording, options.data_root, logs) for recording in RECORDINGS]
     found = report.collect(measured, jobs, [job.recording.name for job in jobs])
+    tell(report, [(RECORDINGS[i], result) for i, result in sorted(found.items())])
+    return report
+
+
+def tell(report: Report, results: Sequence[tuple[Recording, Found]]) -> None:
+    """Write the table of results, and below it why there is none."""
     rows, notes = [], []
-    for i, result in sorted(found.items()):
-        recording = RECORDINGS[i]
+    for recording, result in results:
         told = {name: one for name, one in result.scores.items() if isinstance(one, dict)}
         refused = {name: one for name, one in result.scores.items() if isinstance(one, str)}
         counts = {one.get("causal.scored") or one.get("final.scored") or 0 for one in told.values()}
@@ -55,7 +61,6 @@ def section(options: Options) -> Report:
             )
     report.table(("log", "what it is", "odometry; other sensors", "poses", *ESTIMATORS), rows)
     report.lines += [*notes, ""]
-    return report
 
 
 def measured(job: Job) -> Found:
