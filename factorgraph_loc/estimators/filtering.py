@@ -83,6 +83,8 @@ class Filter(ABC):
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
         self._rng: np.random.Generator | None = None  # of a filter that draws
         self._state: Any = None
+        # the last one that was ahead of this one, and the state that it began with: the next tick need not go there once more
+        self._ahead: tuple[Any, Filter] | None = None
         self._t = -math.inf
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._moves = (
@@ -105,6 +107,8 @@ class Filter(ABC):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
+        if not isinstance(measurement, Tick):
+            self._ahead = None
         if isinstance(measurement, Odometry):
             self._motion.add(measurement)
         elif isinstance(measurement, RfidScan) and not self.takes_scans:
@@ -136,6 +140,7 @@ class Filter(ABC):
 
     def forget(self, before: float) -> None:
         """Forget the trajectory before then, but not what late measurements may still change."""
+        self._ahead = None
         t = min(before, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
@@ -182,19 +187,36 @@ class Filter(ABC):
         """The filter itself, or one that is ahead of it, by what :meth:`_take` would do at ``t``: it is there to be read."""
         if t is None or t <= self._t or self._state is None:
             return self
+        self._ahead = None
         ahead = copy.copy(self)
         ahead._rng = copy.deepcopy(self._rng)
+        ahead._anchor()
         ahead._move(t)
+        self._ahead = self._state, ahead
         return ahead
+
+    def _anchor(self) -> None:
+        """At the first measurement after a start: the odometry there is what has come by now."""
+        if not self._moves:
+            self._odometry, self._moves = self._motion.state(self._t), True
 
     def _move(self, t: float) -> None:
         """Go on to ``t``, or stay if that is now."""
-        if not self._moves:
-            self._odometry, self._moves = self._motion.state(self._t), True
-        if t > self._t:
-            odometry = self._motion.state(t)
-            self._predict(self._motion.relative(self._odometry, odometry))
-            self._t, self._odometry = t, odometry
+        if t <= self._t:
+            return
+        known, self._ahead = self._ahead, None
+        if known is not None and known[0] is self._state and known[1]._t == t:
+            self._catch_up(known[1])
+            return
+        odometry = self._motion.state(t)
+        self._predict(self._motion.relative(self._odometry, odometry))
+        self._t, self._odometry = t, odometry
+
+    def _catch_up(self, ahead: Filter) -> None:
+        """Take over what the one that is ahead has predicted; the generator stays, as others draw by it too."""
+        vars(self).update((name, value) for name, value in vars(ahead).items() if name != "_rng")
+        if self._rng is not None and ahead._rng is not None:
+            self._rng.bit_generator.state = ahead._rng.bit_generator.state
 
     def _begin(self, m: Exteroceptive | Tick) -> None:
         """Start without a prior, at the first measurement that tells something of the pose."""
@@ -208,7 +230,7 @@ class Filter(ABC):
             self.diagnostics.ignore("before the start")
 
     def _take(self, m: Exteroceptive | Tick) -> None:
-        self._move(self._t)
+        self._anchor()
         before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         mark = self.diagnostics.mark()
         self._move(m.t)

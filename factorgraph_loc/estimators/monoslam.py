@@ -119,6 +119,7 @@ class Monoslam(Filter):
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
         if isinstance(measurement, Twist) and self._twists is not None:
+            self._ahead = None
             if not self._twists.add(measurement.t, measurement.v, measurement.w):
                 self.diagnostics.drop_late("twist")
         else:
