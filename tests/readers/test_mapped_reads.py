@@ -1,0 +1,141 @@
+"""Reads of tags as programs of RFID readers write them, by a mapping: in lines of JSON, in several files, of several readers."""
+
+import json
+
+import numpy as np
+import pytest
+from mapped_hall import MANIFEST, READS, WHEELS
+
+
+def test_events_of_an_r700_as_json_lines(hall, with_options, one):
+    def event(t, antenna):
+        inventory = {"epcHex": "E2001", "antennaPort": antenna, "peakRssiCdbm": -5234, "phaseAngle": 90.0}
+        return {"timestamp": f"1970-01-01T00:00:0{t}Z", "tagInventoryEvent": inventory | {"frequency": 866300}}
+
+    lines = [event("1.5", 1), {"timestamp": "1970-01-01T00:00:02Z", "inventoryStatusEvent": {}}, event("2.25", 2)]
+    (hall.parent / "run" / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    log = one(with_options(f'{WHEELS}\n[options.rfid]\nfile = "events.jsonl"\npreset = "impinj_iot"\n'))
+    rfid = log.streams["rfid"]
+    np.testing.assert_allclose(rfid.t, (0.5, 1.25))
+    np.testing.assert_allclose((rfid.rssi[0], rfid.phase[0], rfid.frequency[0]), (-52.34, np.pi / 2, 866.3e6))
+    assert list(rfid.antenna) == ["1", "2"]
+    assert any("1 objects that are no reads are left out" in line for line in log.warnings)
+
+
+def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
+    report = {
+        "EPC": "b'e2001'",
+        "AntennaID": 1,
+        "PeakRSSI": -50,
+        "ChannelIndex": 3,
+        "ImpinjRFPhaseAngle": 1024,
+        "FirstSeenTimestampUTC": 1_500_000,
+        "LastSeenTimestampUTC": 1_900_000,
+        "TagSeenCount": 4,
+    }
+    single = {**report, "FirstSeenTimestampUTC": 1_200_000, "LastSeenTimestampUTC": 1_200_000, "TagSeenCount": 1}
+    (hall.parent / "run" / "tags.json").write_text(json.dumps([report, single]) + "\n")  # a report holds a list
+    log = one(
+        with_options(
+            f'{WHEELS}\n[options.rfid]\nfile = "tags.json"\npreset = "sllurp_reports"\nround_gap = 0.1\n'
+            "channels = { first = 902.75, step = 0.5 }\n"
+        )
+    )
+    rfid = log.streams["rfid"]
+    np.testing.assert_allclose(rfid.t - rfid.age, (0.2, 0.5, 0.9))
+    np.testing.assert_allclose(rfid.rssi, (-50.0, -50.0, np.nan))
+    np.testing.assert_allclose(rfid.phase[:2], np.pi / 2)
+    np.testing.assert_allclose(rfid.frequency[:2], 903.75e6)
+    assert set(rfid.epc) == {"e2001"}
+    assert any("2 reads between the first and the last" in line for line in log.warnings)
+
+
+def test_rows_of_sllurp_log_and_rounds_that_another_file_tells(hall, with_options, one):
+    folder = hall.parent / "run"
+    (folder / "log.csv").write_text("timestamp,reader,antenna,rssi,epc\n1.15,r:5084,1,-60,aa\n1.12,r:5084,1,-61,bb\n")
+    (folder / "rounds.csv").write_text("end,port,took\n1.2,1,200\n1.4,2,200\n")
+    log = one(
+        with_options(
+            f'{WHEELS}\n[options.rfid]\nfile = "log.csv"\npreset = "sllurp_log"\nclock_offset = 0.01\n'
+            '[options.inventories]\nfile = "rounds.csv"\ncolumns = { t = "end", antenna = "port", duration = "took" }\n'
+            'units = { t = "s", duration = "ms" }\n'
+        )
+    )
+    rfid = log.streams["rfid"]
+    assert list(rfid.epc) == ["bb", "aa", ""]
+    np.testing.assert_allclose(rfid.t, (0.2, 0.2, 0.4))
+    np.testing.assert_allclose(rfid.age[:2], (0.07, 0.04), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("content", "fragments"),
+    [
+        ('{"timestamp": "1970', ("events.jsonl:1: is not JSON",)),
+        ("12\n", ("events.jsonl:1", "an object")),
+        ('{"time": 1, "tag": {"epc": "A"}}\n', ("no object has 'timestamp', the first has tag.epc, time",)),
+        ('{"timestamp": [1], "epc": "A", "antenna": 1}\n', ("events.jsonl:1", "timestamp is [1]")),
+    ],
+)
+def test_wrong_json_lines(hall, with_options, refused, content, fragments):
+    (hall.parent / "run" / "events.jsonl").write_text(content)
+    manifest = with_options(f'{WHEELS}\n[options.rfid]\nfile = "events.jsonl"\npreset = "sllurp_log"\n')
+    refused(manifest, *fragments)
+
+
+def test_reads_in_several_files(hall, one, refused):
+    folder = hall.parent / "run"
+    expected = one(hall).streams["rfid"]
+    head, first, last = READS.partition("1970-01-01T01:00:02")
+    (folder / "reads.csv").unlink()
+    (folder / "reads-b.csv").write_text(head)
+    (folder / "reads-a.csv").write_text("".join(READS.splitlines(keepends=True)[:2]) + first + last)
+    hall.write_text(MANIFEST.replace("reads.csv", "reads-*.csv"))
+    found = one(hall).streams["rfid"]
+    assert found.epc == expected.epc
+    np.testing.assert_array_equal(found.t, expected.t)
+    (folder / "reads-c.csv").write_text(READS + "soon,e2001,,1,-60,866.3,r,1,0,\n")
+    refused(hall, "reads-c.csv:6", "soon")
+    hall.write_text(MANIFEST.replace("reads.csv", "log-*.csv"))
+    refused(hall, "log-*.csv", "files that are there")
+    hall.write_text(MANIFEST.replace("reads.csv", "../*.csv"))
+    refused(hall, "leaves its folder")
+
+
+READERS = "\n".join(
+    f"""
+[options.readers.{name}]
+file = "{name}.txt"
+antenna = "{name}"
+separator = " "
+header = false
+columns = {{ t = "8", epc = "2", frequency = "4", phase = "5", rssi = "6" }}
+units = {{ t = "us", frequency = "MHz", phase = "deg" }}
+"""
+    for name in ("first", "second", "third")
+)
+
+
+def test_three_readers_of_a_recorded_robot(data_root, tmp_path, one):
+    """The same reads as the reader that was written for this data set gives within its span, to the last digit."""
+    (tmp_path / "aisle.toml").write_text(
+        MANIFEST.partition("[options")[0].replace('"run"', '"rfid_aisle/run13"')
+        + '[options.odometry]\nfile = "reference_pose.txt"\nseparator = " "\nheader = false\nunits = { t = "s" }\n'
+        + 'columns = { t = "4", x = "1", y = "2", heading = "3" }\n'
+        + READERS
+    )
+    log = one(tmp_path / "aisle.toml", data_root=data_root)
+    expected = one("rfid-aisle-run13", data_root=data_root)
+    theirs, ours = expected.streams["rfid"], log.streams["rfid"]
+    shift = (log.t0_ns - expected.t0_ns) / 1e9
+    begin = np.searchsorted(ours.t + shift, theirs.t[0] - 1e-6)
+    part = slice(begin, begin + len(theirs.t))
+    np.testing.assert_allclose(ours.t[part] + shift, theirs.t, rtol=0, atol=2e-7)
+    assert ours.epc[part] == theirs.epc
+    assert ours.antenna[part] == theirs.antenna
+    for column in ("age", "rssi", "phase", "frequency"):
+        np.testing.assert_allclose(getattr(ours, column)[part], getattr(theirs, column), rtol=0, atol=1e-6)
+
+
+def test_readers_and_a_single_one_do_not_go_together(hall, refused):
+    hall.write_text(MANIFEST + READERS)
+    refused(hall, "has rfid and readers")
