@@ -65,7 +65,7 @@ def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warn
     antenna = [reads.names["antenna"][i] for i in order.tolist()]
     t_ns = reads.t_ns[order]
     number = rounds_from_gaps(t_ns, antenna, gap)
-    end_ns = ends_of(t_ns, number)
+    end_ns = ends_of(t_ns, number, gap)
     first = np.searchsorted(number, np.arange(len(end_ns)))
     return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
 

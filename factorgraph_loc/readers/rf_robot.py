@@ -156,7 +156,7 @@ def make_stream(reads: list[_Reads], t0_ns: int, end: float, source: Path, warni
         np.concatenate([getattr(r, column) for r in reads])[order] for column in ("rssi", "phase", "frequency")
     )
     number = rounds_from_gaps(t_ns, antenna, ROUND_GAP)
-    end_ns = ends_of(t_ns, number)
+    end_ns = ends_of(t_ns, number, ROUND_GAP)
     first = np.searchsorted(number, np.arange(len(end_ns)))
     whole = (t_ns[first] >= t0_ns) & ((end_ns - t0_ns) / 1e9 <= end)
     keep = whole[number]

@@ -51,11 +51,12 @@ def rounds_from_inventories(
     return out
 
 
-def ends_of(t_ns: Integers, number: Integers) -> Integers:
-    """The stamp (R,) of the last read of each of R rounds, numbered from 0 without a gap."""
-    out = np.full(int(number.max(initial=-1)) + 1, np.iinfo(np.int64).min)
-    np.maximum.at(out, number, t_ns)
-    return out
+def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
+    """When it was known (R,) that each of R rounds of :func:`rounds_from_gaps` was over, so that what it did not read counts: at
+    the next read of another antenna, or ``gap`` seconds after its last read."""
+    last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
+    following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
+    return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
 
 
 def make_rfid_stream(
