@@ -83,13 +83,18 @@ AS_IT_IS = Turned()
 
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Rotations (N, 3, 3) of quaternions (N, 4) as x, y, z, w; InputError at one that is no unit quaternion."""
+    require_unit(source, rows, quaternions)
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
+
+
+def require_unit(source: object, rows: Integers, quaternions: Array) -> None:
+    """InputError at one of the quaternions (N, 4) that is no unit one."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     bad = np.flatnonzero(~(np.abs(length - 1.0) <= UNIT))
     if len(bad):
         i = int(bad[0])
         raise bad_field(source, "length of the quaternion", float(length[i]), "1, a unit quaternion", row=int(rows[i]))
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
 
 
 def on_floor(

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import StartPose
-from factorgraph_loc.planar import AS_IT_IS, UNIT, Turned, on_floor, rotations_of
+from factorgraph_loc.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_file import Bag, Stamped
@@ -127,9 +127,4 @@ def check_rotations(source: str, rows: Integers, table: Array) -> None:
     """InputError for a number of positions and quaternions (N, 7) that is not finite, and a quaternion that is no unit one."""
     for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
         checks.require_finite(source, rows, name, table[:, i])
-    with np.errstate(over="ignore"):
-        length = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
-    bad = np.flatnonzero(np.abs(length - 1.0) > UNIT)
-    if len(bad):
-        i = int(bad[0])
-        raise bad_field(source, "length of the quaternion", float(length[i]), "1", row=int(rows[i]))
+    require_unit(source, rows, table[:, 3:])

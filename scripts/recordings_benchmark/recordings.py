@@ -26,7 +26,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Found:
-    """``scores`` by estimator, a line of why there are none in their place; ``warnings`` of the log; ``sensors`` that were used."""
+    """``scores`` by estimator, or in their place a line of why there are none; ``seconds`` of log."""
 
     scores: dict[str, dict[str, Any] | str]
     seconds: float

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import Log
 from factorgraph_loc.tag_map import tag_map
@@ -16,7 +17,6 @@ from factors.se2 import Array
 
 _POSES = 1500  # of the reference, in all
 _POINTS = 1500  # of a map of points
-_PAUSE = 5.0  # s between poses of the reference that a line still joins
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,9 @@ def _pieces(log: Log) -> tuple[Array, ...]:
         return ()
     t, places = log.reference.t, log.reference.poses[:, :2]
     step = len(t) // _POSES + 1
-    ends = np.flatnonzero(np.diff(t) > _PAUSE) + 1
     return tuple(
-        piece[np.unique(np.append(np.arange(0, len(piece), step), len(piece) - 1))] for piece in np.split(places, ends)
+        piece[np.unique(np.append(np.arange(0, len(piece), step), len(piece) - 1))]
+        for piece in np.split(places, pauses(t))
     )
 
 
