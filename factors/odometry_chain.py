@@ -70,10 +70,12 @@ class OdometryChain:
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
         """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row; at the stamp of that
         one it goes on from there, and both are one motion."""
-        move, n = np.array((dx, dy, dtheta), dtype=float), self._count
-        if n and self._rows[n - 1, 0] == t and self._rows[n - 1, 1] == _INCREMENT:
-            self._rows[n - 1, 2:] = se2.log(se2.compose(se2.exp(self._rows[n - 1, 2:]), move))
-            _integrate(self._rows, self._knots, n - 1, n, self._constants)
+        move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
+        while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != _INCREMENT:
+            last -= 1
+        if last >= 0 and self._rows[last, 0] == t:
+            self._rows[last, 2:] = se2.log(se2.compose(se2.exp(self._rows[last, 2:]), move))
+            _integrate(self._rows, self._knots, last, self._count, self._constants)
             return True
         return self._insert(t, _INCREMENT, *se2.log(move).tolist())
 

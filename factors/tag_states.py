@@ -38,9 +38,8 @@ class TagStates:
 
     def __init__(self, count: int, dead: float) -> None:
         self._odds = np.full(count, log_odds(dead))
-        self._told: deque[tuple[float, NDArray[np.int64], Array]] = (
-            deque()
-        )  # time, tags, and what was added to their odds
+        # time, tags, and what was added to their odds
+        self._told: deque[tuple[float, NDArray[np.int64], Array]] = deque()
         self._heard = -math.inf
 
     @property

@@ -169,10 +169,11 @@ class Diagnostics:
 
     def take_back(self, written: Written) -> None:
         """Take out what was last added, as what it tells of will be taken once more: a measurement counts once, however often an
-        estimator goes back in time. What was ``late`` stays, and so do ``events``, which did happen."""
+        estimator goes back in time. Of rows there may be fewer by now: a robot that runs for long keeps the last ones. What was
+        ``late`` stays, and so do ``events``, which did happen."""
         for lists, counts in ((self.nis, written.nis), (self.residuals, written.residuals)):
-            for name, count in counts.items():
-                del lists[name][max(0, len(lists[name]) - count) :]
+            for name in counts.keys() & lists.keys():
+                del lists[name][max(0, len(lists[name]) - counts[name]) :]
                 if not lists[name]:
                     del lists[name]
         for totals, counts in ((self.ignored, written.ignored), (self.rejected, written.rejected)):

@@ -90,6 +90,8 @@ def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping:
     told = {key: np.zeros(size) for key, size in sizes.items()}
     for i in range(graph.size()):
         factor = graph.at(i)
+        if factor is None:  # iSAM2 keeps the places of factors that were removed
+            continue
         diagonal, first = np.diag(factor.information()), 0
         for key in factor.keys():  # noqa: SIM118
             told[key] += diagonal[first : first + sizes[key]]

@@ -89,3 +89,17 @@ def test_what_is_taken_back_leaves_no_trace():
     diagnostics.reject("astray", 3)
     diagnostics.take_back(diagnostics.since(mark))
     assert repr(diagnostics) == before
+
+
+def test_rows_that_were_dropped_meanwhile_cannot_be_taken_back():
+    """A robot that runs for long keeps the last rows alone, fewer than it may go back by."""
+    diagnostics, written = Diagnostics(), []
+    for t in range(3):
+        mark = diagnostics.mark()
+        for _ in range(4):
+            diagnostics.innovation("camera", float(t), 2.0, 2)
+        written.append(diagnostics.since(mark))
+    del diagnostics.nis["camera"][:-5]
+    for one in reversed(written):
+        diagnostics.take_back(one)
+    assert diagnostics.nis == {}

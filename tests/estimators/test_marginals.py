@@ -47,6 +47,16 @@ def test_a_chain_that_hangs_on_nothing_is_damped():
         assert covariance[2, 2] > 1.0
 
 
+def test_a_graph_that_factors_were_removed_from_is_damped():
+    """iSAM2 keeps their places, empty."""
+    graph, _ = chain(30, anchored=False)
+    removed = gtsam.NonlinearFactorGraph()
+    removed.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), UNIT))
+    removed.remove(0)
+    graph.push_back(removed.linearize(gtsam.Values()))
+    assert covariances(graph, dict.fromkeys(range(31), 3), [30]).damping > 0.0
+
+
 def test_what_nothing_tells_of_is_named():
     graph, _ = chain(3)
     graph.add(gtsam.JacobianFactor(4, np.eye(3)[:2], np.zeros(2), gtsam.noiseModel.Unit.Create(2)))

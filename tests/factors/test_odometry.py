@@ -186,6 +186,15 @@ def test_a_gyro_turns_no_robot_whose_increments_say_that_it_stands():
     assert chain.relative(chain.state(2.4), chain.state(3.4)).delta[2] == pytest.approx(0.3)
 
 
+def test_increments_of_one_stamp_are_one_motion_whatever_a_gyro_told_in_between():
+    chain = OdometryChain(OdometryModel(), use_gyro=True)
+    for t in (0.0, 0.1, 0.2):
+        for _ in range(2):
+            chain.add_increment(t, 0.1, 0.0, 0.0)
+            chain.add_yaw_rate(t, 0.0)
+    assert pose_of(chain.state(0.2)) == pytest.approx((0.4, 0.0, 0.0))
+
+
 def test_late_rows_of_a_gyro_beside_increments():
     """Whenever they come, the path is the same."""
     rng = np.random.default_rng(0)
