@@ -31,11 +31,12 @@ def lines(rows: Sequence[Row]) -> list[str]:
     told = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}
-        all_of_them = dict.fromkeys(_label(row) for row in rows if row["log"] in logs)
-        some = dict.fromkeys(_label(row) for row in concerned)
+        all_of_them = dict.fromkeys(label_of(row) for row in rows if row["log"] in logs)
+        some = dict.fromkeys(label_of(row) for row in concerned)
         told.append(text if len(some) == len(all_of_them) else f"{text} ({', '.join(some)})")
     return told
 
 
-def _label(row: Row) -> str:
+def label_of(row: Row) -> str:
+    """What the results call the estimator."""
     return str(row.get("label") or row["estimator"])

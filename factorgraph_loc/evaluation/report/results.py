@@ -11,6 +11,7 @@ import polars as pl
 from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, least_p, pooled
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.scoring import RULE
+from factorgraph_loc.evaluation.warned import label_of
 
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
@@ -181,11 +182,6 @@ def _without_errors(row: Row) -> Row:
 
 def _run_name(row: Row) -> str:
     return f"{row['log']}, {label_of(row)}, seed {row['seed']}"
-
-
-def label_of(row: Row) -> str:
-    """What the results call the estimator."""
-    return str(row.get("label") or row["estimator"])
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], found: Mapping[str, Pooled]) -> str | None:

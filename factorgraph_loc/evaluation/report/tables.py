@@ -10,9 +10,9 @@ from factorgraph_loc.evaluation.ensembles import wilson
 from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.report.markup import Html, join, table, tag
 from factorgraph_loc.evaluation.report.metrics import Metric, number
-from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, label_of, score
+from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, score
 from factorgraph_loc.evaluation.tables import counted
-from factorgraph_loc.evaluation.warned import by_text
+from factorgraph_loc.evaluation.warned import by_text, label_of
 
 TIMINGS = (
     "timing.update_ms_median",
