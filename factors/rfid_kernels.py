@@ -152,34 +152,26 @@ def _alive(
 
 
 @numba.njit(cache=True, inline="always")
-def softplus(x: float) -> float:
-    """log(1 + exp(x)), without overflow: of log-odds x of dead against alive, the negative logarithm of P(alive)."""
-    return math.log1p(math.exp(x)) if x < 0.0 else x + math.log1p(math.exp(-x))
-
-
-@numba.njit(cache=True, inline="always")
 def _mixed(
     odds: float, silent: float, mean: float, spread: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
     """Of a tag that is dead with prior log-odds ``odds``, and is not read (:mod:`factors.tag_states`): the tempered negative
     log-likelihood, by how much the tag counts, and mean and variance of the likelihood over all that could be read.
 
+    A read costs what it does of a tag that is known to live: that this one does, too, tells nothing of the pose.
+
     ``silent``: negative log-likelihood of the silence if the tag is alive, ``mean`` and ``spread``: mean and variance of that of
     all that could be read, ``none``: that of a silence out of reach.
     """
-    alive = 1.0 / (1.0 + math.exp(odds))
-    log_alive = -softplus(odds)
+    alive, dead = 1.0 / (1.0 + math.exp(odds)), 1.0 / (1.0 + math.exp(-odds))
     left = alive * math.exp(-tempering * (silent - none))
-    total = left + 1.0 - alive
+    total = left + dead
     nll = tempering * none - math.log(total)
-    # an alive tag that is read costs what it does alive, less log P(alive); a silent one costs nll, whatever it is
+    # a silence costs nll, whether the tag is dead or alive; the rest is of an alive one that is read
     quiet = math.exp(-silent)
-    read = tempering * (mean - quiet * silent) - (1.0 - quiet) * log_alive
-    expected = (alive * quiet + 1.0 - alive) * nll + alive * read
-    squared = (
-        tempering**2 * spread + (tempering * mean - log_alive) ** 2 - quiet * (tempering * silent - log_alive) ** 2
-    )
-    second = (alive * quiet + 1.0 - alive) * nll * nll + alive * squared
+    expected = (alive * quiet + dead) * nll + alive * tempering * (mean - quiet * silent)
+    squared = tempering**2 * (spread + mean * mean - quiet * silent * silent)
+    second = (alive * quiet + dead) * nll * nll + alive * squared
     return nll, left / total, expected, max(second - expected * expected, 0.0) / tempering
 
 
@@ -238,7 +230,7 @@ def score(
                 mean_sum += mean
                 spread_sum += spread
                 if heard[t] > 0:
-                    e_sum += tempering * tag_e + softplus(odds[t])
+                    e_sum += tempering * tag_e
                 else:
                     e_sum += mixed
                     share = tempering * counts

@@ -126,8 +126,7 @@ class RfidLikelihood:
         certain, silent, which = self.by_silence(poses, looks)
         if len(which):
             add_mixed(silent, looks.odds[which], self.model.tempering, certain)
-        # a tag that is read is alive, which was not certain before
-        return certain - float(np.logaddexp(0.0, looks.odds[looks.hits.any(axis=0)]).sum())
+        return certain
 
     def by_silence(self, poses: Array, looks: Looks) -> tuple[Array, Array32, NDArray[np.int64]]:
         """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,

@@ -7,7 +7,9 @@ part of the likelihood of a pose is the mixture
 
     log p = log(exp(-E) + exp(o) [nothing read]) - log(1 + exp(o)),
 
-which is bounded where an alive tag's is not: the silence of a tag that was never read costs a pose at most ``-log P(dead)``.
+which is bounded where an alive tag's is not: the silence of a tag that was never read costs a pose at most ``-log P(dead)``. Of a
+tag that is read the last term, ``log P(alive)``, is left out: it is the same at all poses, and that a tag lives which was taken for
+dead is no reason to doubt the place.
 What a silence adds to the odds is E itself; one read leaves nothing of them (``-inf``), and for a tag that is known to live
 the mixture is the plain likelihood. As E is tempered, so is what a silence tells of the state.
 

@@ -117,6 +117,17 @@ def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
+def test_a_tag_that_comes_back_is_no_reason_to_doubt_the_place(estimator: str) -> None:
+    live = robot(estimator)
+    for i in range(1, 40):
+        live.push(scan(0.1 * i))
+    assert live.diagnostics().dead_tags.keys() == {"ahead"}
+    for i in range(40, 50):
+        live.push(scan(0.1 * i, ("aside", "ahead")))
+        assert live.estimate().status == "localized"
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
 def test_a_late_scan_counts_once(estimator: str) -> None:
     """Each second scan comes after the one that follows it: what is known of the tags is the same, as the robot stands."""
     in_time, late = robot(estimator), robot(estimator)

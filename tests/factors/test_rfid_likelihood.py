@@ -158,13 +158,15 @@ def out_of_reach(likelihood: RfidLikelihood, looks: Looks) -> float:
 
 
 def mixture(likelihood: RfidLikelihood, looks: Looks, odds: np.ndarray, pose: np.ndarray) -> float:
-    """The negative log-likelihood of tags that may be dead, tag by tag."""
+    """The negative log-likelihood of tags that may be dead, tag by tag; a tag that is read lives, which is not counted."""
     total, none = 0.0, out_of_reach(likelihood, looks)
     each, _, _ = likelihood.by_tag(pose, looks)
     for tag, own in enumerate(odds):
         dead = 0.0 if own == -np.inf else 1.0 / (1.0 + math.exp(-own))
-        silent = 0.0 if looks.hits[:, tag].any() else dead * math.exp(-none)
-        total -= math.log((1.0 - dead) * math.exp(-each[tag]) + silent)
+        if looks.hits[:, tag].any():
+            total += each[tag]
+        else:
+            total -= math.log((1.0 - dead) * math.exp(-each[tag]) + dead * math.exp(-none))
     return total
 
 
