@@ -87,9 +87,8 @@ class Filter(ABC):
         self._ahead: tuple[Any, Filter] | None = None
         self._t = -math.inf
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._moves = (
-            False  # whether the odometry at the state's time counts: at a start rows of before it may still come
-        )
+        # whether the odometry at the state's time counts: at a start rows of before it may still come
+        self._moves = False
         self._ticks: list[float] = []
         self._records: list[Any] = []
         self._taken: deque[_Taken] = deque()  # the last ones, as far back as one may be late

@@ -1,10 +1,10 @@
 """Where the robot is, from scans of RFID tags alone: for an unknown start, and after being carried elsewhere.
 
-A particle filter over pose that begins anywhere: evenly over the map's bounds, or with any heading where the start's position is
-known. Each scan is weighed a share at a time, with
-resampling from a kernel density in between (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo
-Methods in Practice", 2001, section 12.4), so that few particles find narrow places. Their number follows the size of the
-places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each resampling some are drawn anywhere once more,
+A particle filter over pose that begins anywhere: evenly over the map's bounds, or with any heading where the start's position
+is known. Each scan is weighed a share at a time, with resampling from a kernel density in between (progressive correction:
+Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4), so that few particles find
+narrow places. Their number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each
+resampling some are drawn anywhere once more,
 with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
 """
 

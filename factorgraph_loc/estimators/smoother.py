@@ -30,11 +30,8 @@ from factors import se2
 from factors.odometry import between_factor
 from factors.se2 import Array
 
-SOLVE_INTERVAL = (
-    0.45  # s: how long images may wait for the solver; until then they update the newest pose, as a filter would
-)
-
-
+# s: how long images may wait for the solver; until then they update the newest pose, as a filter would
+SOLVE_INTERVAL = 0.45
 NOWHERE: Mapping[int, Array] = {}
 # Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
 JUMPED = 50.0
