@@ -119,8 +119,9 @@ class Smoother(RelocatingGraph):
     def _begin_again(self, newest: Keyframe) -> None:
         del self._filtered[newest.index :]
         self._filtered.append((self._pose, self._covariance))
+        summary = self._solver.summary(failed=False)
         try:
-            self._start_again(newest, self._solver.summary(failed=False))
+            self._start_again(newest, None if summary is None else summary.before(newest.index))
         except RuntimeError as error:
             raise self._unsolved(error) from error
 

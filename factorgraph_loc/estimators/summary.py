@@ -46,6 +46,14 @@ class Summary:
         """The index of the oldest pose."""
         return oldest_pose(self.keys)
 
+    def before(self, pose: int) -> Summary:
+        """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
+        kept = frozenset(key for key in self.keys if not is_pose(key) or index_of(key) < pose)
+        at = gtsam.Values(self.at)
+        for key in self.keys - kept:
+            at.erase(key)
+        return Summary(tuple(self.on(kept)), kept, at)
+
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
         """The factors on variables that are ``present``, with all that those on others tell of these."""
         kept: list[gtsam.NonlinearFactor] = []
