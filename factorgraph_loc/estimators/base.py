@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -101,11 +101,21 @@ class Learnt:
 
 
 @dataclass(frozen=True)
-class Written:
-    """What :class:`Diagnostics` held at a time, or what was added since: rows of ``nis``, and counts of the rest."""
+class Mark:
+    """How much :class:`Diagnostics` held at a time: numbers of rows, and counts."""
 
     nis: Mapping[str, int]
     residuals: Mapping[str, int]
+    ignored: Mapping[str, int]
+    rejected: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was added to :class:`Diagnostics`: its rows, and by how much its counts rose."""
+
+    nis: Mapping[str, Sequence[tuple[float, float, int]]]
+    residuals: Mapping[str, Sequence[float]]
     ignored: Mapping[str, int]
     rejected: Mapping[str, int]
 
@@ -152,30 +162,26 @@ class Diagnostics:
             dict(self.dead_tags),
         )
 
-    def mark(self) -> Written:
+    def mark(self) -> Mark:
         """What there is now, for :meth:`since`."""
         rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
-        return Written(rows, values, dict(self.ignored), dict(self.rejected))
+        return Mark(rows, values, dict(self.ignored), dict(self.rejected))
 
-    def since(self, mark: Written) -> Written:
+    def since(self, mark: Mark) -> Written:
         """What was added since then."""
-        now = self.mark()
         return Written(
-            _added(mark.nis, now.nis),
-            _added(mark.residuals, now.residuals),
-            _added(mark.ignored, now.ignored),
-            _added(mark.rejected, now.rejected),
+            {name: rows[mark.nis.get(name, 0) :] for name, rows in self.nis.items()},
+            {name: values[mark.residuals.get(name, 0) :] for name, values in self.residuals.items()},
+            {name: count - mark.ignored.get(name, 0) for name, count in self.ignored.items()},
+            {name: count - mark.rejected.get(name, 0) for name, count in self.rejected.items()},
         )
 
     def take_back(self, written: Written) -> None:
-        """Take out what was last added, as what it tells of will be taken once more: a measurement counts once, however often an
-        estimator goes back in time. Of rows there may be fewer by now: a robot that runs for long keeps the last ones. What was
-        ``late`` stays, and so do ``events``, which did happen."""
-        for lists, counts in ((self.nis, written.nis), (self.residuals, written.residuals)):
-            for name in counts.keys() & lists.keys():
-                del lists[name][max(0, len(lists[name]) - counts[name]) :]
-                if not lists[name]:
-                    del lists[name]
+        """Take out what was added, as what it tells of will be taken once more: a measurement counts once, however often an
+        estimator goes back in time. Rows may be gone by now: a robot that runs for long keeps the last ones. What was ``late``
+        stays, and so do ``events``, which did happen."""
+        _remove(self.nis, written.nis)
+        _remove(self.residuals, written.residuals)
         for totals, counts in ((self.ignored, written.ignored), (self.rejected, written.rejected)):
             for name, count in counts.items():
                 totals[name] -= count
@@ -183,8 +189,19 @@ class Diagnostics:
                     del totals[name]
 
 
-def _added(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    return {name: count - before.get(name, 0) for name, count in after.items() if count > before.get(name, 0)}
+_Row = TypeVar("_Row")
+
+
+def _remove(lists: dict[str, list[_Row]], taken: Mapping[str, Sequence[_Row]]) -> None:
+    """Take rows out of lists, each where it is found last; a list without rows goes too."""
+    for name in taken.keys() & lists.keys():
+        rows = lists[name]
+        for row in reversed(taken[name]):
+            found = next((i for i in reversed(range(len(rows))) if rows[i] is row or rows[i] == row), None)
+            if found is not None:
+                del rows[found]
+        if not rows:
+            del lists[name]
 
 
 class Estimator(Protocol):

@@ -103,3 +103,17 @@ def test_rows_that_were_dropped_meanwhile_cannot_be_taken_back():
     for one in reversed(written):
         diagnostics.take_back(one)
     assert diagnostics.nis == {}
+
+
+def test_rows_are_taken_back_whatever_came_after_them():
+    """A late look is taken after newer ones; going back to between them leaves its row, and takes theirs."""
+    diagnostics, written = Diagnostics(), {}
+    for t in (5.0, 6.0, 4.9):
+        mark = diagnostics.mark()
+        diagnostics.innovation("camera", t, 2.0, 2)
+        diagnostics.residuals.setdefault("camera.u", []).append(10.0 * t)
+        written[t] = diagnostics.since(mark)
+    for t in (6.0, 5.0):
+        diagnostics.take_back(written[t])
+    assert diagnostics.nis == {"camera": [(4.9, 2.0, 2)]}
+    assert diagnostics.residuals == {"camera.u": [49.0]}
