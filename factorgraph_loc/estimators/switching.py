@@ -67,6 +67,7 @@ class Switching:
         self._vision: Filter = Ekf(by_sight, EkfSettings(max_delay=delay, smooth=False, self_calibration=False))
         by_scans = "rfid" in setup.sensors
         self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
+        self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
         for part in (self._tags, self._vision):
             for shared in fields(Diagnostics):
                 setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))

@@ -133,6 +133,7 @@ class ActiveMcl(Filter):
             told, else_told = (_evidence(c, likelihood.log_likelihood(c.poses, looks)) for c in (cloud, anywhere))
             if told < else_told + LOST:
                 cloud, known = anywhere, False
+                self._tags.forget(-math.inf)  # silences that were taken for those of another place
         if known:
             self._tags.miss(m.t, looks, cloud.moments[0], se2.world_to_body(*cloud.moments))
         return self._tempered(cloud, lambda poses: likelihood.log_likelihood(poses, looks))

@@ -90,6 +90,15 @@ def test_landmarks_tell_the_heading(name, missing, log):
     check(name, log, run(log, replace(CONFIGS[name], prior=position(log))), within=12.0 if missing else 6.0)
 
 
+def test_switching_without_tags_finds_it_by_landmarks(log):
+    result = run(log, RunConfig("switching", prior=position(log)))
+    first = result.status.index("localized")
+    assert result.t[first] - result.t[0] < 6.0
+    assert set(result.status[:first]) <= {"unlocalized", "ambiguous"}
+    found = errors(Trajectory(result.t[first:], result.poses[first:]), log.reference)
+    assert np.nanmax(found.position) < 0.4
+
+
 def test_who_has_found_a_heading_by_ranges_alone_knows_how_well(simulate):
     squared = []
     for seed in range(1, 9):
