@@ -72,7 +72,7 @@ class Run:
     scores: dict[str, Any]
 
 
-def datasets(data_root: Path | None = None) -> list[Dataset]:
+def datasets(data_root: str | Path | None = None) -> list[Dataset]:
     """The logs that are known by name; ``present``: whether their files are there."""
     return describe(data_root)
 

@@ -43,7 +43,7 @@ class _Source:
 def load(
     log: str | Path,
     *,
-    data_root: Path | None = None,
+    data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
     rig: str | Path | None = None,
@@ -85,7 +85,7 @@ def load(
 def read_log(
     log: str | Path,
     *,
-    data_root: Path | None = None,
+    data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
     rig: str | Path | None = None,
@@ -103,7 +103,7 @@ def _choices(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _find(log: str, data_root: Path | None, reader: str | None) -> _Source:
+def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source:
     path = Path(log)
     if reader is not None:
         readers.reader(reader)  # a wrong name of a reader is told before a wrong path
@@ -134,7 +134,7 @@ def _name(path: Path) -> str:
     return path.resolve().stem if path.is_file() else path.resolve().name
 
 
-def _from_manifest(file: Path, data_root: Path | None) -> _Source:
+def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:

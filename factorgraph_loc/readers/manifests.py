@@ -73,7 +73,7 @@ def read_manifest(file: Path) -> Manifest:
     return parse_model(Manifest, read_toml(file), file)
 
 
-def describe(data_root: Path | None = None) -> list[Dataset]:
+def describe(data_root: str | Path | None = None) -> list[Dataset]:
     """What ships with the project, by name; InputError if a data root is named that does not exist."""
     datasets = []
     for name, file in manifests().items():
@@ -82,7 +82,7 @@ def describe(data_root: Path | None = None) -> list[Dataset]:
     return datasets
 
 
-def is_present(manifest: Manifest, file: Path, data_root: Path | None) -> bool:
+def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> bool:
     names = [*manifest.checksums, *([] if manifest.path is None else [manifest.path])]
     if not names:
         return True
@@ -92,7 +92,7 @@ def is_present(manifest: Manifest, file: Path, data_root: Path | None) -> bool:
     return all(inside(root, name, file).exists() for name in names)
 
 
-def verify(manifest: Manifest, data_root: Path | None = None) -> list[str]:
+def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
     """What is wrong with the files of a manifest, a line each: missing, or another content than the checksum says."""
     if not manifest.checksums:
         return []
@@ -109,13 +109,14 @@ def verify(manifest: Manifest, data_root: Path | None = None) -> list[str]:
     return faults
 
 
-def find_data_root(data_root: Path | None, source: object) -> Path:
+def find_data_root(data_root: str | Path | None, source: object) -> Path:
     """The folder that holds the data: the argument, else the environment's; InputError if there is none."""
     if data_root is None:
         named = os.environ.get(DATA_ROOT)
         if not named:
             raise InputError(f"{source}: needs the data folder: give --data-root or set {DATA_ROOT}")
-        data_root = Path(named)
-    if not data_root.is_dir():
-        raise InputError(f"{source}: the data folder {data_root} does not exist")
-    return data_root
+        data_root = named
+    folder = Path(data_root)
+    if not folder.is_dir():
+        raise InputError(f"{source}: the data folder {folder} does not exist")
+    return folder

@@ -81,7 +81,7 @@ def test_a_list_makes_several_logs(manifest, mrclam, tmp_path):
     for name in ("Odometry", "Measurement", "Groundtruth"):
         (mrclam / f"Robot3_{name}.dat").write_text((mrclam / f"Robot1_{name}.dat").read_text())
     file = manifest("[options]\nrobot = [1, 3]\n")
-    names = [log.name for log in load(str(file), data_root=tmp_path)]
+    names = [log.name for log in load(str(file), data_root=str(tmp_path))]
     assert names == ["small-robot1", "small-robot3"]
     # text with commas is the command line's list
     names = [log.name for log in load(str(mrclam), reader="mrclam", options={"robot": "1, 3"})]
