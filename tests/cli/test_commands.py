@@ -367,7 +367,7 @@ def test_a_narrow_terminal_cuts_nothing_off(columns, capsys, monkeypatch):
     scores = {key: 31.494 for key, _, _ in COLUMNS.values()}
     row = {"log": "plaza2", "estimator": "dead_reckoning", "seed": 0, "status": "ok", "time_to_localized": 0.0} | scores
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((columns, 24)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((columns, 24)))
     show.rich_table(comparison_table([row]))
     text = capsys.readouterr().out
     assert "…" not in text
