@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,14 +30,6 @@ SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
 ISO = "iso"
 MAX_STAMP = 2**62  # ns: leaves room for differences in 64 bits
 
-LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
-SPEED = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1.0 / 3.6, "ft/s": 0.3048}
-ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "turn/4096": 2.0 * math.pi / 4096.0}
-RATE = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": 2.0 * math.pi / 60.0}
-POWER = {"dBm": 1.0, "cdBm": 0.01}
-FREQUENCY = {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6}
-DURATION = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-PURE = {"1": 1.0}
 EpcCase = Literal["as written", "upper", "lower"]
 
 

@@ -15,7 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
-from factorgraph_loc.column_mapping import ANGLE, LENGTH, ColumnMapping, EpcCase, in_case, read_mapped
+from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
+from factorgraph_loc.columns import ANGLE, LENGTH
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.column_mapping import LENGTH, SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
+from factorgraph_loc.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
+from factorgraph_loc.columns import LENGTH
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError
 

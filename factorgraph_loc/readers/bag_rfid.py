@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.column_mapping import ANGLE, FREQUENCY, POWER, SECONDS, EpcCase, in_case
+from factorgraph_loc.column_mapping import SECONDS, EpcCase, in_case
+from factorgraph_loc.columns import ANGLE, FREQUENCY, POWER
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.readers import native_rfid

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.columns import ANGLE, LENGTH, PURE, RATE
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import Log, Stream

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.column_mapping import ANGLE, LENGTH, PURE, RATE, SPEED, ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.columns import ANGLE, LENGTH, PURE, RATE, SPEED
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import IncrementStream, VelocityStream
 from factorgraph_loc.planar import Turned, on_floor, rotations_of

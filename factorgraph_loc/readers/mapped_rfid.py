@@ -9,18 +9,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from factorgraph_loc.column_mapping import (
-    ANGLE,
-    DURATION,
-    FREQUENCY,
-    POWER,
-    PURE,
-    ColumnMapping,
-    EpcCase,
-    Mapped,
-    in_case,
-    read_mapped,
-)
+from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
+from factorgraph_loc.columns import ANGLE, DURATION, FREQUENCY, POWER, PURE
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.readers.native_rfid import check_reads

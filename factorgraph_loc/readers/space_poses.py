@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from factorgraph_loc.column_mapping import PURE, ColumnMapping, read_mapped
+from factorgraph_loc.column_mapping import ColumnMapping, read_mapped
+from factorgraph_loc.columns import PURE
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.planar import rotations_of
 from factorgraph_loc.readers import checks

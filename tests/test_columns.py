@@ -1,0 +1,42 @@
+"""The descriptions of the tables' columns: bounds that hold what is measured, and what an error says of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.columns import BEARING_RANGE, MEASURED_RANGE, TABLES, VELOCITIES
+from factorgraph_loc.errors import InputError
+
+COLUMNS = [pytest.param(column, id=f"{table.name}.{column.name}") for table in TABLES for column in table.columns]
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_the_first_unit_is_that_of_the_bounds(column):
+    assert next(iter(column.units.values()), 1.0) == 1.0
+    assert column.low < column.high
+    assert column.doc
+
+
+def test_what_lies_within_the_bounds_passes_and_the_first_that_does_not_is_named():
+    column = VELOCITIES["v"]
+    column.require("a.csv", [2, 3], np.array((column.low, column.high)))
+    with pytest.raises(InputError) as caught:
+        column.require("a.csv", [2, 5], np.array((0.0, 1e300)), "speed")
+    assert str(caught.value) == "a.csv:5: speed is 1e+300, expected a finite number of m/s in -100 to 100"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_only_what_may_lack_may_be_no_number(value):
+    with pytest.raises(InputError):
+        VELOCITIES["w"].require("a.csv", [2], np.array((value,)))
+    bearing = BEARING_RANGE["bearing"]
+    if math.isnan(value):
+        bearing.require("a.csv", [2], np.array((value,)))
+    else:
+        with pytest.raises(InputError, match=r"radians, not degrees, in -6.28319 to 6.28319, or nothing"):
+            bearing.require("a.csv", [2], np.array((value,)))
+
+
+def test_a_measured_range_is_above_zero():
+    assert MEASURED_RANGE.outside(np.array((0.0, 1e-300, 1e-3, 1e5, 2e5))).tolist() == [True, True, False, False, True]
