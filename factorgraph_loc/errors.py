@@ -1,10 +1,15 @@
 """The exceptions that a user can cause. The command line prints them in one line and exits with their code."""
 
+from factorgraph_loc.text import one_line, plain, quoted
+
 
 class FglocError(Exception):
-    """Base of all errors that are reported to the user as one line."""
+    """Base of all errors that are reported to the user as one line, which its text always is, of at most 300 characters."""
 
     exit_code = 2
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message))
 
 
 class InputError(FglocError):
@@ -19,5 +24,5 @@ class RunFailedError(FglocError):
 
 def bad_field(file: object, field: str, value: object, expected: str, *, row: int | None = None) -> InputError:
     """The error for one bad field: file, row (counted as an editor counts lines), field, value, what is expected."""
-    where = f"{file}:{row}" if row is not None else f"{file}"
-    return InputError(f"{where}: {field} is {value!r}, expected {expected}")
+    where = f"{plain(file)}:{row}" if row is not None else plain(file)
+    return InputError(f"{where}: {plain(field)} is {quoted(value)}, expected {expected}")

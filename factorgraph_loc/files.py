@@ -13,6 +13,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import plain, quoted
 
 
 class FileModel(BaseModel):
@@ -53,17 +54,18 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
     except ValidationError as error:
         # a misspelt key is also a missing one: the spelling is what the user can act on
         first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        key = ".".join(str(part) for part in first["loc"])
+        key = plain(".".join(str(part) for part in first["loc"]))
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
             hint = nearest(str(first["loc"][-1]), known_keys(kind, first["loc"][:-1]))
             raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
         if first["type"] == "missing":
             raise InputError(f"{source}: {key} is missing{more}") from error
-        if first["type"] == "value_error" and not key:  # of the whole: its content is no value that a line can show
-            raise InputError(f"{source}: {first['ctx']['error']}{more}") from error
+        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):  # too much for a line
+            table = f"{key}: " if key else ""
+            raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]
-        raise InputError(f"{source}: {key} is {first['input']!r}: {expected}{more}") from error
+        raise InputError(f"{source}: {key} is {quoted(first['input'])}: {expected}{more}") from error
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:

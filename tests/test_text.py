@@ -1,0 +1,125 @@
+import pickle
+import re
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from factorgraph_loc.errors import InputError, RunFailedError, bad_field
+from factorgraph_loc.text import MESSAGE, NAME, VALUE, listed, one_line, plain, quoted, told
+
+ANY = st.text(st.characters(), max_size=400)  # lone surrogates and control characters too
+NESTED = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | ANY | st.binary() | st.dates(),
+    lambda inner: st.lists(inner) | st.dictionaries(ANY, inner) | st.tuples(inner, inner),
+    max_leaves=30,
+)
+HOSTILE = [
+    "\x1b[31mred\x1b[0m",  # colours
+    "\x1b]0;title\x07",  # a title for the window
+    "a\rb\nc\td",
+    "\x9b2J",  # the one-byte form of an escape sequence
+    "\u202eexe.txt",  # written from right to left from here
+    "\u2066a\u2069\u200b\ufeff",
+    "caf\udce9",  # a byte of a file name that is not UTF-8
+    "\x00\x7f\u2028",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_characters_that_a_terminal_obeys_are_shown_as_escapes(text: str) -> None:
+    assert plain(text).isprintable()
+    assert quoted(text).isprintable()
+    assert str(InputError(f"{text}: is missing")).isprintable()
+    assert str(bad_field(text, text, text, "a number")).isprintable()
+
+
+def test_escapes_are_those_of_python() -> None:
+    assert plain("\x1b[1m\u202e\udce9\n") == "\\x1b[1m\\u202e\\udce9\\n"
+    assert quoted("a\nb") == "'a\\nb'"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "hall 3", "Gärtnerstraße", "廊下", "🤖", "C:\\logs\\a", "$x_1^2$", "it's", 'a "b"']
+)
+def test_ordinary_text_is_shown_as_it_is(text: str) -> None:
+    assert plain(text) == text
+    assert quoted(text) == repr(text)
+
+
+def test_of_long_text_begin_and_end_are_shown() -> None:
+    name = "/data/" + "x" * 5000 + "/run.toml"
+    assert len(plain(name)) == NAME
+    assert re.fullmatch(r"/data/x+\.\.\.x+/run\.toml", plain(name))
+    assert len(quoted("y" * 10**6)) == VALUE
+    assert len(plain("\x1b" * 5000)) <= NAME
+
+
+def test_values_are_written_as_python_writes_them() -> None:
+    for value in (None, True, 3, -2.5, float("nan"), "a", b"a", [1, "b"], (1, 2), {"a": [1]}):
+        assert quoted(value) == repr(value)
+    assert quoted(np.float64(0.5)) == "0.5"
+    assert quoted(np.array([1, 2])) == "array([1, 2])"
+
+
+def test_a_number_of_thousands_of_digits_is_described() -> None:
+    assert sys.get_int_max_str_digits() < 10**4
+    for value in (10**10000, -(10**10000), [10**10000], {"a": 10**10000}):
+        assert "about 10001 digits" in quoted(value)
+    assert quoted(10**18) == "1000000000000000000"
+
+
+def test_of_long_and_deep_values_little_is_looked_at() -> None:
+    deep: list[object] = []
+    for _ in range(10**5):
+        deep = [deep]
+    assert quoted(deep) == "[[[[...]]]]"
+    assert quoted(list(range(10**6))) == "[0, 1, 2, 3, 4, ...]"
+
+
+class Unwritable:
+    def __repr__(self) -> str:
+        raise ZeroDivisionError
+
+
+def test_a_value_that_cannot_be_written_is_named_by_its_type() -> None:
+    assert quoted(Unwritable()) == "<Unwritable>"
+
+
+def test_of_many_names_the_first_are_listed() -> None:
+    assert listed(["b", "a\n"]) == "b, a\\n"
+    assert listed(range(1000)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 990 more"
+
+
+def test_what_an_exception_says_fits_on_a_line() -> None:
+    assert told(RuntimeError("one\n\n  two")) == "one two"
+    assert told(RuntimeError()) == "RuntimeError"
+    assert told(FileNotFoundError(2, "No such file or directory", "x")) == "No such file or directory"
+    assert told(OSError("3 requested and 0 written")) == "3 requested and 0 written"
+
+
+@settings(max_examples=200)
+@given(value=NESTED)
+def test_any_value_is_shown_in_bounds(value: object) -> None:
+    shown = quoted(value)
+    assert shown.isprintable()
+    assert len(shown) <= VALUE
+
+
+@settings(max_examples=200)
+@given(text=ANY, value=NESTED, row=st.none() | st.integers(1, 10**9))
+def test_any_error_is_one_line_of_bounded_length(text: str, value: object, row: int | None) -> None:
+    for error in (RunFailedError(text * 3), bad_field(text * 3, text * 3, value, text * 3, row=row)):
+        message = str(error)
+        assert message.isprintable()
+        assert len(message) <= MESSAGE
+        assert one_line(message) == message
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again)) == (type(error), message)
+
+
+def test_an_error_says_where_in_a_long_path_and_what_is_expected() -> None:
+    error = bad_field("/logs/" + "x" * 5000 + "/odometry.csv", "dx", "z" * 5000, "a number", row=17)
+    assert re.fullmatch(r"/logs/x.*x/odometry\.csv:17: dx is 'z.*z', expected a number", str(error))
