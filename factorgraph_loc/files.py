@@ -1,19 +1,29 @@
 """Reading what people write, and writing so that nothing is half-written."""
 
 import difflib
+import json
 import os
+import re
 import tempfile
 import tomllib
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import date, time
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import plain, quoted
+
+DEEPEST = 64  # tables or lists within each other, and parts of a key
+MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
 
 
 class FileModel(BaseModel):
@@ -25,26 +35,43 @@ class FileModel(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; InputError if it is missing or not TOML."""
+def read_text(path: Path, limit: int = bounded.DATA) -> str:
+    """The content of a text file of at most ``limit`` bytes, its line ends as they are; InputError if it is missing, larger, no
+    regular file or not UTF-8."""
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is not TOML: {error}") from error
-
-
-def read_text(path: Path) -> str:
-    """The content of a text file, its line ends as they are; InputError if it is missing or not UTF-8."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return file.read()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        return bounded.read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text in UTF-8") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or
+    has a date or an integer of more than 64 bits, of which no file of ours has any."""
+    text = read_text(path, bounded.SETTINGS)
+    if found := _LONG_KEY.search(text):  # the time that tomllib takes grows with the square of the parts
+        raise InputError(f"{path}:{text.count(chr(10), 0, found.start()) + 1}: a key has more than {DEEPEST} parts")
+    with bounded.foreign(path, "is not TOML"):
+        content = tomllib.loads(text)
+    for key, value in _leaves(content, path):
+        if isinstance(value, int) and abs(value) >= 2**63:
+            raise InputError(f"{path}: {key[:40]} is a whole number of more than 64 bits")
+        if isinstance(value, date | time):
+            raise InputError(f"{path}: {key[:40]} is a date or time, expected a number, or text between quotes")
+    return content
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file; InputError as of :func:`read_toml`, and for NaN, infinity and keys that are there twice."""
+    return parse_json(read_text(path, bounded.SETTINGS), path)
+
+
+def parse_json(text: str, source: object) -> Any:
+    """The value of a text in JSON; InputError as of :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
+    with bounded.foreign(source, "is not JSON"):
+        content = _JSON.decode(text)
+    if text.count("[") + text.count("{") > DEEPEST:
+        deque(_leaves(content, source), maxlen=0)
+    return content
 
 
 def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
@@ -95,10 +122,22 @@ def nearest(word: str, known: list[str]) -> str:
 
 
 def inside(root: Path, name: str, source: object) -> Path:
-    """The path ``name`` below ``root``; InputError if it leaves ``root``, by dots, as an absolute path or by a link."""
-    path = (root / name).resolve()
-    if not path.is_relative_to(root.resolve()):
-        raise InputError(f"{source}: path {name!r} leaves its folder {root}")
+    """The path ``name`` below ``root``, its links followed, where a file or folder is or could be.
+
+    InputError if it leaves ``root``, by dots, as an absolute path or by a link, or if it is what is neither a regular file nor a
+    folder; NoFileNameError if no file can have that name. Every path that a file names goes through here.
+    """
+    shown = name if len(name) <= 80 else f"{name[:50]}...{name[-20:]}"
+    try:
+        path = Path(os.path.realpath(root / name))
+        leaves = not path.is_relative_to(os.path.realpath(root))
+    except (OSError, ValueError) as error:  # NUL, or half of a pair of UTF-16
+        raise bounded.NoFileNameError(f"{source}: path {shown!r} cannot be the name of a file") from error
+    if leaves:
+        raise InputError(f"{source}: path {shown!r} leaves its folder {root}")
+    kind = bounded.kind(path, source)
+    if kind not in ("", "a file", "a folder"):
+        raise InputError(f"{source}: path {shown!r} is {kind}, expected a regular file")
     return path
 
 
@@ -127,3 +166,38 @@ def write_text(path: Path, text: str) -> None:
 def write_toml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a TOML file at once or not at all."""
     write_text(path, tomli_w.dumps(content))
+
+
+def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
+    """All values that are neither tables nor lists, each with its key; InputError where those are nested too deep."""
+    waiting = [("", content, 0)]
+    while waiting:
+        key, value, depth = waiting.pop()
+        if not isinstance(value, dict | list):
+            yield key, value
+        elif depth == DEEPEST:
+            raise InputError(f"{source}: {key[:40]} lies more than {DEEPEST} tables or lists deep")
+        else:
+            entries = value.items() if isinstance(value, dict) else ((key, entry) for entry in value)
+            waiting += [(name, entry, depth + 1) for name, entry in entries]
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a number has {len(digits)} digits, expected at most {MOST_DIGITS}")
+    return int(digits)
+
+
+def _constant(name: str) -> float:
+    raise ValueError(f"{name} is no number in JSON")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)[:40]!r} is there twice")
+    return found
+
+
+_JSON = json.JSONDecoder(parse_int=_integer, parse_constant=_constant, object_pairs_hook=_object)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import read_toml
+from factorgraph_loc.files import inside, read_toml
 from factorgraph_loc.shipped import manifests
 from factorgraph_loc.yaml_files import read_yaml
 
@@ -82,12 +82,13 @@ class RecordedSource:
             return
         from factorgraph_loc.readers.manifests import find_data_root  # noqa: PLC0415
 
-        beside = (path.parent / str(content["path"])).exists()  # one's own manifest, beside its log
+        beside = inside(path.parent, str(content["path"]), path).exists()  # one's own manifest, beside its log
         given = None if self.data_root is None else Path(self.data_root)
         root = path.parent if beside else find_data_root(given, path)
         names = list(content.get("checksums", {})) or [str(content["path"])]
         for name in names:
-            yield from _of_folder(root / name) if (root / name).is_dir() else [(name, root / name)]
+            data = inside(root, name, path)
+            yield from _of_folder(data) if data.is_dir() else [(name, data)]
 
 
 @dataclass(frozen=True)

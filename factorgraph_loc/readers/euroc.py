@@ -16,7 +16,7 @@ from pydantic import Field
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, parse_model
+from factorgraph_loc.files import FileModel, inside, parse_model
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers.bag_frames import angles_of_camera
 from factorgraph_loc.readers.native_camera import make_images
@@ -53,24 +53,28 @@ def read(path: Path | None, options: Options) -> Log:
     InputError names the file and what is wrong."""
     if path is None:
         raise InputError("euroc: the path of the folder with mav0 is missing")
-    folder = path / "mav0" if (path / "mav0").is_dir() else path
-    camera = folder / f"cam{options.camera}"
+    folder = inside(path, "mav0", path) if (path / "mav0").is_dir() else path
+    camera = inside(folder, f"cam{options.camera}", folder)
     if not camera.is_dir():
         there = sorted(f.name for f in folder.glob("cam?"))
         raise InputError(f"{camera}: does not exist, there are {', '.join(there) or 'no cameras'}")
-    truth = next((folder / name / "data.csv" for name in TRUTHS if (folder / name).is_dir()), None)
+    truth = next((inside(folder, f"{name}/data.csv", folder) for name in TRUTHS if (folder / name).is_dir()), None)
     if truth is None:
         raise InputError(f"{folder}: has no {TRUTHS[0]}, which a log without odometry needs")
     warnings: list[str] = []
-    table = read_image_list(camera / "data.csv", unit="ns", separator=",")
+    table = read_image_list(inside(camera, "data.csv", camera), unit="ns", separator=",")
     t0_ns = int(table.t_ns.min())
     t_ns, poses = read_poses(truth, STATE, unit="ns", separator=",", warnings=warnings)
     name = path.resolve().name
     return Log(
         name=name,
-        rig=Rig(name=f"{name}-cam{options.camera}", sensors=("camera",), camera=_camera(camera / "sensor.yaml")),
+        rig=Rig(
+            name=f"{name}-cam{options.camera}",
+            sensors=("camera",),
+            camera=_camera(inside(camera, "sensor.yaml", camera)),
+        ),
         world=World(name=name),
-        streams={"camera": make_images(table, t0_ns, warnings, camera / "data")},
+        streams={"camera": make_images(table, t0_ns, warnings, inside(camera, "data", camera))},
         reference3=later(poses, t_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),

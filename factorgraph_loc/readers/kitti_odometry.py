@@ -14,7 +14,7 @@ from pydantic import Field
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, parse_model, read_text
+from factorgraph_loc.files import FileModel, inside, parse_model, read_text
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.space_poses import image_size, later, read_kitti, read_times
@@ -35,20 +35,22 @@ def read(path: Path | None, options: Options) -> Log:
     if path is None:
         raise InputError("kitti_odometry: the path of the folder with sequences is missing")
     name = f"{options.sequence:02d}"
-    folder, poses_file = path / "sequences" / name, path / "poses" / f"{name}.txt"
+    folder, poses_file = (inside(path, below, path) for below in (f"sequences/{name}", f"poses/{name}.txt"))
     if not poses_file.is_file():
         raise InputError(f"{poses_file}: does not exist: a log without odometry needs the true poses")
-    images = folder / f"image_{options.camera}"
+    images, times, calib = (
+        inside(folder, below, folder) for below in (f"image_{options.camera}", "times.txt", "calib.txt")
+    )
     warnings: list[str] = []
-    t_ns = read_times(folder / "times.txt")
+    t_ns = read_times(times)
     rows = np.arange(1, len(t_ns) + 1, dtype=np.int64)
     files = {"file": [f"{i:06d}.png" for i in range(len(t_ns))]}
     t0_ns = int(t_ns[0])
-    stream = make_images(Table(folder / "times.txt", rows, t_ns, {}, files), t0_ns, warnings, images)
+    stream = make_images(Table(times, rows, t_ns, {}, files), t0_ns, warnings, images)
     if not len(stream.t):
         raise InputError(f"{images}: holds none of the {len(t_ns)} images of times.txt, 000000.png and on")
-    _, poses_ns, poses = read_kitti(poses_file, folder / "times.txt")
-    camera = _camera(folder / "calib.txt", options.camera, image_size(stream.file[0]))
+    _, poses_ns, poses = read_kitti(poses_file, times)
+    camera = _camera(calib, options.camera, image_size(stream.file[0]))
     return Log(
         name=f"kitti-{name}",
         rig=Rig(name=f"kitti-{name}-camera{options.camera}", sensors=("camera",), camera=camera),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from factorgraph_loc.bounded import kind
 from factorgraph_loc.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, nearest, parse_model, read_toml
@@ -107,6 +108,9 @@ def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source
     path = Path(log)
     if reader is not None:
         readers.reader(reader)  # a wrong name of a reader is told before a wrong path
+    if kind(path) not in ("", "a file", "a folder"):
+        raise InputError(f"{log}: is {kind(path)}, expected a file or a folder")
+    if reader is not None:
         if not path.exists():
             raise InputError(f"{log}: does not exist")
         return _Source(reader, path, None if reader == "native" else _name(path))

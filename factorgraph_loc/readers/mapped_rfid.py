@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from factorgraph_loc import bounded
 from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
 from factorgraph_loc.columns import ANGLE, DURATION, FREQUENCY, POWER, PURE
 from factorgraph_loc.errors import InputError, bad_field
@@ -110,7 +111,8 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
     if "*" not in options.file:
         return read_reads(inside(folder, options.file, folder), options, warnings)
     inside(folder, options.file.replace("*", "x"), folder)
-    files = sorted(file for file in folder.glob(options.file) if file.is_file())
+    with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns of which pathlib makes nothing
+        files = sorted(file for file in folder.glob(options.file) if file.is_file())
     if not files:
         raise InputError(f"{folder}: rfid.file is {options.file!r}, expected the names of files that are there")
     return joined(

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns
@@ -37,7 +37,7 @@ def read(path: Path | None, options: Options) -> Log:
         raise InputError(f"{path}: is not a folder, expected that of the .dat files")
     warnings: list[str] = []
     prefix = f"Robot{options.robot}"
-    file = path / f"{prefix}_Odometry.dat"
+    file = inside(path, f"{prefix}_Odometry.dat", path)
     table, rows = read_columns(file, ("time", "forward velocity", "angular velocity"))
     if len(rows) == 0:
         raise InputError(f"{file}: holds no rows: has no odometry, which every estimator needs")
@@ -47,17 +47,17 @@ def read(path: Path | None, options: Options) -> Log:
     streams: dict[str, Stream] = {
         "odometry": VelocityStream(checks.seconds(t_ns[keep], t0_ns), table[keep, 1], table[keep, 2])
     }
-    if (path / f"{prefix}_Measurement.dat").is_file():
+    if inside(path, f"{prefix}_Measurement.dat", path).is_file():
         sightings = read_sightings(path, prefix, t0_ns, warnings)
         if len(sightings.t):
             streams["bearing_range"] = sightings
     reference = None
-    if (file := path / f"{prefix}_Groundtruth.dat").is_file():
+    if (file := inside(path, f"{prefix}_Groundtruth.dat", path)).is_file():
         reference = read_reference(file, t0_ns, warnings)
     return Log(
         name=f"{path.name}-robot{options.robot}",
         rig=DEFAULT_RIG,
-        world=read_landmarks(path / "Landmark_Groundtruth.dat"),
+        world=read_landmarks(inside(path, "Landmark_Groundtruth.dat", path)),
         streams=streams,
         reference=reference,
         t0_ns=t0_ns,
@@ -98,11 +98,11 @@ def read_barcodes(file: Path) -> dict[int, int]:
 
 def read_sightings(folder: Path, prefix: str, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
     """The landmarks that the robot saw; other robots and unknown barcodes are counted and left out."""
-    file = folder / f"{prefix}_Measurement.dat"
+    file = inside(folder, f"{prefix}_Measurement.dat", folder)
     table, rows = read_columns(file, ("time", "barcode", "range", "bearing"))
     if len(rows) == 0:
         warnings.append(f"{file}: holds no rows")
-    subjects = read_barcodes(folder / "Barcodes.dat")
+    subjects = read_barcodes(inside(folder, "Barcodes.dat", folder))
     checks.require_above_zero(file, rows, "range", table[:, 2])
     seen = [subjects.get(whole(file, r, "barcode", c)) for r, c in zip(rows, table[:, 1], strict=True)]
     robots = sum(subject in ROBOTS for subject in seen)

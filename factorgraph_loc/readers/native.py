@@ -210,8 +210,8 @@ def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"]
     """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
 
     Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
-    written, and of a start's deviations in x and y only the larger one. Images are links to those of ``log`` where the file
-    system has links; features that were found in images, motion in space and a second camera cannot be written: InputError.
+    written, and of a start's deviations in x and y only the larger one. Images are copied; features that were found in images,
+    motion in space and a second camera cannot be written: InputError.
     """
     folder = Path(folder)
     require_new(folder)

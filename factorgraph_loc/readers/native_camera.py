@@ -6,11 +6,10 @@ where their features are looked for (:mod:`factorgraph_loc.vision.frontend`).
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from factorgraph_loc.bounded import NoFileNameError, copy_file
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside
 from factorgraph_loc.log import ImageStream, SightingStream
@@ -23,12 +22,12 @@ FOLDER = "camera"
 
 
 def make_images(table: Table, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
-    """The images that there are, in order of arrival; of several at one stamp the last. They lie below ``folder``, by default that
-    of the native format.
+    """The images that there are, in order of arrival; of several at one stamp the last. They lie below ``folder``, which was
+    checked itself, by default that of the native format.
 
-    InputError for a path that leaves the folder, and a stamp that is late by more than 0.5 s."""
+    InputError for a path that leaves the folder or is no regular file, and a stamp that is late by more than 0.5 s."""
     checks.arrivals(table.path, table.rows, table.t_ns, warnings)
-    within = table.path.parent / FOLDER if folder is None else folder
+    within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
     named = zip(table.rows.tolist(), table.names["file"], strict=True)
     paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]
     last = {t: i for i, t in enumerate(table.t_ns.tolist())}
@@ -58,20 +57,16 @@ def make_pixels(table: Table, t0_ns: int, warnings: list[str]) -> SightingStream
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:
     """Put the images into the new folder ``camera`` of a log's ``folder``, and return their names there, by their numbers.
 
-    They are links to the same content where the file system can do that, copies elsewhere. InputError names one that is gone.
+    They are copies: whoever edits one does not edit the other. InputError names one that is gone.
     """
     target = folder / FOLDER
     target.mkdir()
     names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
     for file, name in zip(files, names, strict=True):
-        source = file.resolve()
         try:
-            os.link(source, target / name)
-        except OSError:  # another file system, or one without links
-            try:
-                shutil.copyfile(source, target / name)
-            except OSError as error:
-                raise InputError(f"{file}: cannot be copied into {target}: {error.strerror}") from error
+            copy_file(file, target / name)
+        except OSError as error:
+            raise InputError(f"{file}: cannot be copied into {target}: {error.strerror}") from error
     return names
 
 
@@ -79,6 +74,6 @@ def _image(folder: Path, source: str, name: str) -> Path | None:
     """The path of an image below ``folder``; None if there is no such file."""
     try:
         path = inside(folder, name, source)
-        return path if path.is_file() else None
-    except (OSError, ValueError):  # no name that a file could have
+    except NoFileNameError:
         return None
+    return path if path.is_file() else None

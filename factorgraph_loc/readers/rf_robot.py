@@ -16,7 +16,7 @@ from pydantic import Field
 
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, read_text
+from factorgraph_loc.files import FileModel, inside, read_text
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.readers import checks, simulated_odometry
 from factorgraph_loc.readers.columns import read_columns
@@ -47,18 +47,18 @@ def read(path: Path | None, options: Options) -> Log:
     """The run; t = 0 at the first pose of the reference. InputError names file, row and field of what is wrong."""
     if path is None:
         raise InputError("rf_robot: the path of the folder with tags.csv is missing")
-    folder = path / f"run{options.run}"
+    folder = inside(path, f"run{options.run}", path)
     if not folder.is_dir():
         runs = sorted(f.name for f in path.glob("run*") if f.is_dir())
         raise bad_field(path, "run", options.run, f"a folder of that number, one of {', '.join(runs) or '(none)'}")
     warnings: list[str] = []
-    reference, t0_ns = read_reference(folder / "reference_pose.txt", warnings)
+    reference, t0_ns = read_reference(inside(folder, "reference_pose.txt", folder), warnings)
     odometry = wheel_odometry(reference, options.odometry_seed)
-    reads = [read_reads(folder / f"{antenna}.txt", warnings) for antenna in ANTENNAS]
+    reads = [read_reads(inside(folder, f"{antenna}.txt", folder), warnings) for antenna in ANTENNAS]
     return Log(
         name=f"{path.resolve().name}-run{options.run}",
         rig=DEFAULT_RIG,
-        world=World(name=path.resolve().name, tags=read_tags(path / "tags.csv")),
+        world=World(name=path.resolve().name, tags=read_tags(inside(path, "tags.csv", path))),
         streams={"odometry": odometry, "rfid": make_stream(reads, t0_ns, float(odometry.t[-1]), folder, warnings)},
         reference=Trajectory(reference.t[::THINNING], reference.poses[::THINNING]),
         t0_ns=t0_ns,

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, read_text
+from factorgraph_loc.files import FileModel, inside, read_text
 from factorgraph_loc.log import ImageStream, Log
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory3 import Trajectory3
@@ -49,7 +49,7 @@ def read(path: Path | None, options: Options) -> Log:
     if path is None:
         raise InputError("sevenscenes: the path of the folder with frame-*.color.jpg is missing")
     images = _frames(path)
-    poses = np.array([_pose(_pose_file(image)) for image in images])
+    poses = np.array([_pose(inside(path, _pose_file(image).name, path)) for image in images])
     for image in images:
         _check_image(image)
     t = np.arange(len(images)) / options.rate
@@ -67,7 +67,7 @@ def _frames(folder: Path) -> list[Path]:
     images = sorted(file for kind in IMAGES for file in folder.glob(f"frame-*.{kind}"))
     if not images:
         raise InputError(f"{folder}: holds no images frame-*.color.jpg or frame-*.color.png")
-    return images
+    return [inside(folder, image.name, folder) for image in images]
 
 
 def _pose_file(image: Path) -> Path:

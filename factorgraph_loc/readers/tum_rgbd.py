@@ -8,7 +8,7 @@ from pathlib import Path
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.space_poses import later, read_image_list, read_poses
@@ -37,9 +37,9 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     if path is None:
         raise InputError("tum_rgbd: the path of the folder with rgb.txt is missing")
     warnings: list[str] = []
-    table = read_image_list(path / "rgb.txt", unit="s", separator=" ")
+    table = read_image_list(inside(path, "rgb.txt", path), unit="s", separator=" ")
     t0_ns = int(table.t_ns.min())
-    t_ns, poses = read_poses(path / "groundtruth.txt", POSES, unit="s", separator=" ", warnings=warnings)
+    t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), POSES, unit="s", separator=" ", warnings=warnings)
     name = path.resolve().name
     return Log(
         name=name,

@@ -1,0 +1,195 @@
+import os
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from factorgraph_loc import bounded
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import inside, parse_json, read_json, read_text, read_toml
+
+
+def refused(call, *words: str) -> str:
+    with pytest.raises(InputError) as caught:
+        call()
+    text = str(caught.value)
+    assert "\n" not in text
+    assert len(text) < 400
+    for word in words:
+        assert word in text
+    return text
+
+
+def test_a_path_below_a_folder_follows_links_within_it(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "file").write_text("")
+    (tmp_path / "b").symlink_to("a")
+    assert inside(tmp_path, "b/file", "log") == tmp_path / "a" / "file"
+    assert inside(tmp_path, "b/none", "log") == tmp_path / "a" / "none"
+    assert inside(tmp_path, "b", "log") == tmp_path / "a"
+
+
+def test_a_folder_that_is_named_through_a_link_is_the_folder(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "file").write_text("")
+    (tmp_path / "log").symlink_to("disk")
+    assert inside(tmp_path / "log", "file", "log").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret", "/etc/passwd", "out", "out/passwd", "a/../../secret", "far", "a/up/secret"]
+)
+def test_a_path_that_leaves_its_folder_is_refused(tmp_path, name):
+    root = tmp_path / "log"
+    (root / "a").mkdir(parents=True)
+    (tmp_path / "secret").write_text("")
+    (root / "out").symlink_to("/etc")
+    (root / "far").symlink_to("out")
+    (root / "a" / "up").symlink_to("../..")
+    refused(lambda: inside(root, name, "run.toml"), "run.toml: path", "leaves its folder")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 5000, "x/" * 3000 + "y", "\ud800"])
+def test_a_path_that_no_file_can_have_is_refused(tmp_path, name):
+    refused(lambda: inside(tmp_path, name, "run.toml"), "run.toml: ")
+    refused(lambda: read_text(tmp_path / name), "cannot be")
+
+
+def test_a_link_to_itself_is_refused(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    refused(lambda: read_text(tmp_path / "a"), "cannot be read")
+    refused(lambda: inside(tmp_path, "a", "run.toml"), "run.toml: ")
+
+
+@pytest.mark.parametrize("what", ["fifo", "socket", "zero", "folder"])
+def test_only_regular_files_are_read(tmp_path, what):
+    path = tmp_path / "it"
+    match what:
+        case "fifo":
+            os.mkfifo(path)
+        case "socket":
+            here = Path.cwd()
+            os.chdir(tmp_path)  # the name of a socket is short
+            try:
+                socket.socket(socket.AF_UNIX).bind("it")
+            finally:
+                os.chdir(here)
+        case "zero":
+            path.symlink_to("/dev/zero")
+        case "folder":
+            path.mkdir()
+    started = time.monotonic()
+    refused(lambda: read_text(path), "it: is a", "expected a regular file")
+    refused(lambda: bounded.copy_file(path, tmp_path / "copy"), "expected a regular file")
+    if what in ("fifo", "socket"):
+        refused(lambda: inside(tmp_path, "it", "run.toml"), "run.toml: path 'it' is a", "expected a regular file")
+    assert time.monotonic() - started < 1.0
+    assert not (tmp_path / "copy").exists()
+
+
+def test_a_file_is_not_read_before_its_size_is_known_to_be_small_enough(tmp_path):
+    path = tmp_path / "sparse.toml"
+    with path.open("wb") as file:
+        file.truncate(10**12)
+    refused(lambda: read_toml(path), "its size in bytes is 1,000,000,000,000, expected at most 16,777,216")
+    refused(lambda: read_text(path), "expected at most 1,073,741,824")
+
+
+def test_a_copy_is_a_file_of_its_own(tmp_path):
+    source, copy = tmp_path / "a.png", tmp_path / "b.png"
+    source.write_bytes(bytes(range(256)) * 10000)
+    bounded.copy_file(source, copy)
+    assert copy.read_bytes() == source.read_bytes()
+    with copy.open("r+b") as file:
+        file.write(b"edited")
+    assert source.read_bytes()[:6] == bytes(range(6))
+    assert source.stat().st_nlink == 1
+    with pytest.raises(FileExistsError):
+        bounded.copy_file(source, copy)
+
+
+def test_toml_of_other_editors_is_read(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"\xef\xbb\xbfa = 1\r\nb = '''x\r\ny'''\r\n")
+    assert read_toml(path) == {"a": 1, "b": "x\ny"}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"x = " + b"9" * 5000, "is not TOML"),
+        (b"x = " + b"9" * 4000, "more than 64 bits"),
+        (b"x = " + b"[" * 3000 + b"]" * 3000, "nested too deep"),
+        (b"x = " + b"[" * 100 + b"]" * 100, "64 tables or lists deep"),
+        (b"x = " + b"{a=" * 3000 + b"1" + b"}" * 3000, "nested too deep"),
+        (b"\n" + b"a." * 100_000 + b"a = 1", "a.toml:2: a key has more than 64 parts"),
+        (b'["a"' + b" . 'b'" * 100_000 + b"]", "a key has more than 64 parts"),
+        (b"x = 1979-05-27", "x is a date"),
+        (b"x = [{y = [07:32:00]}]", "y is a date or time"),
+        (b"x = 1979-05-27T07:32:00Z", "x is a date"),
+        (b"x = \xff", "is not text in UTF-8"),
+        (b"x = 1\0", "is not TOML"),
+        ("x = 1".encode("utf-16"), "is not text in UTF-8"),
+        (b"x = 1\nx = 2", "is not TOML"),
+        (b"x = 1\n[x.y]", "is not TOML"),
+    ],
+)
+def test_what_is_no_toml_of_ours_is_one_line(tmp_path, content, words):
+    path = tmp_path / "a.toml"
+    path.write_bytes(content)
+    started = time.monotonic()
+    refused(lambda: read_toml(path), "a.toml", words)
+    assert time.monotonic() - started < 2.0
+
+
+def test_long_words_and_numbers_with_points_are_no_long_keys(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text(f'x = [{", ".join(["0.5"] * 1000)}]\ny = "{"a" * 500_000}"\nz = "{"..." * 1000} 1.2.3.4"\n')
+    assert read_toml(path)["x"] == [0.5] * 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 5000 + "]" * 5000, "nested too deep"),
+        ("[" * 100 + "]" * 100, "64 tables or lists deep"),
+        ('{"a":' * 100 + "1" + "}" * 100, "64 tables or lists deep"),
+        ("9" * 5000, "5000 digits"),
+        ('{"a": NaN}', "NaN"),
+        ("-Infinity", "Infinity"),
+        ('{"a": 1, "a": 2}', "'a' is there twice"),
+        ('{"a": 1', "is not JSON"),
+        ("", "is not JSON"),
+        ("\ufeff1", "is not JSON"),
+    ],
+)
+def test_what_is_no_json_of_ours_is_one_line(tmp_path, text, words):
+    refused(lambda: parse_json(text, "log.jsonl:3"), "log.jsonl:3: ", words)
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    if not text.startswith("\ufeff"):
+        refused(lambda: read_json(path), "a.json: ", words)
+
+
+def test_json_keeps_integers_as_long_as_an_epc():
+    assert parse_json('{"epc": 79228162514264337593543950335, "t": 1e400}', "a")["epc"] == 2**96 - 1
+
+
+def test_what_another_library_raises_is_one_line():
+    class Panic(BaseException):
+        pass
+
+    def fail(error: BaseException) -> None:
+        with bounded.foreign("a.npz", "is no grid"):
+            raise error
+
+    refused(lambda: fail(ValueError("first\nsecond")), "a.npz: is no grid: first")
+    refused(lambda: fail(MemoryError()), "more memory than there is")
+    refused(lambda: fail(ValueError()), "ValueError")
+    refused(lambda: fail(InputError("as it is")), "as it is")
+    with pytest.raises(Panic):
+        fail(Panic())
+    Panic.__module__ = "pyo3_runtime"  # of libraries in Rust
+    refused(lambda: fail(Panic("index out of range")), "index out of range")
