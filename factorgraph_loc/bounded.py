@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.text import plain, quoted, told
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
 YAML = 2**20  # bytes of a YAML file, which takes a hundred times as long to read
@@ -48,23 +49,24 @@ def kind(path: Path, source: object = None) -> str:
 
     NoFileNameError if no file can have that name, InputError if it may not be looked at; they name ``source``, by default the path.
     """
-    shown = str(path) if len(str(path)) <= 100 else f"{str(path)[:60]}...{str(path)[-30:]}"
     try:
         return _kind(path.stat())
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOTDIR):
             return ""
         if error.errno == errno.ENAMETOOLONG:
-            raise NoFileNameError(f"{source or shown}: {shown!r} cannot be the name of a file: too long") from error
-        raise InputError(f"{source or shown}: {shown!r} cannot be read: {error.strerror}") from error
+            raise NoFileNameError(
+                f"{source or plain(path)}: {quoted(str(path))} cannot be the name of a file: too long"
+            ) from error
+        raise InputError(f"{source or plain(path)}: {quoted(str(path))} cannot be read: {error.strerror}") from error
     except ValueError as error:  # NUL, or half of a pair of UTF-16
-        raise NoFileNameError(f"{source or shown}: {shown!r} cannot be the name of a file") from error
+        raise NoFileNameError(f"{source or plain(path)}: {quoted(str(path))} cannot be the name of a file") from error
 
 
 def require_size(source: object, what: str, size: int, limit: int) -> None:
     """InputError if ``size``, in bytes or as ``what`` says, is above ``limit``: to be called before memory is taken."""
     if not 0 <= size <= limit:
-        raise InputError(f"{source}: {what} is {size:,}, expected at most {limit:,}")
+        raise InputError(f"{plain(source)}: {what} is {size:,}, expected at most {limit:,}")
 
 
 @contextmanager
@@ -76,7 +78,7 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
         # without waiting, should a FIFO have taken the file's place since
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
     with file:
         now = os.fstat(file.fileno())
         _require_file(path, _kind(now))
@@ -90,7 +92,7 @@ def read_bytes(path: Path, limit: int) -> bytes:
         try:
             content = file.read(limit + 1)  # a file may grow, and those of /proc say that they are empty
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+            raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
     require_size(path, "its size in bytes", len(content), limit)
     return content
 
@@ -117,14 +119,13 @@ def foreign(source: object, what: str) -> Iterator[None]:
     except FglocError:
         raise
     except MemoryError as error:
-        raise InputError(f"{source}: {what}: it takes more memory than there is") from error
+        raise InputError(f"{plain(source)}: {what}: it takes more memory than there is") from error
     except RecursionError as error:
-        raise InputError(f"{source}: {what}: it is nested too deep") from error
+        raise InputError(f"{plain(source)}: {what}: it is nested too deep") from error
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
             raise  # a signal
-        told = " ".join(str(error).split("\n")[0].split())
-        raise InputError(f"{source}: {what}: {told[:120] or type(error).__name__}") from error
+        raise InputError(f"{plain(source)}: {what}: {told(error)}") from error
 
 
 def _kind(found: os.stat_result) -> str:
@@ -133,4 +134,4 @@ def _kind(found: os.stat_result) -> str:
 
 def _require_file(path: Path, kind: str) -> None:
     if kind != "a file":
-        raise InputError(f"{path}: is {kind}, expected a regular file")
+        raise InputError(f"{plain(path)}: is {kind}, expected a regular file")

@@ -6,7 +6,7 @@ import os
 import re
 import tempfile
 import tomllib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import date, time
@@ -54,9 +54,11 @@ def read_toml(path: Path) -> dict[str, Any]:
         content = tomllib.loads(text)
     for key, value in _leaves(content, path):
         if isinstance(value, int) and abs(value) >= 2**63:
-            raise InputError(f"{path}: {key[:40]} is a whole number of more than 64 bits")
+            raise InputError(f"{plain(path)}: {plain(key)} is a whole number of more than 64 bits")
         if isinstance(value, date | time):
-            raise InputError(f"{path}: {key[:40]} is a date or time, expected a number, or text between quotes")
+            raise InputError(
+                f"{plain(path)}: {plain(key)} is a date or time, expected a number, or text between quotes"
+            )
     return content
 
 
@@ -127,17 +129,16 @@ def inside(root: Path, name: str, source: object) -> Path:
     InputError if it leaves ``root``, by dots, as an absolute path or by a link, or if it is what is neither a regular file nor a
     folder; NoFileNameError if no file can have that name. Every path that a file names goes through here.
     """
-    shown = name if len(name) <= 80 else f"{name[:50]}...{name[-20:]}"
     try:
         path = Path(os.path.realpath(root / name))
         leaves = not path.is_relative_to(os.path.realpath(root))
     except (OSError, ValueError) as error:  # NUL, or half of a pair of UTF-16
-        raise bounded.NoFileNameError(f"{source}: path {shown!r} cannot be the name of a file") from error
+        raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
     if leaves:
-        raise InputError(f"{source}: path {shown!r} leaves its folder {root}")
+        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}")
     kind = bounded.kind(path, source)
     if kind not in ("", "a file", "a folder"):
-        raise InputError(f"{source}: path {shown!r} is {kind}, expected a regular file")
+        raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")
     return path
 
 
@@ -176,7 +177,7 @@ def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
         if not isinstance(value, dict | list):
             yield key, value
         elif depth == DEEPEST:
-            raise InputError(f"{source}: {key[:40]} lies more than {DEEPEST} tables or lists deep")
+            raise InputError(f"{source}: {plain(key)} lies more than {DEEPEST} tables or lists deep")
         else:
             entries = value.items() if isinstance(value, dict) else ((key, entry) for entry in value)
             waiting += [(name, entry, depth + 1) for name, entry in entries]
@@ -195,8 +196,8 @@ def _constant(name: str) -> float:
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)[:40]!r} is there twice")
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {quoted(twice)} is there twice")
     return found
 
 
