@@ -244,15 +244,17 @@ def experiment(
     jobs: int | None = None,
     scheduler: str | None = None,
     retry_failed: bool = False,
+    verify: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
     """Make the runs of an experiment's file whose results are not there yet.
 
     ``changes``: other values of its dotted keys, as of ``--set``. ``out``: folder of the results, else what the file says.
     ``jobs``: processes, else one per core; ``scheduler``: address of a ``dask.distributed`` cluster in place of them.
+    ``verify``: what is stored is compared with its checksums, and made again where it is damaged.
     ``progress`` is given the number of runs done, of all, and of failures. A run that fails is a row and a line of ``failures``.
     """
-    prepared = _prepared(file, changes, out, data_root)
+    prepared = _prepared(file, changes, out, data_root, verify=verify)
     executor = None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed)
     return run_experiment(prepared, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
 
@@ -265,11 +267,12 @@ def report(
     data_root: str | Path | None = None,
     page: str | Path | None = None,
 ) -> Path:
-    """Write the results of an experiment as one HTML page, ``report.html`` in its folder or ``page``, and return its path.
+    """Write the results of an experiment as one HTML page, ``report.html`` in its folder or ``page``, and return its path. Damaged
+    results are named there, and left out.
 
     ``changes``, ``out`` and ``data_root`` as they were given to :func:`experiment`.
     """
-    return report_experiment(_prepared(file, changes, out, data_root), None if page is None else Path(page))
+    return report_experiment(_prepared(file, changes, out, data_root), None if page is None else Path(page)).page
 
 
 def images(
@@ -309,10 +312,15 @@ def features(
 
 
 def _prepared(
-    file: str | Path, changes: Settings | None, out: str | Path | None, data_root: str | Path | None
+    file: str | Path,
+    changes: Settings | None,
+    out: str | Path | None,
+    data_root: str | Path | None,
+    *,
+    verify: bool = False,
 ) -> Prepared:
     folder, root = None if out is None else Path(out), None if data_root is None else str(data_root)
-    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder)
+    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder, verify=verify)
 
 
 def _one(log: LogLike) -> Log:

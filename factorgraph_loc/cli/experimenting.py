@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Prepared
 
 MANY = 2000  # runs that are not planned by mistake
-SHOWN = 10  # failures; all are in the table
+SHOWN = 10  # failures, which are all in the table, and damaged runs
 
 app = typer.Typer(no_args_is_help=True, help="Many runs of a file: make them, see how far they are, report on them.")
 
@@ -45,6 +45,9 @@ def run(
         typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that makes the runs instead."),
     ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run again what failed.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Compare stored results with their checksums; make damaged ones again.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and how long they may take.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help=f"Yes, these are to be more than {MANY:,} runs.")] = False,
     data_root: DataRoot = None,
@@ -56,7 +59,7 @@ def run(
 
     if scheduler is not None and jobs is not None:
         raise InputError("--jobs is of this machine, but --scheduler names a cluster: expected one of them")
-    prepared = _prepared(file, set_, out, data_root)
+    prepared = _prepared(file, set_, out, data_root, verify=verify)
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return
@@ -116,11 +119,13 @@ def status(
     ]
     if json:
         counts = {label: dict(zip(states, numbers, strict=True)) for label, numbers in by_label.items()}
-        show.document({"folder": str(prepared.folder), "labels": counts, "failures": reasons})
+        damaged = [run.shown for run in prepared.damaged()]
+        show.document({"folder": str(prepared.folder), "labels": counts, "failures": reasons, "damaged": damaged})
         return
     total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
     show.table(["label", *states], rows)
+    _print_damaged([run.shown for run in prepared.damaged()], file)
     for one in reasons:
         typer.echo(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
 
@@ -136,14 +141,15 @@ def report(
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """Write the results of an experiment as one HTML page, of those runs that are there."""
+    """Write the results of an experiment as one HTML page, of those runs that are there and not damaged."""
     from factorgraph_loc.experiments.reporting import report_experiment
 
     written = report_experiment(_prepared(file, set_, out, data_root), page)
     if json:
-        show.document({"page": str(written)})
-    else:
-        typer.echo(f"the report is {written}")
+        show.document({"page": str(written.page), "damaged": written.damaged})
+        return
+    typer.echo(f"the report is {written.page}")
+    _print_damaged(written.damaged, file, "left out")
 
 
 def _prepared(
@@ -186,6 +192,15 @@ def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -
     typer.echo(
         f"\n{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes"
     )
+
+
+def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
+    for run in runs[:SHOWN]:
+        typer.echo(f"damaged{what and f', {what}'}: {run}")
+    if len(runs) > SHOWN:
+        typer.echo(f"damaged: {len(runs) - SHOWN} more")
+    if runs:
+        typer.echo(f"`fgloc experiment run {file} --verify` makes them again")
 
 
 def _span(seconds: float) -> str:

@@ -160,7 +160,7 @@ class _Cluster:
                 claim.close()
                 self._busy.append(run)
                 continue
-            state = self._store.state(run.key)
+            state = self._store.state(run.key, thorough=True)
             if state == "ok" or (state == "failed" and not self._again):
                 claim.close()
                 yield stored_outcome(run.key, self._store)

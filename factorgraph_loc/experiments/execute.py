@@ -46,7 +46,7 @@ def run_planned(run: PlannedRun, folder: Path, *, again: bool = False) -> Outcom
     with store.claim(run.key) as mine:
         if not mine:
             return Outcome(run.key, "busy")
-        state = store.state(run.key)
+        state = store.state(run.key, thorough=True)  # that of a run which its caller takes to be missing or damaged
         if state == "ok" or (state == "failed" and not again):
             return stored_outcome(run.key, store)
         store.put(run.key, compute(run))
@@ -59,7 +59,7 @@ def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Out
     with store.claim(run.key) as mine:
         if not mine:
             return Outcome(run.key, "busy")
-        if store.state(run.key) != "ok":
+        if store.state(run.key, thorough=True) != "ok":
             store.put(run.key, {FAILURE: failure_file(kind, reason)})
         return stored_outcome(run.key, store)
 

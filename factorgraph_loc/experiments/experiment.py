@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -38,6 +38,14 @@ class Prepared:
     def store(self) -> Store:
         """Where the results are."""
         return Store(self.folder)
+
+    def damaged(self) -> list[PlannedRun]:
+        """The runs whose results are not as they were written."""
+        return [run for run in self.runs if self.states[run.key] == "damaged"]
+
+    def verified(self) -> Prepared:
+        """The same, with states by all checksums."""
+        return replace(self, states={key: self.store.state(key, thorough=True) for key in self.states})
 
     def todo(self, *, again: bool = False) -> list[PlannedRun]:
         """The runs that are to be made; with ``again`` those that failed too."""
@@ -117,7 +125,7 @@ def run_experiment(
     finally:
         for run in todo:  # an interrupt may come between a run's end and the news of it
             if states[run.key] not in ("ok", "failed"):
-                states[run.key] = prepared.store.state(run.key)
+                states[run.key] = prepared.store.state(run.key, thorough=True)
         rows = _write_rows(prepared, states)
     found = rows.to_dicts()
     return Done(rows, [_failure(row) for row in found if row["status"] == "failed"], lines(found))
@@ -125,16 +133,24 @@ def run_experiment(
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
     """How long the runs take one after the other [s]: as those of the same estimator did, by duration of the log, else a guess."""
+    import polars as pl  # noqa: PLC0415
+
     from factorgraph_loc.experiments.index import load_results  # noqa: PLC0415
 
-    columns = ["label", "estimator", "log", "timing.run_seconds", "duration"]
+    columns = {
+        "label": "String",
+        "estimator": "String",
+        "log": "String",
+        "timing.run_seconds": "Float64",
+        "duration": "Float64",
+    }
+    known: dict[tuple[str, str], list[float]] = {}
     try:
         rows = load_results(folder)
     except InputError:
-        return sum(run.duration / PACE for run in runs)
-    rows = rows.select(c for c in columns if c in rows.columns).drop_nulls()
-    known: dict[tuple[str, str], list[float]] = {}
-    for label, estimator, log, seconds, duration in rows.iter_rows() if rows.width == len(columns) else ():
+        rows = pl.DataFrame()
+    is_whole = columns.items() <= {name: str(kind) for name, kind in rows.schema.items()}.items()
+    for label, estimator, log, seconds, duration in rows.select(*columns).drop_nulls().iter_rows() if is_whole else ():
         for like in ((label, log), (label, ""), (estimator, "")):
             known.setdefault(like, []).append(seconds / max(duration, 1e-9))
     total = 0.0

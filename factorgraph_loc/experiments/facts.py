@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel
 
 from factorgraph_loc.experiments.experiment_file import canonical
 from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions, read_cache, write_cache
@@ -30,50 +32,53 @@ class EstimatorFacts:
     deterministic: bool
 
 
+class _Kept(BaseModel):
+    """What was looked up with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings, and
+    ``priors`` that are some."""
+
+    version: str
+    logs: dict[str, list[LogFacts]] = {}
+    estimators: dict[str, EstimatorFacts] = {}
+    priors: list[str] = []
+
+
 class Facts:
     """Facts by what they are about, kept in ``cache`` as long as code and libraries are the same."""
 
     def __init__(self, cache: Path) -> None:
         self._cache = cache
-        self._version = digest_of([code_version(), library_versions()])
-        kept = read_cache(cache)
-        known = kept.get("facts") if kept.get("version") == self._version else None
-        self._known: dict[str, Any] = known if isinstance(known, dict) else {}
-        self._estimators: dict[str, EstimatorFacts] = {}
+        version = digest_of([code_version(), library_versions()])
+        kept = read_cache(cache, _Kept)
+        self._known = kept if kept is not None and kept.version == version else _Kept(version=version)
         self._new = False
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
         """Of all logs that a source stands for; InputError as of the reader, or of the simulation's settings."""
-        found = self._known.get(digest)
-        if found is None:
-            found = self._keep(digest, [asdict(_facts(log)) for log in source.load_all()])
-        return [LogFacts(one["name"], one["duration"], tuple(one["sensors"])) for one in found]
+        if digest not in self._known.logs:
+            self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
+        return self._known.logs[digest]
 
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
         """Of an estimator with these settings; InputError if there is none, or if they are none of it."""
         key = f"{name} {canonical(settings)}"
-        if key not in self._estimators:
-            found = self._known.get(key) or self._keep(key, asdict(_of_estimator(name, settings)))
-            self._estimators[key] = EstimatorFacts(found["effective"], found["deterministic"])
-        return self._estimators[key]
+        if key not in self._known.estimators:
+            self._known.estimators[key], self._new = _of_estimator(name, settings), True
+        return self._known.estimators[key]
 
     def check_prior(self, prior: str) -> None:
         """InputError for a prior that is none."""
-        if f"prior {prior}" not in self._known:
+        if prior not in self._known.priors:
             from factorgraph_loc.experiments.prior import check_prior  # noqa: PLC0415
 
             check_prior(prior)
-            self._keep(f"prior {prior}", True)
+            self._known.priors.append(prior)
+            self._new = True
 
     def save(self) -> None:
         """Keep what is new."""
         if self._new:
-            write_cache(self._cache, {"version": self._version, "facts": self._known})
+            write_cache(self._cache, self._known)
             self._new = False
-
-    def _keep(self, key: str, value: Any) -> Any:
-        self._known[key], self._new = value, True
-        return value
 
 
 def _facts(log: Any) -> LogFacts:

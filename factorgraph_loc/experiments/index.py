@@ -21,7 +21,7 @@ TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "rea
 
 
 def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
-    """The rows of those runs whose results are stored; see :func:`load_results`. InputError for a damaged one."""
+    """The rows of those runs whose results are stored; see :func:`load_results`. DamagedError for a damaged one."""
     rows = [_row(run, store.row(run.key)) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
@@ -59,7 +59,7 @@ def load_results(path: str | Path) -> pl.DataFrame:
 
 
 def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:
-    return {
+    row = {
         "label": run.label,
         "log": run.log,
         "estimator": run.estimator,
@@ -70,5 +70,5 @@ def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:
         **{name: found.pop(name) for name in ("status", "kind", "reason")},
         "key": run.key,
         "duration": run.duration,
-        **found,
     }
+    return row | {name: value for name, value in found.items() if name not in row}

@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 import factorgraph_loc
 from factorgraph_loc.errors import InputError
@@ -34,6 +36,7 @@ OUTSIDE = (
     "experiments/maps.py",
     "experiments/reporting.py",
 )
+Kept = TypeVar("Kept", bound=BaseModel)
 _UNSETTLED = 2.0  # s: a file that young may change again within the same stamp
 
 
@@ -74,19 +77,24 @@ def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
     )
 
 
-def read_cache(file: Path) -> dict[str, Any]:
-    """A JSON object that was kept; empty if it is not there or damaged, for it can be made again."""
+def read_cache(file: Path, kind: type[Kept]) -> Kept | None:
+    """What was kept; None if it is not there or damaged, for it can be made again."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
+        return kind.model_validate_json(file.read_bytes())
+    except (OSError, ValidationError):
+        return None
 
 
-def write_cache(file: Path, content: Mapping[str, Any]) -> None:
-    """Keep a JSON object; where it cannot be written, it is made again the next time."""
+def write_cache(file: Path, content: BaseModel) -> None:
+    """Keep it; where it cannot be written, it is made again the next time."""
     with suppress(OSError):
-        write_text(file, json.dumps(content))
+        write_text(file, json.dumps(content.model_dump()))
+
+
+class _Digests(BaseModel):
+    """By path: the size, the time of change and the sha256."""
+
+    files: dict[str, tuple[int, int, str]] = {}
 
 
 class FileDigests:
@@ -95,7 +103,7 @@ class FileDigests:
     def __init__(self, cache: Path | None) -> None:
         self._cache = cache
         self._new = False
-        self._known: dict[str, list[Any]] = {} if cache is None else read_cache(cache)
+        self._known = ((cache and read_cache(cache, _Digests)) or _Digests()).files
 
     def of_source(self, source: LogSource) -> str:
         """The digest of what a log is made from; InputError if a file is not there."""
@@ -107,21 +115,21 @@ class FileDigests:
         try:
             stat = path.stat()
             known = self._known.get(str(path))
-            if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
-                return str(known[2])
+            if known is not None and known[:2] == (stat.st_size, stat.st_mtime_ns):
+                return known[2]
             with path.open("rb") as file:
                 found = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         if time.time() - stat.st_mtime > _UNSETTLED:
-            self._known[str(path)] = [stat.st_size, stat.st_mtime_ns, found]
+            self._known[str(path)] = (stat.st_size, stat.st_mtime_ns, found)
             self._new = True
         return found
 
     def save(self) -> None:
         """Keep what is new."""
         if self._new and self._cache is not None:
-            write_cache(self._cache, self._known)
+            write_cache(self._cache, _Digests(files=self._known))
             self._new = False
 
 

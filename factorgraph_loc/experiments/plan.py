@@ -50,6 +50,12 @@ class PlannedRun:
     sweep: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def shown(self) -> str:
+        """What tells it from the others, in words."""
+        swept = "".join(f", {key} {value}" for key, value in self.sweep.items())
+        return f"{self.log}, {self.label}{swept}, seed {self.seed}"
+
+    @property
     def config(self) -> RunConfig:
         """What is run on the log."""
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator

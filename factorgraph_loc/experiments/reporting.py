@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,12 +19,22 @@ from factorgraph_loc.experiments.plan import PlannedRun
 PAGE = "report.html"
 
 
-def report_experiment(prepared: Prepared, out: Path | None = None) -> Path:
-    """Write the page of all results of an experiment that are there, by default into its folder, and return its path.
+@dataclass(frozen=True)
+class Report:
+    """The ``page`` that was written, and the ``damaged`` runs that it leaves out, in words."""
 
-    What the logs look like is kept in the store, so that they are read once. InputError without any results, for damaged ones, or
-    if the page cannot be written.
+    page: Path
+    damaged: list[str]
+
+
+def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
+    """Write the page of all results of an experiment that are there, by default into its folder.
+
+    All results are compared with their checksums; damaged ones are named and left out. What the logs look like is kept in the
+    store, so that they are read once. InputError without any results, or if the page cannot be written.
     """
+    prepared = prepared.verified()
+    damaged = [run.shown for run in prepared.damaged()]
     rows = collect((run for run in prepared.runs if prepared.states[run.key] in ("ok", "failed")), prepared.store)
     runs = {run.key: run for run in prepared.runs}
     scenes: dict[str, Scene | None] = {}
@@ -46,16 +57,17 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Path:
             baseline=settings.baseline if is_there else None,  # of results that are still being made
             title=prepared.experiment.name,
             experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
+            damaged=damaged,
             versions={"factorgraph-loc": __version__, "its source, sha256": code_version(), **library_versions()},
         )
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-    return path
+    return Report(path, damaged)
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
     """Of a run's log; None if the log has vanished."""
-    with suppress(OSError, ValueError, KeyError):
+    with suppress(OSError, ValueError):
         return Scene.read(kept)
     try:
         scene = Scene.of(run.source.load())

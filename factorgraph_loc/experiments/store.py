@@ -18,14 +18,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
+from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, Manifest, parse_stored
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
 
 MANIFEST, METRICS, TIMINGS, FAILURE = "manifest.json", "metrics.json", "timings.json", "failure.json"
+TIMING = "timing."  # what times begin with
 State = Literal["ok", "failed", "missing", "damaged"]
+_AGAIN = "; `fgloc experiment run --verify` makes it again"
 
 
 class StoreError(RunFailedError):
@@ -47,10 +50,12 @@ class Store:
 
     def sweep(self) -> None:
         """Remove what processes that died have left behind: claims, and results that are half-written."""
-        for key in {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}:
+        with self._writing():
+            keys = {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}
+        for key in keys:
             with self.claim(key) as mine:
                 if mine:
-                    shutil.rmtree(self.folder / "tmp" / key, ignore_errors=True)
+                    _remove(self.folder / "tmp" / key)
 
     def path(self, key: str) -> Path:
         """The folder of a run."""
@@ -61,46 +66,66 @@ class Store:
         they are; other files, and all if ``thorough``, are read and compared with their checksums."""
         folder = self.path(key)
         try:
-            manifest = json.loads((folder / MANIFEST).read_bytes())
+            manifest = self._manifest(key)
             written = (folder / MANIFEST).stat().st_mtime_ns
-            for name, said in manifest["files"].items():
+            for name, said in manifest.files.items():
                 stat = (folder / name).stat()
-                if stat.st_size != said["bytes"]:
+                if stat.st_size != said.bytes:
                     return "damaged"
-                doubtful = thorough or name in (METRICS, FAILURE) or stat.st_mtime_ns > written
-                if doubtful and _sha256((folder / name).read_bytes()) != said["sha256"]:
-                    return "damaged"
-            if manifest["key"] != key:
-                return "damaged"
-        except FileNotFoundError:
-            return "damaged" if folder.exists() else "missing"
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+                if thorough or stat.st_mtime_ns > written:
+                    self._read(manifest, name)
+            self._row(manifest)  # reads the scores, or the failure
+        except DamagedError:
+            return "damaged" if os.path.lexists(folder) else "missing"
+        except OSError:
             return "damaged"
-        return "failed" if FAILURE in manifest["files"] else "ok"
+        return "failed" if FAILURE in manifest.files else "ok"
 
     def read(self, key: str, name: str) -> bytes:
-        """A file of a run, compared with its checksum; InputError if it is missing or damaged."""
-        path = self.path(key) / name
-        try:
-            content = path.read_bytes()
-            said = json.loads((self.path(key) / MANIFEST).read_bytes())["files"].get(name)
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(f"{path}: cannot be read, run the experiment again") from error
-        if said is not None and said["sha256"] != _sha256(content):
-            raise InputError(f"{path}: is damaged (its sha256 differs), run the experiment again")
-        return content
+        """A file of a run, compared with its checksum; DamagedError if it is missing or damaged."""
+        return self._read(self._manifest(key), name)
 
     def row(self, key: str) -> dict[str, Any]:
         """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, the scalar scores of a run, timings among them, and its
-        ``warnings``, a line each."""
-        if (self.path(key) / FAILURE).exists():
-            failure = json.loads(self.read(key, FAILURE))
-            row = {"status": "failed", "kind": failure["kind"], "reason": failure["reason"]}
+        ``warnings``, a line each. DamagedError as of :meth:`read`."""
+        return self._row(self._manifest(key))
+
+    def _row(self, manifest: Manifest) -> dict[str, Any]:
+        folder = self.path(manifest.key)
+        state: dict[str, Any] = {"status": "ok", "kind": None, "reason": None}
+        scores: dict[str, Any] = {}
+        if FAILURE in manifest.files:
+            failure = parse_stored(Failure, self._read(manifest, FAILURE), folder / FAILURE)
+            state = {"status": "failed", "kind": failure.kind, "reason": failure.reason}
         else:
-            row = {"status": "ok", "kind": None, "reason": None} | json.loads(self.read(key, METRICS))
-        with suppress(InputError, ValueError):  # times are not worth a run
-            row |= json.loads(self.read(key, TIMINGS))
-        return row_of(row)
+            scores = parse_stored(Figures, self._read(manifest, METRICS), folder / METRICS).model_dump()
+        with suppress(DamagedError):  # times are not worth a run
+            times = parse_stored(Figures, self._read(manifest, TIMINGS), folder / TIMINGS)
+            scores |= {name: value for name, value in times.model_dump().items() if name.startswith(TIMING)}
+        return row_of(state | {name: value for name, value in scores.items() if name not in state})
+
+    def _read(self, manifest: Manifest, name: str) -> bytes:
+        path = self.path(manifest.key) / name
+        said = manifest.files.get(name)
+        content = self._content(path)
+        if said is None and name != TIMINGS:
+            raise DamagedError(f"{path}: is not in {MANIFEST}{_AGAIN}")
+        if said is not None and said.sha256 != _sha256(content):
+            raise DamagedError(f"{path}: is damaged (its sha256 differs){_AGAIN}")
+        return content
+
+    def _manifest(self, key: str) -> Manifest:
+        path = self.path(key) / MANIFEST
+        manifest = parse_stored(Manifest, self._content(path), path)
+        if manifest.key != key:
+            raise DamagedError(f"{path}: is that of another run{_AGAIN}")
+        return manifest
+
+    def _content(self, path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise DamagedError(f"{path}: cannot be read: {error.strerror}{_AGAIN}") from error
 
     def track(self, key: str) -> Track:
         """The causal and the final trajectory of a run, with covariances, times [s] from its first estimate."""
@@ -118,19 +143,21 @@ class Store:
         manifest = json.dumps({"key": key, "files": said}, indent=1).encode()
         temporary = self.folder / "tmp" / key
         with self._writing():
-            shutil.rmtree(temporary, ignore_errors=True)
+            _remove(temporary)
             (temporary / "run").mkdir(parents=True)
             try:
                 for name, content in (*files.items(), (MANIFEST, manifest)):  # last, so that none is younger
                     _write(temporary / "run" / name, content)
                 _sync(temporary / "run")
+                if self.path(key).parent.is_file():
+                    self.path(key).parent.unlink(missing_ok=True)
                 self.path(key).parent.mkdir(exist_ok=True)
-                if self.path(key).exists():
+                if os.path.lexists(self.path(key)):
                     self.path(key).rename(temporary / "old")
                 (temporary / "run").rename(self.path(key))
                 _sync(self.path(key).parent)
             finally:
-                shutil.rmtree(temporary, ignore_errors=True)
+                _remove(temporary)
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
@@ -156,7 +183,16 @@ class Store:
         try:
             yield
         except OSError as error:
-            raise StoreError(f"{self.folder}: cannot be written: {error.strerror or error}") from error
+            raise StoreError(
+                f"{error.filename or self.folder}: cannot be written: {error.strerror or error}"
+            ) from error
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder, or a file that lies in its place, as far as that can be done."""
+    shutil.rmtree(path, ignore_errors=True)
+    with suppress(OSError):
+        path.unlink()
 
 
 def _lock(handle: int, path: Path) -> bool:

@@ -22,11 +22,9 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.output import COVARIANCES, FILES, write_files
-from factorgraph_loc.experiments.store import TIMINGS
+from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
-
-TIMING = "timing."  # what begins so is a time
 
 
 def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:

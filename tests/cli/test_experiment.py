@@ -52,6 +52,36 @@ def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     assert "<html" in (tmp_path / "out" / "lags" / "report.html").read_text().lower()
 
 
+def test_damage_is_told_and_repaired(fgloc, file, tmp_path):
+    assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
+    for path in (tmp_path / "out/lags/store").glob("??/*/estimates.parquet"):
+        before = path.stat()
+        path.write_bytes(b"?" + path.read_bytes()[1:])
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        break
+    (name,) = json.loads(fgloc("experiment", "status", file, "--verify", "--json").stdout)["damaged"]
+    assert f"damaged: {name}" in fgloc("experiment", "status", file, "--verify").stdout
+    report = fgloc("experiment", "report", file)
+    assert report.exit_code == 0, report.output
+    assert f"damaged, left out: {name}" in report.stdout
+    assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == [name]
+    assert fgloc("experiment", "run", file, "--verify", "--jobs", 1).exit_code == 0
+    assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == []
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"text", None])
+def test_a_damaged_table_of_results_is_written_anew(fgloc, file, tmp_path, content):
+    index = tmp_path / "out/lags/results.parquet"
+    index.parent.mkdir(parents=True)
+    if content is None:
+        pl.DataFrame({"label": [1], "estimator": ["ekf"], "log": ["short"], "duration": ["x"]}).write_parquet(index)
+    else:
+        index.write_bytes(content)
+    assert "2 runs, 2 to be made" in fgloc("experiment", "run", file, "--dry-run").stdout
+    assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
+    assert len(pl.read_parquet(index)) == 2
+
+
 def test_warnings_are_told_once_and_stand_on_the_page(fgloc, file, tmp_path, short_log):
     shutil.copytree(short_log, tmp_path / "doubtful")
     lines = (short_log / "reference.tum").read_text().splitlines(keepends=True)

@@ -1,5 +1,7 @@
 """The page of an experiment, from its store."""
 
+import os
+
 import pytest
 
 from factorgraph_loc.errors import InputError
@@ -34,7 +36,7 @@ def prepared(tmp_path):
 
 
 def test_page_of_what_is_stored(prepared):
-    page = report_experiment(prepared()).read_text(encoding="utf-8")
+    page = report_experiment(prepared()).page.read_text(encoding="utf-8")
     assert "2 estimators on 1 log: 2 runs. All went well." in page
     assert "Differences from again &amp; again" in page
     assert code_version() in page
@@ -44,7 +46,7 @@ def test_page_of_what_is_stored(prepared):
 
 
 def test_part_of_it_is_a_page_too(prepared, tmp_path):
-    page = report_experiment(prepared(made=1)).read_text(encoding="utf-8")
+    page = report_experiment(prepared(made=1)).page.read_text(encoding="utf-8")
     assert "1 estimator on 1 log: 1 run." in page
     assert "Differences from" not in page
     with pytest.raises(InputError, match="no runs"):
@@ -52,10 +54,10 @@ def test_part_of_it_is_a_page_too(prepared, tmp_path):
 
 
 def test_logs_are_read_once(prepared, monkeypatch):
-    first = report_experiment(prepared())
+    first = report_experiment(prepared()).page
     before = first.read_bytes()
     monkeypatch.setattr(SimulatedSource, "load", lambda _: pytest.fail("was read again"))
-    assert report_experiment(prepared(made=0)).read_bytes() == before
+    assert report_experiment(prepared(made=0)).page.read_bytes() == before
 
 
 def test_a_log_that_has_vanished_is_drawn_without_map(prepared, monkeypatch):
@@ -64,16 +66,47 @@ def test_a_log_that_has_vanished_is_drawn_without_map(prepared, monkeypatch):
 
     some = prepared()
     monkeypatch.setattr(SimulatedSource, "load", vanished)
-    assert '"scene":null' in report_experiment(some).read_text(encoding="utf-8")
+    assert '"scene":null' in report_experiment(some).page.read_text(encoding="utf-8")
 
 
-def test_a_damaged_result_is_told(prepared):
-    some = prepared()
-    file = some.store.path(some.runs[0].key) / "estimates.parquet"
+def damage(run, store):
+    """Change a byte of the trajectories, and neither their size nor their time of change."""
+    file = store.path(run.key) / "estimates.parquet"
+    before = file.stat()
     file.write_bytes(file.read_bytes()[:-1] + b"?")
-    with pytest.raises(InputError, match="is damaged"):
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_a_damaged_result_is_named_and_left_out(prepared):
+    some = prepared()
+    damage(some.runs[0], some.store)
+    written = report_experiment(some)
+    assert written.damaged == ["office-0, dead_reckoning, seed 0"]
+    page = written.page.read_text(encoding="utf-8")
+    assert "1 estimator on 1 log: 1 run." in page
+    assert f"1 run is damaged, and left out: <strong>{written.damaged[0]}</strong>" in page
+    damage(some.runs[1], some.store)
+    with pytest.raises(InputError, match=r"no runs to report on \(2 are damaged\)"):
         report_experiment(some)
-    assert not (some.folder / "report.html").exists()
+
+
+def test_a_damaged_result_is_made_again_where_all_is_verified(prepared, tmp_path):
+    some = prepared()
+    damage(some.runs[0], some.store)
+    assert prepare(tmp_path / "tiny.toml", out=tmp_path / "out").todo() == []
+    (again,) = prepare(tmp_path / "tiny.toml", out=tmp_path / "out", verify=True).todo()
+    assert again == some.runs[0]
+    assert run_planned(again, tmp_path / "out").status == "ok"
+    assert report_experiment(some).damaged == []
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"5", b'{"walls": 3}', b"[" * 5000, b'{"files": {"a": 5}, "logs": 1}'])
+def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepared, content, tmp_path):
+    first = report_experiment(prepared()).page.read_bytes()
+    (scene,) = (tmp_path / "out/store/scenes").iterdir()
+    for file in (scene, *(tmp_path / "out/store").glob("*.json")):
+        file.write_bytes(content)
+    assert report_experiment(prepared(made=0)).page.read_bytes() == first
 
 
 def test_a_page_that_cannot_be_written_is_told(prepared, tmp_path):

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, METRICS, TIMINGS, Store, StoreError
+from factorgraph_loc.experiments.stored_files import DamagedError
 
 KEY, OTHER = "ab" * 32, "cd" * 32
 FILES = {
@@ -110,6 +111,75 @@ def test_a_quick_look_sees_gross_damage(store, what):
     assert store.state(KEY) == "damaged"
     store.put(KEY, FILES)
     assert store.state(KEY, thorough=True) == "ok"
+
+
+def with_files(store, files):
+    """The results of KEY with these contents, whose checksums are right."""
+    store.put(KEY, FILES | files)
+    return store
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"5", b"[]", b"[" * 5000, b"\xff", b'{"a": "text"}', b'{"a": {"b": 1}}', b'{"warnings": 5}'),
+        *(b'{"warnings": [1]}', b'{"a": 1e999}', b'{"a": 9' + b"9" * 5000 + b"}", b'{"a": true}', b'{"a": NaN}'),
+    ],
+)
+@pytest.mark.parametrize("name", [METRICS, FAILURE, MANIFEST])
+def test_contents_of_other_types_are_damage(store, name, content):
+    with_files(store, {name: content})
+    if name == MANIFEST:
+        (store.path(KEY) / name).write_bytes(content)
+    assert store.state(KEY) == "damaged"
+    with pytest.raises(DamagedError) as told:
+        store.row(KEY)
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 400
+    store.put(KEY, FILES)
+    assert store.state(KEY) == "ok"
+
+
+def test_scores_do_not_stand_for_what_the_run_is(store):
+    with_files(store, {METRICS: b'{"status": 3, "causal.anees": 2}', TIMINGS: b'{"kind": 1, "timing.updates": 4}'})
+    row = store.row(KEY)
+    assert (row["status"], row["kind"], row["causal.anees"], row["timing.updates"]) == ("ok", None, 2, 4)
+
+
+def test_a_manifest_names_files_of_its_folder_alone(store):
+    store.put(KEY, FILES)
+    manifest = store.path(KEY) / MANIFEST
+    manifest.write_text(manifest.read_text().replace("estimates.parquet", "../estimates.parquet"))
+    assert store.state(KEY) == "damaged"
+
+
+@pytest.mark.parametrize("place", ["ab", f"ab/{KEY}", f"tmp/{KEY}"])
+def test_a_file_in_the_place_of_a_folder_gives_way(store, place):
+    path = store.folder / place
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("in the way")
+    assert store.state(KEY) in ("damaged", "missing")
+    store.put(KEY, FILES)
+    assert store.state(KEY, thorough=True) == "ok"
+
+
+@pytest.mark.parametrize("name", ["estimates.parquet", METRICS, MANIFEST])
+def test_a_folder_in_the_place_of_a_file_is_damage(store, name):
+    store.put(KEY, FILES)
+    (store.path(KEY) / name).unlink()
+    (store.path(KEY) / name).mkdir()
+    assert store.state(KEY) == "damaged"
+    store.put(KEY, FILES)
+    assert store.state(KEY, thorough=True) == "ok"
+
+
+@pytest.mark.parametrize("place", ["", "claims", "tmp"])
+def test_a_file_in_the_place_of_the_store_is_told(tmp_path, place):
+    path = tmp_path / "out/store" / place
+    path.parent.mkdir(parents=True)
+    path.write_text("in the way")
+    with pytest.raises(StoreError, match="cannot be written: "):
+        Store(tmp_path / "out").create()
 
 
 def test_times_may_be_lost_without_the_run(store):

@@ -42,6 +42,7 @@ def write_report(
     baseline: str | None = None,
     title: str = "Results",
     experiment: Mapping[str, Any] | None = None,
+    damaged: Sequence[str] = (),
     versions: Mapping[str, str] | None = None,
 ) -> None:
     """Write the page ``out``.
@@ -49,30 +50,37 @@ def write_report(
     ``rows``: one a run, with key, log, estimator, seed, status (ok, failed), reason, the scores, and where there are such label,
     sensors, kind (of a failure) and ``sweep.*``. ``runs``: the files of a run that went well, by its key. ``metrics``: scores to
     show. ``baseline``: the label that the others are compared with, by default the first. ``experiment``: what was asked for, as
-    plain values. ``versions``: of what the runs were made with, by default those that the configuration of the first tells.
+    plain values. ``damaged``: runs whose results are left out, in words. ``versions``: of what the runs were made with, by default
+    those that the configuration of the first tells.
 
     Raises InputError for no rows, or a baseline that is no label.
     """
     if not len(rows):
-        raise InputError("there are no runs to report on")
+        raise InputError(f"there are no runs to report on{f' ({len(damaged)} are damaged)' if damaged else ''}")
     results = Results(rows)
     labels = {variant.label: name for name, variant in reversed(results.variants.items())}
     if baseline is not None and baseline not in labels:
         raise InputError(f"the baseline is {baseline!r}, expected one of {', '.join(sorted(labels))}")
     page = _Page(
-        results, _known(results, metrics), labels[baseline] if baseline else next(iter(results.variants)), runs
+        results, _known(results, metrics), labels[baseline] if baseline else next(iter(results.variants)), runs, damaged
     )
     write_text(out, page.html(title, experiment or {}, versions or {}))
 
 
 class _Page:
     def __init__(
-        self, results: Results, metrics: Sequence[Metric], baseline: str, runs: Callable[[str], RunFiles]
+        self,
+        results: Results,
+        metrics: Sequence[Metric],
+        baseline: str,
+        runs: Callable[[str], RunFiles],
+        damaged: Sequence[str],
     ) -> None:
         self._results = results
         self._metrics = metrics
         self._baseline = baseline
         self._runs = runs
+        self._damaged = damaged
         self._charts: list[charts.Chart] = []
         self._sections: list[tuple[str, str]] = []
 
@@ -82,7 +90,7 @@ class _Page:
         best = [results.compare(metric) for metric in self._metrics]
         against = [results.compare(metric, self._baseline) for metric in self._metrics]
         body = [
-            tag("section", summary(results, best, drawn.trust), class_="lead", id="summary"),
+            tag("section", summary(results, best, drawn.trust, self._damaged), class_="lead", id="summary"),
             self._overview(best),
             self._differences(against),
             self._by_log(),

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.files import write_text
@@ -61,13 +62,30 @@ class Scene:
 
     @classmethod
     def read(cls, path: Path) -> Scene:
-        """Read what :meth:`write` wrote."""
-        found = json.loads(path.read_text(encoding="utf-8"))
-        walls, landmarks, tags, points = (
-            _metres(found[name], columns)
-            for name, columns in (("walls", 4), ("landmarks", 2), ("tags", 2), ("points", 2))
+        """Read what :meth:`write` wrote; OSError or ValueError if it is not there or damaged."""
+        found = _SceneFile.model_validate_json(path.read_bytes())
+        return cls(
+            walls=_metres(found.walls, 4),
+            landmarks=_metres(found.landmarks, 2),
+            tags=_metres(found.tags, 2),
+            points=_metres(found.points, 2),
+            reference=tuple(_metres(piece, 2) for piece in found.reference),
+            t0_ns=found.t0_ns,
         )
-        return cls(walls, landmarks, tags, points, tuple(_metres(p, 2) for p in found["reference"]), found["t0_ns"])
+
+
+_Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+
+
+class _SceneFile(BaseModel):
+    """What is kept: coordinates one after the other [mm]."""
+
+    walls: list[_Whole]
+    landmarks: list[_Whole]
+    tags: list[_Whole]
+    points: list[_Whole]
+    reference: list[list[_Whole]]
+    t0_ns: _Whole
 
 
 def _pieces(log: Log) -> tuple[Array, ...]:

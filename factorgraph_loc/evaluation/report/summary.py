@@ -13,13 +13,19 @@ _SPOKEN = 2  # metrics of which the best is told
 
 
 def summary(
-    results: Results, against_best: Sequence[Comparison], trust: Mapping[str, tuple[float, float, float]]
+    results: Results,
+    against_best: Sequence[Comparison],
+    trust: Mapping[str, tuple[float, float, float]],
+    damaged: Sequence[str] = (),
 ) -> Html:
     """``against_best``: comparisons with the best of each metric. ``trust``: of each variant the mean NEES per degree of freedom of
-    its causal poses, and the band in which it lies where covariances are right."""
+    its causal poses, and the band in which it lies where covariances are right. ``damaged``: runs that are left out."""
     paragraphs = [_extent(results)]
     paragraphs += [_best(c) for c in [c for c in against_best if c.best is not None][:_SPOKEN]]
     paragraphs += _trust(trust)
+    if damaged:
+        left_out = f"{_count(len(damaged), 'run')} {_is(damaged)} damaged, and left out: "
+        paragraphs.append(join([left_out, _list(damaged), "; fgloc experiment run --verify makes them again."]))
     paragraphs += _cautions(results, against_best)
     return join(tag("p", paragraph) for paragraph in paragraphs)
 
