@@ -38,6 +38,7 @@ from factorgraph_loc.rig import write_rig
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
 from factorgraph_loc.simulation import simulate as make_log
 from factorgraph_loc.simulation.recorded import RecordedLooks
+from factorgraph_loc.ticks import TICK_GAP
 from factorgraph_loc.vision.feature_evaluation import feature
 from factorgraph_loc.vision.sequences import find_sequences
 
@@ -97,6 +98,7 @@ def run(
     prior: str | None = None,
     seed: int = 0,
     max_gap: float = MAX_GAP,
+    tick_gap: float = TICK_GAP,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -108,7 +110,9 @@ def run(
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
     loaded = _one(log)
-    config = RunConfig(estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap)
+    config = RunConfig(
+        estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap
+    )
     result = running.run(loaded, config, progress)
     if out is None:
         return Run(result, score(result, loaded))
@@ -127,6 +131,7 @@ def compare(
     prior: str | None = None,
     seeds: Iterable[int] = (0,),
     max_gap: float = MAX_GAP,
+    tick_gap: float = TICK_GAP,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -142,7 +147,9 @@ def compare(
     used = None if sensors is None else tuple(sensors)
     chosen = list(seeds)
     configs = [
-        RunConfig(name, named.get(name, {}), used, prior, seed, max_gap) for name in estimators for seed in chosen
+        RunConfig(name, named.get(name, {}), used, prior, seed, max_gap, tick_gap)
+        for name in estimators
+        for seed in chosen
     ]
     return comparing.compare(_all(logs), configs, Path(out), jobs=jobs, overwrite=overwrite, progress=progress)
 

@@ -24,12 +24,14 @@ from factorgraph_loc.estimators.base import (
     PosePrior,
     finds_heading,
 )
+from factorgraph_loc.estimators.guarded import Guard, sound, sound_trajectory
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files import nearest
-from factorgraph_loc.measurements import TICK_RATE, Exteroceptive, IncrementOdometry, Odometry, Tick
+from factorgraph_loc.measurements import Exteroceptive, IncrementOdometry, Odometry, Tick
 from factorgraph_loc.pushed import ALL_SENSORS, RfidRead, checked, numbers, scan_of, sensor_of
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.ticks import Ticks
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 
@@ -80,7 +82,7 @@ class Localizer:
         self._lock = threading.Lock()
         self._image_lock = threading.Lock()
         self._frontend: LiveFrontend | None = None
-        self._begin_anew(None, None)
+        self._begin_anew(None, None, Guard(estimator))
 
     def initialize(
         self, pose: ArrayLike | None = None, covariance: ArrayLike | None = None, t: float | None = None
@@ -91,19 +93,23 @@ class Localizer:
         ``covariance`` (3, 3) of the pose, or (2, 2) of the position where the heading is NaN, by default that of 0.05 m and
         0.05 rad. ``t`` [s]: when the robot is there, by default at the first measurement. Odometry from before then is taken in,
         as its velocity holds on; other measurements are ignored.
-        InputError if these are no pose, or if the estimator cannot begin from an unknown one.
+        InputError if these are no pose, or if the estimator cannot begin from an unknown one; RunFailedError if it cannot begin
+        there. All goes on as before then.
         """
         start = None if pose is None else _start(pose, covariance, t)
         setup = registry.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
-        new = registry.create(self._name, setup, self._settings)
+        guard = Guard(self._name)
+        with guard:
+            new = registry.create(self._name, setup, self._settings)
         if start is None and not getattr(new, "supports_unknown_start", False):
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected one")
         if start is not None and not math.isnan(start.t):
-            new.initialize(start)
+            with guard.telling(f"the start at {start.t:.3f} s"):
+                new.initialize(start)
         with self._lock:
-            self._begin_anew(new, start)
+            self._begin_anew(new, start, guard)
 
     def push(self, measurement: Odometry | Exteroceptive) -> None:
         """Take a measurement, in the order of arrival: one that is late goes in at its time if it is late by at most the
@@ -111,7 +117,8 @@ class Localizer:
 
         InputError if it has a value that cannot be, such as NaN, or comes before :meth:`initialize`; if a stamp is an hour ahead
         of all others; if increments of odometry go back in time, whose meaning depends on their order. It is not taken then, and
-        nothing else has changed. RunFailedError, and whatever else the estimator raises: it is lost, :meth:`initialize` it anew.
+        nothing else has changed. RunFailedError if the estimator fails: it is lost. Whatever is pushed or asked from then on
+        raises the same error, until :meth:`initialize` begins anew; only :meth:`diagnostics` still tells what there was.
         Tags, antennas and landmarks that rig and map lack are no errors: they are counted, see :meth:`diagnostics`.
         """
         own = checked(measurement)
@@ -149,7 +156,8 @@ class Localizer:
 
         It changes nothing: what is measured before ``t`` will not be late.
 
-        Before there is anything to tell it is ``unlocalized``, and not a number. RunFailedError if the estimator has failed.
+        Before there is anything to tell it is ``unlocalized``, and not a number. RunFailedError if the estimator has failed, or has
+        no pose of finite numbers with a positive covariance then; that loses nothing.
         """
         with self._lock:
             return self._estimate(t)
@@ -157,38 +165,53 @@ class Localizer:
     def belief(self) -> Belief:
         """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them."""
         with self._lock:
+            self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
                 return Belief(())
-            return copy.deepcopy(self._estimator.belief(self._newest))
+            with self._guard.telling(f"the belief at {self._newest:.3f} s"):
+                return copy.deepcopy(self._estimator.belief(self._newest))
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the past, with what came later: ten times a second from the start to before the newest stamp, of the
         last ``history`` seconds, or somewhat more."""
         with self._lock:
-            if self._estimator is None or not self._ticks:
+            self._require_whole()
+            if self._estimator is None or self._ticks is None or not self._ticks.count:
                 return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
-            return copy.deepcopy(self._estimator.trajectory())
+            with self._guard.telling("the trajectory"):
+                return copy.deepcopy(sound_trajectory(self._estimator.trajectory()))
 
     def learnt(self) -> Learnt:
         """What is estimated beside the pose: constants of the sensors, landmarks, points; with what came later, as
         :meth:`trajectory` has them, and in the time that this takes."""
         with self._lock:
-            return Learnt() if self._estimator is None else copy.deepcopy(self._estimator.learnt())
+            self._require_whole()
+            if self._estimator is None:
+                return Learnt()
+            with self._guard.telling("what was learnt"):
+                return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
         """What was ignored, rejected or too late, by reason, since the beginning; the last innovations, residuals and events."""
         with self._lock:
             return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
 
-    def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None) -> None:
+    def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None, guard: Guard) -> None:
         self._estimator = estimator
+        self._guard = guard
+        self._failure: RunFailedError | None = None  # what the estimator was lost by
         self._prior = prior  # its time is NaN until the first measurement tells it
-        self._start = None if prior is None or math.isnan(prior.t) else prior.t  # the time of the first tick
-        self._ticks = 0  # how many there were
+        # from the first measurement on, or from the prior's time
+        self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
         self._newest = self._newest_increment = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # nothing has changed since
 
+    def _require_whole(self) -> None:
+        if self._failure is not None:
+            raise RunFailedError(str(self._failure)) from self._failure
+
     def _begun(self, what: str) -> Estimator:
+        self._require_whole()
         if self._estimator is None:
             raise InputError(f"{what} came before initialize(), expected that first")
         return self._estimator
@@ -201,24 +224,33 @@ class Localizer:
             return
         m = replace(m, t=m.t + self._rig.time_offset(sensor))
         self._check_stamp(m)
-        if self._start is None:
-            self._start = m.t
+        self._newest, self._last = max(self._newest, m.t), None
+        try:
+            self._feed(estimator, m)
+        except BaseException as error:  # an interrupt, too, leaves it half changed
+            if isinstance(error, RunFailedError):
+                self._failure = error
+            else:
+                self._failure = RunFailedError(f"{self._name}: lost by {type(error).__name__}; initialize() it anew")
+            raise
+        self._tidy(estimator)
+
+    def _feed(self, estimator: Estimator, m: Odometry | Exteroceptive) -> None:
+        if self._ticks is None:
+            self._ticks = Ticks(m.t)
             if self._prior is not None:
                 self._prior = replace(self._prior, t=m.t)
-                estimator.initialize(self._prior)
-        self._newest, self._last = max(self._newest, m.t), None
-        self._pass_time(estimator, self._start, m.t)
+                with self._guard.telling(f"the start at {m.t:.3f} s"):
+                    estimator.initialize(self._prior)
+        # as in a run of a log: a tick comes after all that was measured by then
+        for t in self._ticks.before(m.t):
+            with self._guard.taking(Tick(t)):
+                estimator.process(Tick(t))
         if not isinstance(m, Odometry) and not self._is_under_way(m.t):
             estimator.diagnostics.ignore("before the start")
             return
-        estimator.process(m)
-        self._tidy(estimator)
-
-    def _pass_time(self, estimator: Estimator, start: float, t: float) -> None:
-        """Let the ticks of before ``t`` come, as in a run of a log: after all that was measured by then."""
-        while (tick := start + self._ticks / TICK_RATE) < t:
-            estimator.process(Tick(tick))
-            self._ticks += 1
+        with self._guard.taking(m):
+            estimator.process(m)
 
     def _check_stamp(self, m: Odometry | Exteroceptive) -> None:
         where = f"{type(m).__name__} at {m.t:.3f} s"
@@ -239,6 +271,7 @@ class Localizer:
         return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:
+        self._require_whole()
         if t is not None and not math.isfinite(t):
             raise InputError(f"t is {t!r}, expected a finite number of seconds")
         at = self._newest if t is None else max(self._newest, t)
@@ -250,9 +283,8 @@ class Localizer:
             raise InputError(
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected their clock"
             )
-        found = self._estimator.estimate(at)
-        if found.status != "unlocalized" and not np.all(np.isfinite(found.pose)):
-            raise RunFailedError(f"{self._name}: the estimate at {at:.3f} s is not finite; initialize() it anew")
+        with self._guard.telling(f"the estimate at {at:.3f} s"):
+            found = sound(self._estimator.estimate(at))
         # the estimator may use its arrays again
         self._last = copy.deepcopy(replace(found, t=at))
         return copy.deepcopy(self._last)
@@ -262,7 +294,7 @@ class Localizer:
         if self._newest < self._tidied + TIDY_INTERVAL:
             return
         self._tidied = self._newest
-        if isinstance(estimator, ForgettingEstimator) and self._ticks:
+        if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)
         found = estimator.diagnostics
         for innovations in found.nis.values():

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from factors.se2 import Array
 
-TICK_RATE = 10  # Hz, the grid on which trajectories are written
-
 
 @dataclass(frozen=True, slots=True)
 class VelocityOdometry:

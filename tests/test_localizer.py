@@ -16,12 +16,14 @@ from factorgraph_loc import (
     InputError,
     RfidRead,
     Rig,
+    RunFailedError,
     VelocityOdometry,
     YawRate,
 )
+from factorgraph_loc.estimators.ekf import Ekf
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import cut
+from factorgraph_loc.log import IncrementStream, cut
 from factors import se2
 
 SENSORS = ("odometry", "rfid", "bearing_range")
@@ -289,3 +291,65 @@ def test_images_are_ignored_by_who_takes_none(log):
     localizer = started(log, "dead_reckoning", sensors=("odometry", "camera"))
     localizer.push_image(1.0, np.zeros((48, 64), dtype=np.uint8))
     assert localizer.diagnostics().ignored == {"images": 1}
+
+
+def test_an_estimator_that_fails_stays_lost_until_it_begins_anew(log, monkeypatch):
+    localizer = started(log, "ekf", sensors=("odometry",))
+    localizer.push(VelocityOdometry(0.0, 0.5, 0.0))
+    known = localizer.estimate(0.5).pose
+
+    def fail(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Ekf, "process", fail)
+        with pytest.raises(RunFailedError) as told:
+            localizer.push(VelocityOdometry(0.05, 0.5, 0.0))
+    assert str(told.value) == "ekf: tick at 0.000 s: Singular matrix"
+    asked = (
+        localizer.estimate,
+        localizer.belief,
+        localizer.trajectory,
+        localizer.learnt,
+        lambda: localizer.push(VelocityOdometry(0.2, 0.5, 0.0)),
+    )
+    for ask in asked:
+        with pytest.raises(RunFailedError) as again:
+            ask()
+        assert str(again.value) == str(told.value)
+    assert localizer.diagnostics().late == {}
+    start, _ = resolve_prior(log, None)
+    localizer.initialize(start.pose, start.covariance, start.t)
+    localizer.push(VelocityOdometry(0.0, 0.5, 0.0))
+    assert localizer.estimate(0.5).pose == pytest.approx(known)
+
+
+def test_an_estimate_that_cannot_be_is_not_told_and_loses_nothing(log, monkeypatch):
+    localizer = started(log, "ekf", sensors=("odometry",))
+    localizer.push(VelocityOdometry(0.0, 0.5, 0.0))
+    whole = Ekf.estimate
+
+    def broken(self, t=None):
+        found = whole(self, t)
+        return replace(found, covariance=-found.covariance)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Ekf, "estimate", broken)
+        for _ in range(2):
+            with pytest.raises(
+                RunFailedError, match=r"^ekf: the estimate at 0\.500 s .*the covariance is not positive"
+            ):
+                localizer.estimate(0.5)
+    localizer.push(VelocityOdometry(0.1, 0.5, 0.0))
+    assert np.all(np.isfinite(localizer.estimate(0.5).pose))
+
+
+def test_a_long_pause_holds_no_ticks(log):
+    localizer = started(log, "ekf", prior="0,0,0", sensors=("odometry",), history=1e6)
+    stamps = np.array([0.0, 0.25, 30.0, 100.0, 3000.0, 3000.5])
+    for t in stamps:
+        localizer.push(IncrementOdometry(t, 0.0, 0.0, 0.0))
+    odometry = IncrementStream(stamps, *np.zeros((3, len(stamps))))
+    expected = run(replace(log, streams={"odometry": odometry}), RunConfig("ekf", prior="0,0,0", sensors=("odometry",)))
+    assert localizer.trajectory().t.tolist() == expected.final.t.tolist()[:-1]
+    assert np.diff(expected.final.t).max() > 2800.0

@@ -67,6 +67,10 @@ MaxGap = Annotated[
     float,
     typer.Option(metavar="SECONDS", help="How far apart estimates may lie between which the score interpolates."),
 ]
+TickGap = Annotated[
+    float,
+    typer.Option(metavar="SECONDS", help="Gaps between measurements that are longer than this hold no estimates."),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option(

@@ -26,12 +26,14 @@ from factorgraph_loc.cli.options import (
     RigFile,
     Sensors,
     Settings,
+    TickGap,
     WorldFile,
     parse_list,
     parse_settings,
 )
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.ticks import TICK_GAP
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.result import RunResult
@@ -71,6 +73,7 @@ def run(
     rig: RigFile = None,
     world: WorldFile = None,
     max_gap: MaxGap = MAX_GAP,
+    tick_gap: TickGap = TICK_GAP,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -83,7 +86,9 @@ def run(
     check_free(out, overwrite=overwrite)  # now, not when all is computed
     settings = parse_settings(set_ or (), [estimator])[estimator]
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
-    config = experiment.RunConfig(estimator, settings, parse_list(sensors) if sensors else None, prior, seed, max_gap)
+    config = experiment.RunConfig(
+        estimator, settings, parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
+    )
     with show.progress(estimator, counted=False) as report:
         result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
@@ -115,6 +120,7 @@ def compare(
     rig: RigFile = None,
     world: WorldFile = None,
     max_gap: MaxGap = MAX_GAP,
+    tick_gap: TickGap = TICK_GAP,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -131,7 +137,9 @@ def compare(
     chosen = parse_seeds(seeds)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
     used = parse_list(sensors) if sensors else None
-    configs = [RunConfig(name, settings[name], used, prior, seed, max_gap) for name in names for seed in chosen]
+    configs = [
+        RunConfig(name, settings[name], used, prior, seed, max_gap, tick_gap) for name in names for seed in chosen
+    ]
     with show.progress("runs", counted=True) as report:
         comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
     show.warnings(comparison.warnings)

@@ -28,6 +28,7 @@ from factorgraph_loc.experiments.processes import run_each
 from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
 from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
+from factorgraph_loc.ticks import check_tick_gap
 
 _ERROR = "error.txt"
 _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "report.html")
@@ -137,6 +138,7 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
         registry.settings_of(config.estimator, config.settings)
         check_prior(config.prior)
         check_max_gap(config.max_gap)
+        check_tick_gap(config.tick_gap)
         for sensor in config.sensors or ():
             if sensor not in streams:
                 raise InputError(f"no log has a sensor {sensor!r}{nearest(sensor, streams)}")

@@ -39,6 +39,18 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
     )
 
 
+def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[str, ...]:
+    """Gaps (begin, end) [s] between measurements inside of which there are no estimates."""
+    if not skipped:
+        return ()
+    begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])
+    count = "a gap" if len(skipped) == 1 else f"{len(skipped)} gaps"
+    return (
+        f"{log.name}: {count} above {tick_gap:g} s without any measurement, the longest {end - begin:.0f} s at {begin:.1f} s: "
+        "there are no estimates inside",
+    )
+
+
 def check_free_map(log: Log, sensors: Sequence[str], name: str, settings: FileModel) -> None:
     """InputError where landmarks are to be estimated (by the setting ``landmarks`` of the estimator ``name``) and no sighting tells
     where one is, nor is of one that the map keeps: all would be ignored."""

@@ -14,6 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.files import FileModel, nearest, parse_model, read_toml
+from factorgraph_loc.ticks import LONGEST, SHORTEST, TICK_GAP
 
 SIMULATION = "simulation"  # the first word of settings of simulated logs
 METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")
@@ -132,7 +133,8 @@ class Limits(FileModel):
 class Experiment(FileModel):
     """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
     default those of each log's rig; ``prior``: where runs start; ``seeds``: of the estimators; ``max_gap`` [s]: how far apart
-    estimates may lie between which the score interpolates."""
+    estimates may lie between which the score interpolates; ``tick_gap`` [s]: gaps between measurements that are longer than this
+    hold no estimates."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
     out: Name | None = None
@@ -142,6 +144,7 @@ class Experiment(FileModel):
     prior: Name | None = None
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
     max_gap: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = MAX_GAP
+    tick_gap: Annotated[float, Field(ge=SHORTEST, le=LONGEST)] = TICK_GAP
     sweep: Sweep = Sweep()
     report: ReportSettings = ReportSettings()
     limits: Limits = Limits()

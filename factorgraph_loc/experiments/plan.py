@@ -31,8 +31,8 @@ class PlannedRun:
     """One run, as plain data that can be sent to other processes.
 
     ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``sweep``: what was set for this run, by dotted name.
-    ``key``: of its results.
+    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``tick_gap`` [s]: of the estimates; ``sweep``: what was
+    set for this run, by dotted name. ``key``: of its results.
     """
 
     source: LogSource
@@ -46,6 +46,7 @@ class PlannedRun:
     prior: str | None
     seed: int
     max_gap: float
+    tick_gap: float
     key: str
     sweep: Mapping[str, Any] = field(default_factory=dict)
 
@@ -60,7 +61,9 @@ class PlannedRun:
         """What is run on the log."""
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
 
-        return RunConfig(self.estimator, self.settings, self.sensors, self.prior, self.seed, self.max_gap)
+        return RunConfig(
+            self.estimator, self.settings, self.sensors, self.prior, self.seed, self.max_gap, self.tick_gap
+        )
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ def _runs(
                 "prior": experiment.prior,
                 "seed": seed,
                 "max_gap": experiment.max_gap,
+                "tick_gap": experiment.tick_gap,
             }
             yield PlannedRun(
                 source=log.source,
@@ -131,6 +135,7 @@ def _runs(
                 prior=experiment.prior,
                 seed=seed,
                 max_gap=experiment.max_gap,
+                tick_gap=experiment.tick_gap,
                 key=run_key(log.digest, config),
                 sweep=point,
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import math
 import platform
 import resource
 import sys
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc import __version__
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import (
     ConcludingEstimator,
@@ -27,6 +26,7 @@ from factorgraph_loc.estimators.base import (
     SpaceEstimator,
     finds_heading,
 )
+from factorgraph_loc.estimators.guarded import Guard, sound, sound_space, sound_trajectory
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.experiments.doubts import (
@@ -35,6 +35,7 @@ from factorgraph_loc.experiments.doubts import (
     findable,
     never_localized,
     partly_scored,
+    with_pauses,
     without_points,
     without_tags,
 )
@@ -42,10 +43,12 @@ from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.measurements import TICK_RATE, Measurement, Odometry, Tick
+from factorgraph_loc.measurements import Measurement, Odometry, Tick
+from factorgraph_loc.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
+FARTHEST = 1e10  # s from the log's start that a stamp may be
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
 
 
@@ -56,7 +59,8 @@ class RunConfig:
     ``estimator``: its name in the registry; ``settings``: overrides of its settings. ``sensors``: names of the streams that it
     may use, None for those of the rig; ``rssi`` and ``phase`` are what the reads of ``rfid`` tell besides. ``prior``: see
     :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator.
-    ``max_gap`` [s]: how far apart estimates may lie between which the score interpolates; it changes no estimate.
+    ``max_gap`` [s]: how far apart estimates may lie between which the score interpolates; it changes no estimate. ``tick_gap`` [s]:
+    there are no estimates inside gaps between measurements that are longer than this.
     """
 
     estimator: str
@@ -65,6 +69,7 @@ class RunConfig:
     prior: str | None = None
     seed: int = 0
     max_gap: float = MAX_GAP
+    tick_gap: float = TICK_GAP
 
 
 def run(
@@ -75,24 +80,28 @@ def run(
 ) -> RunResult:
     """Run an estimator on a log.
 
-    The grid of ticks has 10 Hz and starts at the prior's time. A tick comes after all measurements that arrived up to its time;
-    the estimate after it is the causal one. Odometry older than the prior is fed before the estimator is initialized, because
-    its velocity holds on; other measurements older than the prior are counted as ignored. With an unknown start the grid begins at
-    the first measurement, and the final trajectory, empty if nothing told the pose, where the estimator began to believe
-    something. A log with neither start nor reference, and without a map that its sensors see, begins at (0, 0, 0).
+    The grid of ticks has 10 Hz and starts at the prior's time; there are none inside long gaps between measurements (``tick_gap``).
+    A tick comes after all measurements that arrived up to its time; the estimate after it is the causal one. Odometry older than
+    the prior is fed before the estimator is initialized, because its velocity holds on; other measurements older than the prior are
+    counted as ignored. With an unknown start the grid begins at the first measurement, and the final trajectory, empty if nothing
+    told the pose, where the estimator began to believe something. A log with neither start nor reference, and without a map that
+    its sensors see, begins at (0, 0, 0).
     ``progress`` is given the share done; where features of images are looked for first, that is its first half.
     ``watch`` is given the time and the estimator after each tick, to look at what it believes.
 
-    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator gives a pose that is not finite.
-    Whatever the estimator itself raises is passed on.
+    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or tells a pose that is not
+    finite or a covariance that is not positive, with the time and the measurement; see :mod:`factorgraph_loc.estimators.guarded`.
     """
     check_max_gap(config.max_gap)
+    check_tick_gap(config.tick_gap)
     sensors = _sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
     check_free_map(log, sensors, config.estimator, settings)
     prior, prior_source = resolve_prior(log, config.prior)
     setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
-    estimator = registry.create(config.estimator, setup, settings)
+    guard = Guard(f"{config.estimator} on {log.name}")
+    with guard:
+        estimator = registry.create(config.estimator, setup, settings)
     if "odometry" not in log.streams and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
             f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
@@ -116,17 +125,28 @@ def run(
     report = progress or (lambda _: None)
     prepared = prepare(log, sensors, config.estimator, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
-    loop = _Loop(estimator, prepared.log, sensors, prior, lambda share: report(before + (1.0 - before) * share), watch)
+    ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
+    loop = _Loop(
+        guard,
+        estimator,
+        prepared.log,
+        sensors,
+        prior,
+        ticks,
+        lambda share: report(before + (1.0 - before) * share),
+        watch,
+    )
     loop.run()
     started = perf_counter()
-    final = estimator.trajectory()
-    final_seconds = perf_counter() - started
-    if not np.all(np.isfinite(final.poses)):
-        raise RunFailedError(f"{config.estimator} on {log.name}: the final trajectory holds poses that are not finite")
-
-    diagnostics = estimator.diagnostics
-    if isinstance(estimator, ConcludingEstimator):
-        diagnostics = estimator.final_diagnostics()
+    in_space = None
+    with guard.telling("the final trajectory"):
+        final = sound_trajectory(estimator.trajectory())
+        final_seconds = perf_counter() - started
+        if isinstance(estimator, SpaceEstimator):
+            in_space = sound_space(estimator.space_trajectory())
+        diagnostics, learnt = estimator.diagnostics, estimator.learnt()
+        if isinstance(estimator, ConcludingEstimator):
+            diagnostics = estimator.final_diagnostics()
     versions = _versions()
     effective = {
         "log": log.name,
@@ -136,6 +156,7 @@ def run(
         "prior": prior_source,
         "seed": config.seed,
         "max_gap": config.max_gap,
+        "tick_gap": config.tick_gap,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
         "versions": versions,
     }
@@ -148,7 +169,7 @@ def run(
         status=tuple(e.status for e in loop.estimates),
         final=final,
         diagnostics=diagnostics,
-        learnt=estimator.learnt(),
+        learnt=learnt,
         timings=loop.timings(final_seconds, prepared),
         versions=versions,
         warnings=_once(
@@ -161,9 +182,10 @@ def run(
             *(dead_tags(log, estimator.diagnostics) if "rfid" in sensors else ()),
             *never_localized(log, sensors, loop.estimates, final),
             *partly_scored(log, final, config.max_gap),
+            *with_pauses(log, ticks.skipped, config.tick_gap),
         ),
         causal_space=_in_space(loop.estimates),
-        final_space=estimator.space_trajectory() if isinstance(estimator, SpaceEstimator) else None,
+        final_space=in_space,
     )
 
 
@@ -172,27 +194,26 @@ class _Loop:
 
     def __init__(
         self,
+        guard: Guard,
         estimator: Estimator,
         log: Log,
         sensors: tuple[str, ...],
         prior: PosePrior | None,
+        ticks: Ticks,
         progress: Callable[[float], None],
         watch: Callable[[float, Estimator], None] | None,
     ) -> None:
+        self._guard = guard
         self._watch = watch
         self._estimator = estimator
         self._log = log
         self._sensors = sensors
         self._prior = prior
+        self._ticks = ticks
         self._progress = progress
-        first, last = _span(log, sensors)
+        first, self._last = _span(log, sensors)
         self._start = first if prior is None else prior.t
-        if self._start > last:
-            raise InputError(
-                f"{log.name}: the prior's time {self._start:.3f} s lies after the last measurement at {last:.3f} s"
-            )
-        self._span = last - self._start
-        self._ticks = self._start + np.arange(math.floor(self._span * TICK_RATE + 1e-6) + 1) / TICK_RATE
+        self._reported = 0.0
         self._update_t: list[float] = []
         self._update_s: list[float] = []
         self._seconds = 0.0
@@ -202,21 +223,16 @@ class _Loop:
         """Feed everything, ticks included."""
         started = perf_counter()
         initialized = self._prior is None
-        fired = 0
-        reported = 0.0
         for (t, is_odometry), group in groupby(self._measurements(), lambda m: (m.t, isinstance(m, Odometry))):
             if not initialized and t > self._start:
                 self._initialize()
                 initialized = True
-            while initialized and fired < len(self._ticks) and self._ticks[fired] < t:
-                self._tick(float(self._ticks[fired]))
-                fired += 1
-                if fired >= reported * len(self._ticks):
-                    self._progress(fired / len(self._ticks))
-                    reported = fired / len(self._ticks) + 0.01
+            for tick in self._ticks.before(t):
+                self._tick(tick)
             if is_odometry:
                 for m in group:
-                    self._estimator.process(m)
+                    with self._guard.taking(m):
+                        self._estimator.process(m)
             elif t < self._start:
                 self._estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
             else:
@@ -226,8 +242,8 @@ class _Loop:
                 self._update(t, group)
         if not initialized:
             self._initialize()
-        for tick in self._ticks[fired:]:
-            self._tick(float(tick))
+        for tick in self._ticks.rest():
+            self._tick(tick)
         self._seconds = perf_counter() - started
         self._progress(1.0)
 
@@ -237,7 +253,7 @@ class _Loop:
             update_t=np.array(self._update_t),
             update_ms=np.array(self._update_s) * 1e3,
             causal_seconds=self._seconds,
-            real_time_factor=self._span / self._seconds,
+            real_time_factor=self._ticks.seconds / self._seconds,
             final_seconds=final_seconds,
             peak_memory_mb=_peak_memory_mb(),
             images=prepared.images,
@@ -249,28 +265,34 @@ class _Loop:
 
     def _initialize(self) -> None:
         assert self._prior is not None
-        self._estimator.initialize(self._prior)
+        with self._guard.telling(f"the start at {self._prior.t:.3f} s"):
+            self._estimator.initialize(self._prior)
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
         for m in measurements:
-            self._estimator.process(m)
-        self._estimator.estimate()
+            with self._guard.taking(m):
+                self._estimator.process(m)
+        with self._guard.telling(f"the estimate at {t:.3f} s"):
+            sound(self._estimator.estimate())
         self._update_s.append(perf_counter() - started)
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
-        e = self._estimator.estimate(t)
-        self._estimator.process(Tick(t))
-        if e.status != "unlocalized" and not np.all(np.isfinite(e.pose)):
-            name = type(self._estimator).__name__
-            raise RunFailedError(f"{name} on {self._log.name}: the estimate at {t:.3f} s is not finite")
+        with self._guard.telling(f"the estimate at {t:.3f} s"):
+            e = sound(self._estimator.estimate(t))
+        with self._guard.taking(Tick(t)):
+            self._estimator.process(Tick(t))
         # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
         )
         if self._watch is not None:
             self._watch(t, self._estimator)
+        share = (t - self._start) / max(self._last - self._start, 1e-9)
+        if share >= self._reported:
+            self._progress(share)
+            self._reported = share + 0.01
 
 
 def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
@@ -283,12 +305,24 @@ def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
     return Trajectory3(np.array(t), *parts)
 
 
+def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float:
+    """The time of the first tick; InputError where nothing is measured from then on."""
+    first, last = _span(log, sensors)
+    begin = first if prior is None else prior.t
+    if not begin <= last:
+        raise InputError(f"{log.name}: the prior's time {begin:.3f} s lies after the last measurement at {last:.3f} s")
+    return begin
+
+
 def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
     streams = {s: log.streams[s].t for s in sensors if s in log.streams}
     stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
     if not stamps:
         raise InputError(f"{log.name}: has no measurements of {', '.join(sensors)}")
-    return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+    first, last = min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+    if not (abs(first) <= FARTHEST and abs(last) <= FARTHEST):
+        raise InputError(f"{log.name}: has stamps from {first:g} to {last:g} s, expected at most {FARTHEST:g} s from 0")
+    return first, last
 
 
 def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:

@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Belief, Estimator, Mode
+from factorgraph_loc.estimators.base import Belief, Estimator, Mode, PoseEstimate
 from factorgraph_loc.estimators.cloud import systematic
+from factorgraph_loc.estimators.guarded import Guard, sound
 from factorgraph_loc.files import nearest
 from factorgraph_loc.measurements import Measurement, RfidScan, Tick
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
@@ -53,7 +54,8 @@ def run_active(
     """Drive from an unknown start until the place is known, or until the robot gives up.
 
     Runs of one seed share world, start, and the sequences that noise is drawn from, whatever the policy and the estimator.
-    InputError names a wrong policy, estimator or start, and a sensor that is faster than the robot's control.
+    InputError names a wrong policy, estimator or start, and a sensor that is faster than the robot's control; RunFailedError tells
+    that the estimator failed, when, and by what.
     """
     settings = settings or ActiveSettings()
     if simulation.faults != FaultSettings():
@@ -78,7 +80,10 @@ def run_active(
     robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
     sensors = ("odometry", "rfid", *(("bearing_range",) if world.landmarks else ()))
     setup = registry.Setup(simulation.rig, world, sensors, of_estimator)
-    loop = _Loop(robot, _estimator(estimator, setup, settings), chooser, setup, space, simulation, settings, of_policy)
+    guard = Guard(f"{estimator} on {simulation.name}")
+    with guard:
+        made = _estimator(estimator, setup, settings)
+    loop = _Loop(robot, guard, made, chooser, setup, space, simulation, settings, of_policy)
     localized = loop.run()
     position, heading = loop.errors()
     return ActiveRun(
@@ -104,6 +109,7 @@ class _Loop:
     def __init__(
         self,
         robot: SimulatedRobot,
+        guard: Guard,
         estimator: Estimator,
         policy: Policy,
         setup: registry.Setup,
@@ -115,6 +121,7 @@ class _Loop:
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
         self._robot, self._estimator, self._policy = robot, estimator, policy
+        self._guard = guard
         self._space, self._settings, self._rng = space, settings, rng
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
         self._looked_at = -math.inf  # metres driven when the particles were last told of the walls
@@ -149,23 +156,24 @@ class _Loop:
                 done = self._take(robot.drive(choice.path.poses, metres))
             if robot.t == before:
                 done = self._take(robot.wait(PAUSE))
-        self._estimator.process(Tick(robot.t))
+        self._feed(Tick(robot.t))
         return done
 
     def errors(self) -> tuple[float, float]:
         """Of the estimate, in position [m] and heading [rad]; not a number where there is none."""
-        error = self._estimator.estimate().pose - self._robot.pose
+        error = self._estimate().pose - self._robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
         """Whether the place is known, and truly, on the way of these reports."""
         for report in reports:
-            self._estimator.process(report)
+            self._feed(report)
             if isinstance(self._estimator, ActiveMcl) and self._robot.metres >= self._looked_at + LOOK:
                 self._looked_at = self._robot.metres
                 # filters move at scans and ticks alone
-                self._estimator.process(Tick(self._robot.t))
-                self._estimator.see(self._robot.proximity, self._robot.look())
+                self._feed(Tick(self._robot.t))
+                with self._guard.telling(f"the walls at {self._robot.t:.3f} s"):
+                    self._estimator.see(self._robot.proximity, self._robot.look())
             if isinstance(report, RfidScan) and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
@@ -174,8 +182,16 @@ class _Loop:
                 self.claimed_wrong |= beyond > WRONG
         return False
 
+    def _feed(self, measurement: Measurement) -> None:
+        with self._guard.taking(measurement):
+            self._estimator.process(measurement)
+
+    def _estimate(self) -> PoseEstimate:
+        with self._guard.telling(f"the estimate at {self._robot.t:.3f} s"):
+            return sound(self._estimator.estimate())
+
     def _is_sure(self) -> bool:
-        estimate = self._estimator.estimate()
+        estimate = self._estimate()
         if estimate.status != "localized":
             return False
         position = math.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1])
@@ -183,9 +199,10 @@ class _Loop:
         return position < self._settings.position_limit and heading < self._settings.heading_limit
 
     def _choose(self) -> Choice:
-        self._estimator.process(Tick(self._robot.t))
+        self._feed(Tick(self._robot.t))
         started = perf_counter()
-        belief = self._estimator.belief()
+        with self._guard.telling(f"the belief at {self._robot.t:.3f} s"):
+            belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         modes = _places(belief)
         proposed = [*self._paths, *self._far(modes)]
@@ -210,7 +227,7 @@ class _Loop:
         elapsed = 1e3 * (perf_counter() - started)
         if choice.path is not None and choice.path.kind == self._turn.kind:
             self._turned_at = self._robot.metres
-        estimate = self._estimator.estimate()
+        estimate = self._estimate()
         self.steps.append(
             PlanningStep(
                 t=self._robot.t,

@@ -95,8 +95,55 @@ def test_progress_ends_at_one(log):
 
 
 def test_a_pose_that_is_not_finite_is_an_error(log):
-    with pytest.raises(RunFailedError, match=r"straight: the estimate at 1\.000 s is not finite"):
+    with pytest.raises(
+        RunFailedError, match=r"^fake on straight: the estimate at 1\.000 s \(after .*\): the pose is not finite$"
+    ):
         run(log, RunConfig("fake", {"broken_at": 0.95}))
+
+
+@pytest.mark.parametrize("far", [100.0, 1.7e9])
+@pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
+def test_a_clock_that_jumps_costs_no_ticks(log, name, far):
+    """The first row of the odometry is from before the clock was set."""
+    jumped = {key: replace(s, t=np.where(s.t > 0.0, s.t + far, s.t)) for key, s in log.streams.items()}
+    result = run(replace(log, streams=jumped, reference=None), RunConfig(name, prior="0,0,0"))
+    assert result.t[0] == 0.0
+    assert result.t[1:] == pytest.approx(far + np.arange(1, 21) * 0.1)
+    assert np.all(np.isfinite(result.poses))
+    assert np.all(np.linalg.eigvalsh(result.covariances) > 0.0)
+    # the odometry alone may be anywhere after a minute of silence, landmarks tell the place
+    assert (np.sqrt(result.covariances[1, 0, 0]) > 1.0) == (name == "dead_reckoning")
+    assert any("a gap above 60 s without any measurement" in warning for warning in result.warnings)
+    assert result.timings.real_time_factor < 1e4
+    assert result.config["tick_gap"] == 60.0
+
+
+def test_gaps_without_ticks_are_a_setting(log):
+    silent = {key: replace(s, t=np.where(s.t > 1.0, s.t + 5.0, s.t)) for key, s in log.streams.items()}
+    silent = replace(log, streams=silent)
+    whole, parted = run(silent, RunConfig("fake")), run(silent, RunConfig("fake", tick_gap=2.0))
+    assert len(whole.t) == 71
+    assert parted.t.tolist() == [t for t in whole.t.tolist() if t <= 1.0 or t >= 6.02]
+    with pytest.raises(InputError, match="tick_gap is 0, expected 1 to 86400 s"):
+        run(log, RunConfig("fake", tick_gap=0.0))
+
+
+def test_stamps_that_are_no_times_of_a_log(log):
+    for far in (np.nan, np.inf, 1e300):
+        stream = replace(log.streams["odometry"], t=np.append(log.streams["odometry"].t[:-1], far))
+        with pytest.raises(InputError, match="has stamps from"):
+            run(replace(log, streams={"odometry": stream}), RunConfig("fake", prior="0,0,0"))
+
+
+def test_what_an_estimator_cannot_compute_is_one_line(log, fake, monkeypatch):
+    def fail(_, measurement):
+        if measurement.t > 0.5:
+            np.linalg.inv(np.zeros((2, 2)))
+
+    monkeypatch.setattr(fake, "process", fail)
+    with pytest.raises(RunFailedError) as told:
+        run(log, RunConfig("fake"))
+    assert str(told.value) == "fake on straight: bearing_range at 0.520 s: Singular matrix"
 
 
 def test_a_log_without_measurements(log):

@@ -302,7 +302,9 @@ class _Page:
                 "The test is Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected as of Holm "
                 "within each column; below 0.05 a difference is called significant. The effect is the matched-pairs "
                 "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored at the stamps of the "
-                "reference, at most ten a second, without alignment; between estimates they are interpolated."
+                "reference, at most ten a second, without alignment; between estimates they are interpolated. There are "
+                "estimates ten times a second, but none inside gaps of more than a minute (or what tick_gap says) in which no "
+                "sensor measured anything."
             ),
         )
 

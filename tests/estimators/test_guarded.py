@@ -1,0 +1,113 @@
+"""What fails in an estimator is one line, and what it says is checked."""
+
+import math
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.estimators.base import PoseEstimate
+from factorgraph_loc.estimators.guarded import Guard, nearest_positive, sound, sound_trajectory
+from factorgraph_loc.measurements import BearingRange, Tick, VelocityOdometry
+from factorgraph_loc.trajectory import Trajectory
+
+SEEN = BearingRange(3.25, ("a",), np.ones(1), np.zeros(1))
+
+
+def estimate(covariance=None, pose=(1.0, 2.0, 0.3), status="localized"):
+    return PoseEstimate(1.0, np.array(pose), np.eye(3) if covariance is None else np.array(covariance), status)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (np.linalg.LinAlgError("Singular matrix"), "Singular matrix"),
+        (ZeroDivisionError("division by zero"), "division by zero"),
+        (FloatingPointError("overflow"), "overflow"),
+        (RuntimeError("\n  Indeterminant linear system\nnear 8, and much more"), "Indeterminant linear system"),
+        (RuntimeError(), "RuntimeError"),
+        (ValueError("x" * 500), "x" * 117 + "..."),
+        (RunFailedError("the graph cannot be solved"), "the graph cannot be solved"),
+    ],
+)
+def test_a_failure_is_one_line_with_estimator_time_and_measurement(error, reason):
+    guard = Guard("ekf on hall")
+    with pytest.raises(RunFailedError) as told, guard.taking(SEEN):
+        raise error
+    assert str(told.value) == f"ekf on hall: bearing_range at 3.250 s: {reason}"
+    assert told.value.__cause__ is error
+    with pytest.raises(RunFailedError) as told, guard.telling("the estimate at 4.000 s"):
+        raise error
+    assert str(told.value) == f"ekf on hall: the estimate at 4.000 s (after bearing_range at 3.250 s): {reason}"
+
+
+def test_faults_of_the_program_and_of_the_input_pass():
+    guard = Guard("ekf")
+    for error in (KeyError("a"), TypeError("b"), AttributeError("c"), InputError("d"), KeyboardInterrupt()):
+        with pytest.raises(type(error)), guard.taking(VelocityOdometry(1.0, 0.0, 0.0)):
+            raise error
+
+
+def test_warnings_are_silent_inside_and_as_before_outside():
+    before = np.geterr()
+    with Guard("ekf").taking(Tick(1.0)):
+        assert not np.isfinite(np.array(1e300) * np.array(1e300))
+    assert np.geterr() == before
+
+
+def test_a_sound_estimate_is_the_same():
+    turned = np.array(((0.6, -0.8, 0.1), (0.8, 0.6, 0.0), (0.0, 0.0, 1.0)))
+    for scale in (1e-12, 1.0, 1e12):
+        given = estimate(scale * turned @ np.diag((1.0, 1e-3, 10.0)) @ turned.T)
+        assert sound(given) is given
+    unsaid = estimate(np.full((3, 3), np.nan), (math.nan,) * 3, "unlocalized")
+    assert sound(unsaid) is unsaid
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (estimate(pose=(math.nan, 0.0, 0.0)), "the pose is not finite"),
+        (estimate(pose=(0.0, 0.0, math.inf)), "the pose is not finite"),
+        (estimate(np.diag((1.0, math.nan, 1.0))), "the covariance is not finite"),
+        (estimate(np.diag((1.0, math.inf, 1.0))), "the covariance is not finite"),
+        (estimate(np.diag((1.0, 0.0, 1.0))), "the covariance is not positive definite"),
+        (estimate(np.diag((1.0, -1.0, 1.0))), "the covariance is not positive definite"),
+        (estimate(((1.0, 1.1, 0.0), (1.1, 1.0, 0.0), (0.0, 0.0, 1.0))), "the covariance is not positive definite"),
+        (estimate(((1.0, 0.1, 0.0), (0.2, 1.0, 0.0), (0.0, 0.0, 1.0))), "the covariance is not positive definite"),
+    ],
+)
+def test_what_cannot_be_is_a_failure(given, why):
+    guard = Guard("ekf on hall")
+    with pytest.raises(RunFailedError) as told, guard.telling("the estimate at 1.000 s"):
+        sound(given)
+    assert str(told.value) == f"ekf on hall: the estimate at 1.000 s: {why}"
+
+
+def test_what_rounding_took_from_a_covariance_is_given_back():
+    line = np.array((1e3, 1e-2, 1.0))
+    singular = np.outer(line, line)
+    found = sound(estimate(singular)).covariance
+    assert np.all(np.linalg.eigvalsh(found) > 0.0)
+    assert found == pytest.approx(singular, rel=1e-6)
+    assert np.array_equal(found, found.T)
+    lopsided = np.eye(3)
+    lopsided[0, 1] = 1e-12
+    assert nearest_positive(lopsided) is lopsided
+
+
+def test_a_trajectory_names_the_time_of_the_pose_that_cannot_be():
+    guard = Guard("batch on hall")
+    t, poses, covariances = np.arange(3.0), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+    sound = Trajectory(t, poses, covariances)
+    assert sound_trajectory(sound) is sound
+    for bad in (np.full((3, 3), np.nan), np.diag((1.0, -1.0, 1.0)), np.zeros((3, 3))):
+        wrong = covariances.copy()
+        wrong[1] = bad
+        with pytest.raises(RunFailedError, match=r"final: the covariance at 1\.000 s is not"), guard.telling("final"):
+            sound_trajectory(Trajectory(t, poses, wrong))
+    poses = poses.copy()
+    poses[2, 1] = np.inf
+    with pytest.raises(RunFailedError, match=r"the pose at 2\.000 s is not finite"), guard.telling("final"):
+        sound_trajectory(Trajectory(t, poses))
+    assert len(sound_trajectory(Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))) == 0
