@@ -15,17 +15,17 @@ from typing import Self
 
 import numpy as np
 
-from factorgraph_loc.errors import FglocError, RunFailedError
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.base import PoseEstimate
 from factorgraph_loc.measurements import Measurement, Tick
 from factorgraph_loc.pushed import sensor_of
+from factorgraph_loc.text import plain
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 # singular matrices, overflows, divisions by zero, values that no function takes; all that GTSAM throws
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-LONGEST = 120  # letters of another library's message
 SKEW = 1e-6  # of two standard deviations: how far rounding may take a covariance from symmetry
 ROUNDING = 1e-6  # of a correlation matrix: eigenvalues that are no lower are those of rounding
 LEAST = 1e-9  # what they are raised to
@@ -175,9 +175,6 @@ def _named(measurement: Measurement) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what an error says that says anything, shortened; its type where it says nothing."""
+    """The first line of what an error says that says anything; its type where it says nothing."""
     lines = (" ".join(line.split()) for line in str(error).splitlines())
-    text = next((line for line in lines if line), type(error).__name__)
-    if isinstance(error, FglocError) or len(text) <= LONGEST:
-        return text
-    return text[: LONGEST - 3] + "..."
+    return plain(next((line for line in lines if line), type(error).__name__))

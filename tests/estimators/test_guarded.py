@@ -26,7 +26,7 @@ def estimate(covariance=None, pose=(1.0, 2.0, 0.3), status="localized"):
         (FloatingPointError("overflow"), "overflow"),
         (RuntimeError("\n  Indeterminant linear system\nnear 8, and much more"), "Indeterminant linear system"),
         (RuntimeError(), "RuntimeError"),
-        (ValueError("x" * 500), "x" * 117 + "..."),
+        (ValueError("x" * 500), "x" * 71 + "..." + "x" * 46),
         (RunFailedError("the graph cannot be solved"), "the graph cannot be solved"),
     ],
 )
