@@ -38,6 +38,7 @@ from factorgraph_loc.rig import write_rig
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
 from factorgraph_loc.simulation import simulate as make_log
 from factorgraph_loc.simulation.recorded import RecordedLooks
+from factorgraph_loc.text import listed
 from factorgraph_loc.ticks import TICK_GAP
 from factorgraph_loc.vision.feature_evaluation import feature
 from factorgraph_loc.vision.sequences import find_sequences
@@ -143,7 +144,7 @@ def compare(
     comparing.check_free(Path(out), overwrite=overwrite)
     named = settings or {}
     if others := [name for name in named if name not in estimators]:
-        raise InputError(f"settings are given of {others[0]}, which is not run here; run: {', '.join(estimators)}")
+        raise InputError(f"settings are given of {others[0]}, which is not run here; run: {listed(estimators)}")
     used = None if sensors is None else tuple(sensors)
     chosen = list(seeds)
     configs = [

@@ -22,6 +22,7 @@ from pydantic import Field
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, nearest, read_text
+from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array
 
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
@@ -82,7 +83,7 @@ class Mapped:
         unit = self.mapping.units.get(field)
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
-            raise InputError(f"{self.path}: the unit of {field} is {unit!r}, expected {expected}: units.{field}")
+            raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}: units.{field}")
         column, shift = self.mapping.columns[field], round(offset * 1e9)
         out = np.empty(len(self.cells.rows), dtype=np.int64)
         for i, text in enumerate(self.cells.columns[column]):
@@ -106,7 +107,7 @@ class Mapped:
             return float(unit)
         if unit not in units:
             expected = f"one of {', '.join(units)}, or a number"
-            raise InputError(f"{self.path}: the unit of {field} is {unit!r}, expected {expected}")
+            raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}")
         return units[unit]
 
 
@@ -120,10 +121,10 @@ def read_mapped(
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
     if unknown := sorted(given - known):
-        raise InputError(f"{path}: there is no field {unknown[0]!r} to map{nearest(unknown[0], sorted(known))}")
+        raise InputError(f"{path}: there is no field {quoted(unknown[0])} to map{nearest(unknown[0], sorted(known))}")
     if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
         expected = " or ".join(", ".join(shape) for shape in shapes)
-        raise InputError(f"{path}: columns maps {', '.join(sorted(given))}, expected {expected}")
+        raise InputError(f"{path}: columns maps {listed(sorted(given))}, expected {expected}")
     if stray := sorted(set(mapping.units) - given):
         raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
     needed = [column for field, column in mapping.columns.items() if field not in optional]
@@ -198,7 +199,7 @@ def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> I
         for parts in reader:
             yield lines[reader.line_num - 1][0], [part.strip() for part in parts]
     except csv.Error as error:
-        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {error}") from error
+        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
 
 
 def _chained(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
@@ -209,9 +210,9 @@ def _chained(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]
 def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], row: int) -> None:
     for column in needed:
         if column not in header:
-            raise InputError(f"{path}:{row}: has no column {column!r}, it has {', '.join(header)}")
+            raise InputError(f"{path}:{row}: has no column {quoted(column)}, it has {listed(header)}")
         if list(header).count(column) > 1:
-            raise InputError(f"{path}:{row}: has the column {column!r} more than once")
+            raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, int]:
@@ -237,7 +238,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
                 columns[column].append("" if value is None else str(value))
     for column in needed:
         if passed and not seen[column]:
-            raise InputError(f"{path}: no object has {column!r}, the first has {', '.join(keys)}")
+            raise InputError(f"{path}: no object has {quoted(column)}, the first has {listed(keys)}")
     return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), passed
 
 
@@ -245,7 +246,7 @@ def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:
     try:
         content = json.loads(line)
     except ValueError as error:
-        raise InputError(f"{path}:{row}: is not JSON, expected an object in each line: {error}") from error
+        raise InputError(f"{path}:{row}: is not JSON, expected an object in each line: {told(error)}") from error
     entries = content if isinstance(content, list) else [content]
     if not all(isinstance(entry, dict) for entry in entries):
         raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)

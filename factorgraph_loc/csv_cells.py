@@ -12,6 +12,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import nearest, read_text
+from factorgraph_loc.text import told
 from factors.se2 import Array
 
 Shape = tuple[str, ...]  # the names of columns
@@ -62,7 +63,7 @@ def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
             rows.append(reader.line_num)
             cells.append(parts)
     except csv.Error as error:
-        raise InputError(f"{path}:{reader.line_num}: is not CSV: {error}") from error
+        raise InputError(f"{path}:{reader.line_num}: is not CSV: {told(error)}") from error
     columns = [[parts[i] for parts in cells] for i in range(len(header))]
     return Cells(path, rows, dict(zip(header, columns, strict=True))), shape
 

@@ -18,9 +18,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.text import plain, quoted
+from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted
 
 DEEPEST = 64  # tables or lists within each other, and parts of a key
+MANY = 1000  # names that a misspelt one is compared to: each takes its time
 MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
@@ -117,10 +118,11 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 def nearest(word: str, known: list[str]) -> str:
     """A hint for a misspelt word: the nearest known one, else all of them."""
-    matches = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    short = [name for name in known if len(name) <= NAME][:MANY]
+    matches = difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
     if matches:
-        return f": did you mean {matches[0]}?"
-    return f"; known: {', '.join(sorted(known))}" if known else ""
+        return f": did you mean {plain(matches[0])}?"
+    return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
 
 
 def inside(root: Path, name: str, source: object) -> Path:

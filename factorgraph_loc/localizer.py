@@ -31,6 +31,7 @@ from factorgraph_loc.files import nearest
 from factorgraph_loc.measurements import Exteroceptive, IncrementOdometry, Odometry, Tick
 from factorgraph_loc.pushed import ALL_SENSORS, RfidRead, checked, numbers, scan_of, sensor_of
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import quoted
 from factorgraph_loc.ticks import Ticks
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
@@ -73,7 +74,7 @@ class Localizer:
         seed: int = 0,
     ) -> None:
         if not history > 0.0:
-            raise InputError(f"history is {history!r}, expected more than 0 s")
+            raise InputError(f"history is {quoted(history)}, expected more than 0 s")
         self._rig, self._world, self._name = rig, world or World(), estimator
         default = {"lag": LAG} if estimator == "smoother" else {}
         self._settings = registry.settings_of(estimator, default | dict(settings or {}))
@@ -273,7 +274,7 @@ class Localizer:
     def _estimate(self, t: float | None) -> PoseEstimate:
         self._require_whole()
         if t is not None and not math.isfinite(t):
-            raise InputError(f"t is {t!r}, expected a finite number of seconds")
+            raise InputError(f"t is {quoted(t)}, expected a finite number of seconds")
         at = self._newest if t is None else max(self._newest, t)
         if self._last is not None and self._last.t == at:
             return copy.deepcopy(self._last)
@@ -310,7 +311,7 @@ def _sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
         asked = rig.sensors
     for name in asked:
         if name not in ALL_SENSORS:
-            raise InputError(f"no sensor is called {name!r}{nearest(name, list(ALL_SENSORS))}")
+            raise InputError(f"no sensor is called {quoted(name)}{nearest(name, list(ALL_SENSORS))}")
     return tuple(name for name in asked if rig.camera is not None or not name.startswith((CAMERA, "sightings")))
 
 
@@ -330,6 +331,6 @@ def _start(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> Po
     ):
         raise InputError(f"covariance is {spread.tolist()}, expected ({size}, {size}), symmetric and positive definite")
     if t is not None and not math.isfinite(t):
-        raise InputError(f"t is {t!r}, expected a finite number of seconds")
+        raise InputError(f"t is {quoted(t)}, expected a finite number of seconds")
     at = math.nan if t is None else float(t)
     return PosePrior(at, mean, spread) if size == 3 else PosePrior.at_position(at, mean[:2], spread)

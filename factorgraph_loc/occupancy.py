@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model
+from factorgraph_loc.text import told
 from factorgraph_loc.yaml_files import read_yaml
 from factors import se2
 from factors.se2 import Array
@@ -47,27 +48,29 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
     They run through the middles of the outermost occupied cells, within :data:`TOLERANCE`; groups of less than :data:`MIN_EXTENT`
     are left out. InputError names the file and what is wrong.
     """
-    told = parse_model(MapFile, read_yaml(path), path)
-    if told.free_thresh >= told.occupied_thresh:
-        raise bad_field(path, "free_thresh", told.free_thresh, f"less than occupied_thresh, {told.occupied_thresh:g}")
+    stated = parse_model(MapFile, read_yaml(path), path)
+    if stated.free_thresh >= stated.occupied_thresh:
+        raise bad_field(
+            path, "free_thresh", stated.free_thresh, f"less than occupied_thresh, {stated.occupied_thresh:g}"
+        )
     # maps made by a saver name their image without a folder, but nav stacks also write absolute paths
-    image = inside(path.parent, Path(told.image).name if Path(told.image).is_absolute() else told.image, path)
-    occupied = _occupied(image, told)
+    image = inside(path.parent, Path(stated.image).name if Path(stated.image).is_absolute() else stated.image, path)
+    occupied = _occupied(image, stated)
     if not occupied.any():
         raise InputError(
-            f"{image}: has no occupied cells, expected some above occupied_thresh {told.occupied_thresh:g}"
+            f"{image}: has no occupied cells, expected some above occupied_thresh {stated.occupied_thresh:g}"
         )
     lines = _outlines(occupied)
     if not len(lines):
         raise InputError(f"{image}: has only single occupied cells, expected walls of several")
     height = occupied.shape[0]
     columns, rows = lines[:, 0::2] + 0.5, height - (lines[:, 1::2] + 0.5)
-    ends = np.stack((columns, rows), axis=-1).reshape(-1, 2) * told.resolution
-    placed: Array = se2.transform_from(np.array(told.origin), ends).reshape(-1, 4)
+    ends = np.stack((columns, rows), axis=-1).reshape(-1, 2) * stated.resolution
+    placed: Array = se2.transform_from(np.array(stated.origin), ends).reshape(-1, 4)
     return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in np.round(placed, 6).tolist())
 
 
-def _occupied(path: Path, told: MapFile) -> NDArray[np.bool_]:
+def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
     """Which cells (rows, columns) are occupied; a transparent one is unknown."""
     try:
         with Image.open(path) as image:
@@ -77,14 +80,14 @@ def _occupied(path: Path, told: MapFile) -> NDArray[np.bool_]:
     except FileNotFoundError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: is not an image that can be read: {error}") from error
+        raise InputError(f"{path}: is not an image that can be read: {told(error)}") from error
     values = np.asarray(channels, dtype=np.uint8)
     grey = values[:, :, :3].mean(axis=2)
-    if told.mode == "raw":  # the occupancy in percent, 255 where it is unknown
-        return np.asarray((grey <= 100.0) & (grey >= 100.0 * told.occupied_thresh))
-    occupancy = grey / 255.0 if told.negate else 1.0 - grey / 255.0
+    if stated.mode == "raw":  # the occupancy in percent, 255 where it is unknown
+        return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))
+    occupancy = grey / 255.0 if stated.negate else 1.0 - grey / 255.0
     opaque = values[:, :, 3] > 0 if values.shape[2] == 4 else np.ones(grey.shape, dtype=bool)
-    return np.asarray((occupancy > told.occupied_thresh) & opaque)
+    return np.asarray((occupancy > stated.occupied_thresh) & opaque)
 
 
 def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
+from factorgraph_loc.text import listed, told
 from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
@@ -117,7 +118,7 @@ def read_points(path: Path) -> PointMap:
     try:
         table = pl.read_parquet(path)
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"{path}: is not a table of points: {str(error).splitlines()[0]}") from error
+        raise InputError(f"{path}: is not a table of points: {told(error)}") from error
     missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
@@ -145,7 +146,7 @@ def read_points(path: Path) -> PointMap:
     if unknown := [name for name in kinds if name not in KINDS]:
         raise bad_field(path, "feature", unknown[0], " or ".join(KINDS), row=features.index(unknown[0]) + 1)
     if len(kinds) > 1:
-        raise InputError(f"{path}: has features of the kinds {', '.join(kinds)}, expected one kind")
+        raise InputError(f"{path}: has features of the kinds {listed(kinds)}, expected one kind")
     if not kinds:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])

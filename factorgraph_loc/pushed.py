@@ -23,6 +23,7 @@ from factorgraph_loc.measurements import (
     VelocityOdometry,
     YawRate,
 )
+from factorgraph_loc.text import listed
 from factors.se2 import Array
 
 M = TypeVar("M", bound=Odometry | Exteroceptive)
@@ -95,12 +96,12 @@ def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRe
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
         if read.antenna not in names:
-            raise bad_field(where, "antenna", read.antenna, f"one that listened: {', '.join(names)}")
+            raise bad_field(where, "antenna", read.antenna, f"one that listened: {listed(names)}")
         if read.round is None:
             continue
         own = [k for k, name in enumerate(names) if name == read.antenna]
         if read.round not in own:
-            expected = f"one of antenna {read.antenna}: {', '.join(map(str, own))}"
+            expected = f"one of antenna {read.antenna}: {listed(own)}"
             raise bad_field(where, "round", read.round, expected)
         out[i] = read.round
     taken = {(read.epc, int(k)) for read, k in zip(reads, out, strict=True) if k >= 0}

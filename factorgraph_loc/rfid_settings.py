@@ -15,6 +15,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.grids import read_grid
+from factorgraph_loc.text import listed, quoted
 from factors import se2
 from factors.rfid import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
 from factors.rfid_phase import PhaseModel
@@ -170,7 +171,7 @@ class RfidSettings(FileModel):
         for name, antenna in self.all_antennas().items():
             if antenna.model not in self.models:
                 raise ValueError(
-                    f"antenna {name} has the model {antenna.model!r}, expected one of {', '.join(self.models)}"
+                    f"antenna {name} has the model {quoted(antenna.model)}, expected one of {listed(self.models)}"
                 )
         return self
 

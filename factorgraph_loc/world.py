@@ -23,6 +23,7 @@ from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, wri
 from factorgraph_loc.markers import Marker, corner_points
 from factorgraph_loc.occupancy import read_walls
 from factorgraph_loc.points import POINTS_SUFFIX, PointMap, read_points, write_points
+from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
 TAGS_SUFFIX = ".tags.csv"
@@ -133,10 +134,10 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
     points = content.get("points")
     if points is not None:
         if not isinstance(points, str):
-            raise InputError(f"{source}: points is {points!r}, expected the name of a file")
+            raise InputError(f"{source}: points is {quoted(points)}, expected the name of a file")
         path = inside(folder, points, source)
         if not path.exists():
-            raise InputError(f"{source}: points names {points!r}, which is missing")
+            raise InputError(f"{source}: points names {quoted(points)}, which is missing")
         content = {**content, "points": read_points(path)}
     if "markers" in content:
         markers = parse_model(_Markers, {"markers": content["markers"]}, source).markers

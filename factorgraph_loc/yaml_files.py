@@ -14,6 +14,7 @@ import yaml
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import read_text
+from factorgraph_loc.text import told
 
 DEEPEST = 20  # blocks within blocks
 _DIRECTIVE = re.compile(r"\A(\s*)%YAML[: ][^\n]*")  # OpenCV writes %YAML:1.0, which is none
@@ -54,7 +55,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         what = ", ".join(part for part in (error.context, error.problem) if part)
         raise InputError(f"{path}:{mark.line + 1 if mark else 1}: is not YAML that can be read: {what}") from error
     except yaml.YAMLError as error:
-        raise InputError(f"{path}: is not YAML that can be read: {' '.join(str(error).split())}") from error
+        raise InputError(f"{path}: is not YAML that can be read: {told(error)}") from error
     if node is None:
         return {}
     if not isinstance(node, yaml.MappingNode):

@@ -20,6 +20,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.rfid_settings import RfidSettings, SurveySettings
 from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.text import listed
 from factors import se2
 from factors.rfid_likelihood import TagArray
 from factors.rfid_phase import PhaseLikelihood, PhaseModel, PhaseReads
@@ -64,7 +65,7 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
     origin = np.array((*se2.transform_from(start.transform(), focus.pivot) - focus.pivot, start.heading, 0.0, 0.0))
     coarse = focus.near(origin)
     if coarse.count < ENOUGH_READS:
-        names = ", ".join(log.name for log in logs)
+        names = listed(log.name for log in logs)
         expected = f"expected at least {ENOUGH_READS} within {focus.model.max_range:g} m of their tags"
         raise InputError(f"{names}: hold {coarse.count} reads with a phase, {expected}")
     # reads of a wrong survey are near others than the true ones

@@ -27,6 +27,7 @@ from factorgraph_loc.calibration.triangulation import (
 )
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.points import PointMap
+from factorgraph_loc.text import told
 from factors.reprojection import CameraModel
 from factors.se2 import Array
 
@@ -121,7 +122,7 @@ def map_points(
             progress=lambda share: progress(0.7 + 0.3 * share),
         )
     except RuntimeError as error:  # GTSAM's of a system that is not determined
-        raise RunFailedError(f"points and cameras cannot be adjusted: {str(error).strip().splitlines()[0]}") from error
+        raise RunFailedError(f"points and cameras cannot be adjusted: {told(error)}") from error
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
     shift, turn = _moved(posed.cameras, adjusted.cameras)

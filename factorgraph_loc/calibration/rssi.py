@@ -15,6 +15,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import Log
 from factorgraph_loc.rfid_settings import RfidSettings, RssiSettings, SurveySettings
 from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.text import listed
 from factors.rfid_rssi import FEATURES, RssiReads, features
 from factors.se2 import Array
 
@@ -41,7 +42,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
     """
     x, y = _table(logs, rfid, survey)
     if len(y) < ENOUGH_READS:
-        names = ", ".join(log.name for log in logs)
+        names = listed(log.name for log in logs)
         raise InputError(f"{names}: hold {len(y)} reads with an RSSI, expected at least {ENOUGH_READS}")
     coefficients, sigma, dof = _fit(x, y)
     _, sigma_0, dof_0 = flat = _fit(x[:, :1], y)

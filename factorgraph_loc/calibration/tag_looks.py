@@ -11,6 +11,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.text import listed
 from factors.rfid import RfidModel
 from factors.rfid_likelihood import Looks
 from factors.se2 import Array
@@ -65,7 +66,7 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
         for row in _rows(m, antennas, index)
     ]
     if not rows:
-        known = ", ".join(antennas)
+        known = listed(antennas)
         raise InputError(f"{log.name}: no antenna that read is in its rig, expected some of {known}")
     rows.sort(key=lambda row: row[0])
     t, antenna, rounds, hits = zip(*rows, strict=True)

@@ -11,6 +11,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
 from factorgraph_loc.cli.viewing import What, load_results, shown
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import StoredRun
@@ -40,7 +41,7 @@ def export(
 ) -> None:
     """Write runs for Foxglove, or one run's final trajectory, or the reference of a log, for other programs."""
     if out.suffix not in FORMATS:
-        raise InputError(f"{out}: has the suffix {out.suffix!r}, expected one of {', '.join(FORMATS)}")
+        raise InputError(f"{out}: has the suffix {quoted(out.suffix)}, expected one of {', '.join(FORMATS)}")
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
     files = [out]
     if out.suffix == ".mcap":
@@ -70,7 +71,7 @@ def export(
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:
     if len(runs) != 1:
-        found = f"there are {len(runs)} ({', '.join(run.name for run in runs)})" if runs else "there is none"
+        found = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
         raise InputError(f"{out}: is of one run, and {found}, expected the folder of one")
     return runs[0]
 

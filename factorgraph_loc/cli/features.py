@@ -9,6 +9,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
+from factorgraph_loc.text import quoted
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images, and how good they are.")
 ALL = "colour,sift,orb,fast_hessian,harris_laplace,hessian_laplace"
@@ -37,7 +38,7 @@ def evaluate(
 
     names = list(dict.fromkeys(parse_list(features)))
     if not names:
-        raise InputError(f"--features is {features!r}, expected names such as {ALL}")
+        raise InputError(f"--features is {quoted(features)}, expected names such as {ALL}")
     chosen = [feature(name, count) for name in names]
     evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
     sequences = find_sequences(images)

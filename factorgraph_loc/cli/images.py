@@ -21,6 +21,7 @@ from factorgraph_loc.cli.options import (
     parse_list,
 )
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import quoted
 
 RANGE = "FIRST:END or FIRST:END:STEP"
 
@@ -49,7 +50,7 @@ def images(
     queries = dict(_query(text) for text in query)
     names = list(dict.fromkeys(parse_list(feature)))
     if not names:
-        raise InputError(f"--feature is {feature!r}, expected names such as colour,sift,orb")
+        raise InputError(f"--feature is {quoted(feature)}, expected names such as colour,sift,orb")
     for name in names:
         extractor(name, count)
     evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
@@ -84,12 +85,12 @@ def parse_range(text: str, option: str) -> range:
     except (TypeError, ValueError):
         found = range(0)
     if ":" not in text or not found or min(found) < 0 or found.step < 1:
-        raise InputError(f"{option} is {text!r}, expected a range of images such as 0:200:2")
+        raise InputError(f"{option} is {quoted(text)}, expected a range of images such as 0:200:2")
     return found
 
 
 def _query(text: str) -> tuple[str, range]:
     name, equals, numbers = text.partition("=")
     if not (name and equals):
-        raise InputError(f"--query is {text!r}, expected a name and a range of images such as A=1:200:2")
+        raise InputError(f"--query is {quoted(text)}, expected a name and a range of images such as A=1:200:2")
     return name, parse_range(numbers, "--query")

@@ -12,6 +12,7 @@ import typer
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.log import Log
@@ -109,7 +110,7 @@ class LogOptions:
         """The log of a name that must stand for one log."""
         logs = self.load([name])
         if len(logs) > 1:
-            raise InputError(f"{name} stands for {len(logs)} logs, expected one: {', '.join(log.name for log in logs)}")
+            raise InputError(f"{name} stands for {len(logs)} logs, expected one: {listed(log.name for log in logs)}")
         return logs[0]
 
 
@@ -127,15 +128,15 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
         name, value = key_and_value(text, "--set")
         estimator, *keys = name.split(".")
         if not keys or not all(keys):
-            raise InputError(f"--set is {text!r}, expected NAME.key=value, such as smoother.lag=10")
+            raise InputError(f"--set is {quoted(text)}, expected NAME.key=value, such as smoother.lag=10")
         check_names([estimator])
         if estimator not in settings:
-            raise InputError(f"--set is {text!r}, but {estimator} is not run here; run: {', '.join(estimators)}")
+            raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here; run: {listed(estimators)}")
         table = settings[estimator]
         for key in keys[:-1]:
             table = table.setdefault(key, {})
             if not isinstance(table, dict):
-                raise InputError(f"--set is {text!r}, but {key} is set to {table!r} already")
+                raise InputError(f"--set is {quoted(text)}, but {key} is set to {quoted(table)} already")
         table[keys[-1]] = value
     return settings
 
@@ -143,7 +144,7 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip():
-        raise InputError(f"{option} is {text!r}, expected KEY=VALUE")
+        raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")
     return key.strip(), _scalar(value.strip())
 
 

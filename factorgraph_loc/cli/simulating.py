@@ -11,6 +11,7 @@ from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.simulation import SimulationSettings
@@ -109,6 +110,6 @@ def nested_changes(named: dict[str, float | None], texts: list[str]) -> dict[str
         for table in tables:
             inner = inner.setdefault(table, {})
             if not isinstance(inner, dict):
-                raise InputError(f"--set is {name}={value}, but {table} is set to {inner!r} already")
+                raise InputError(f"--set is {name}={value}, but {table} is set to {quoted(inner)} already")
         inner[key] = value
     return changes

@@ -12,6 +12,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.shipped import manifests
+from factorgraph_loc.text import listed
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.particles import Particles
@@ -94,11 +95,11 @@ def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[Stored
     places = [name for name in what if is_results(Path(name))]
     logs = [name for name in what if name not in places]
     if len(logs) > 1:
-        raise InputError(f"{', '.join(logs)} are {len(logs)} logs, expected one log and folders of its results")
+        raise InputError(f"{listed(logs)} are {len(logs)} logs, expected one log and folders of its results")
     folders = [run for name in places for run in find_runs(Path(name))]
     named = sorted({folder.log for folder in folders})
     if not logs and len(named) > 1:
-        raise InputError(f"{places[0]}: holds runs of {', '.join(named)}, expected one of them to be named too")
+        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of them to be named too")
     if not logs and named[0] not in manifests():
         raise InputError(
             f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be named too"
@@ -106,5 +107,5 @@ def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[Stored
     log = options.load_one(logs[0] if logs else named[0])
     of_log = [folder for folder in folders if folder.log == log.name]
     if folders and not of_log:
-        raise InputError(f"{places[0]}: holds runs of {', '.join(named)}, expected some of the log {log.name}")
+        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected some of the log {log.name}")
     return log, read_runs(of_log, log)

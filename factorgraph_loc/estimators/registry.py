@@ -13,6 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import Estimator
 from factorgraph_loc.files import FileModel, nearest, parse_model
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import quoted
 from factorgraph_loc.world import World
 
 # name: (module, class of the estimator, class of its settings); imported when asked for
@@ -58,7 +59,7 @@ def check_names(names: Sequence[str]) -> None:
     """InputError for the first name that is no estimator, with the nearest that is."""
     for name in names:
         if name not in ESTIMATORS:
-            raise InputError(f"no estimator is called {name!r}{nearest(name, list(ESTIMATORS))}")
+            raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
 
 
 def _load(name: str, which: int) -> Any:

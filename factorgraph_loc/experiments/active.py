@@ -32,6 +32,7 @@ from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.text import quoted, told
 
 CHUNK = 10  # runs of one process: to start one takes longer than a run
 FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")
@@ -265,7 +266,7 @@ def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
         raise InputError(f"no {what} is given; known: {', '.join(known)}")
     for name in names:
         if name not in known:
-            raise InputError(f"unknown {what} {name!r}{nearest(name, list(known))}")
+            raise InputError(f"unknown {what} {quoted(name)}{nearest(name, list(known))}")
         if list(names).count(name) > 1:
             raise InputError(f"{what} {name} is given twice")
 
@@ -292,8 +293,7 @@ def _failed(job: ActiveJob, seed: int, status: str, reason: str) -> Row:
 
 
 def _message(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, FglocError) else f"{type(error).__name__}: {text}"
+    return str(error) if isinstance(error, FglocError) else f"{type(error).__name__}: {told(error)}"
 
 
 def _kept(job: ActiveJob) -> list[Row]:

@@ -27,6 +27,7 @@ from factorgraph_loc.experiments.keys import code_version, digest_of, library_ve
 from factorgraph_loc.experiments.log_source import LogSource, SimulatedSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import FAILURE, Store
+from factorgraph_loc.text import quoted, told
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -78,9 +79,11 @@ def execute(
         try:
             client = stack.enter_context(distributed.Client(scheduler, timeout=CONNECT, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f"--scheduler is {scheduler!r}: no scheduler answers there: {error}") from error
+            raise InputError(
+                f"--scheduler is {quoted(scheduler)}: no scheduler answers there: {told(error)}"
+            ) from error
         if not client.nthreads():
-            raise InputError(f"--scheduler is {scheduler!r}: it has no workers")
+            raise InputError(f"--scheduler is {quoted(scheduler)}: it has no workers")
         cluster = _Cluster(distributed, client, Store(folder), limits, again)
         stack.callback(cluster.close)
         try:
@@ -201,7 +204,7 @@ class _Cluster:
             return _Made(_failure("killed", "the workers that were given it died, one after the other"))
         if isinstance(error, FglocError):
             raise error
-        raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {error}") from error
+        raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {told(error)}") from error
 
 
 def _failure(kind: Kind, reason: str) -> dict[str, bytes]:

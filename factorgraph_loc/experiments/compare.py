@@ -28,6 +28,7 @@ from factorgraph_loc.experiments.processes import run_each
 from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
 from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
+from factorgraph_loc.text import quoted
 from factorgraph_loc.ticks import check_tick_gap
 
 _ERROR = "error.txt"
@@ -141,7 +142,7 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
         check_tick_gap(config.tick_gap)
         for sensor in config.sensors or ():
             if sensor not in streams:
-                raise InputError(f"no log has a sensor {sensor!r}{nearest(sensor, streams)}")
+                raise InputError(f"no log has a sensor {quoted(sensor)}{nearest(sensor, streams)}")
     names = [file_name(log.name) for log in logs]
     for log, name in zip(logs, names, strict=True):
         if names.count(name) > 1:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import FAILURE, Store, StoreError
+from factorgraph_loc.text import told
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.log_source import LogSource
@@ -81,11 +82,11 @@ def compute(run: PlannedRun) -> dict[str, bytes]:
         files = {FAILURE: failure_file("memory", "there was no memory left")}
     except FglocError as error:
         kind: Kind = "vanished" if isinstance(error, VanishedError) else "error"
-        files = {FAILURE: failure_file(kind, " ".join(str(error).split()))}
+        files = {FAILURE: failure_file(kind, str(error))}
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _DISK:
             raise StoreError(f"{tempfile.gettempdir()}: cannot be written: {error.strerror}") from error
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        reason = f"{type(error).__name__}: {told(error)}"
         files = {FAILURE: failure_file("error", reason, "".join(traceback.format_exception(error)))}
     return files
 

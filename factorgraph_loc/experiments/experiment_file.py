@@ -14,6 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.files import FileModel, nearest, parse_model, read_toml
+from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.ticks import LONGEST, SHORTEST, TICK_GAP
 
 SIMULATION = "simulation"  # the first word of settings of simulated logs
@@ -105,7 +106,7 @@ class Sweep(FileModel):
             if not values:
                 raise ValueError(f"{key} has no values")
         if self.mode == "list" and len({len(values) for values in self.over.values()}) > 1:
-            raise ValueError(f"a list needs as many values of each of {', '.join(self.over)}")
+            raise ValueError(f"a list needs as many values of each of {listed(self.over)}")
         return self
 
     def points(self) -> list[dict[str, Scalar]]:
@@ -167,19 +168,19 @@ class Experiment(FileModel):
     def _fits(self) -> Experiment:
         labels = [entry.shown for entry in self.estimators]
         if twice := [label for label in labels if labels.count(label) > 1]:
-            raise ValueError(f"two estimators are called {twice[0]!r}, expected a label of its own for each")
+            raise ValueError(f"two estimators are called {quoted(twice[0])}, expected a label of its own for each")
         known = {SIMULATION, *labels, *(entry.name for entry in self.estimators)}
         for key in self.sweep.over:
             first, _, rest = key.partition(".")
             if first not in known or not rest:
                 raise ValueError(
-                    f"sweep has {key!r}{nearest(first, list(known))}; expected LABEL.KEY or simulation.KEY"
+                    f"sweep has {quoted(key)}{nearest(first, list(known))}; expected LABEL.KEY or simulation.KEY"
                 )
             if first == SIMULATION and not any(entry.simulate for entry in self.logs):
-                raise ValueError(f"sweep has {key!r}, but no log is simulated")
+                raise ValueError(f"sweep has {quoted(key)}, but no log is simulated")
         baseline = self.report.baseline
         if baseline is not None and baseline not in labels:
-            raise ValueError(f"report.baseline is {baseline!r}{nearest(baseline, labels)}")
+            raise ValueError(f"report.baseline is {quoted(baseline)}{nearest(baseline, labels)}")
         return self
 
     def folder(self) -> Path:
@@ -225,7 +226,7 @@ def _set(table: dict[str, Any], key: str, value: Any, source: object) -> None:
     for part in parts:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise InputError(f"{source}: no key {key}, as {part} is {table!r}")
+            raise InputError(f"{source}: no key {key}, as {part} is {quoted(table)}")
     table[last] = value
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, read_toml
 from factorgraph_loc.shipped import manifests
+from factorgraph_loc.text import quoted
 from factorgraph_loc.yaml_files import read_yaml
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSou
     found += [str(path) for path in sorted(base.glob(below)) if others.get("reader") or _is_log(path)]
     if not found:
         raise InputError(
-            f"no log matches {name!r}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
+            f"no log matches {quoted(name)}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
         )
     return [RecordedSource(one, **others) for one in found]
 

@@ -25,6 +25,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log, StartPose
 from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.frontend import with_features
 from factorgraph_loc.world import World, write_world
 from factors import se2
@@ -135,7 +136,7 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
     if of == "points" or (of is None and not of_others and "camera" in log.streams and log.rig.camera is not None):
         return "points"
     if of not in (None, "landmarks", "tags"):
-        raise InputError(f"--of is {of!r}, expected landmarks, tags or points")
+        raise InputError(f"--of is {quoted(of)}, expected landmarks, tags or points")
     if of == "tags" or (of is None and "bearing_range" not in log.streams and "rfid" in log.streams):
         if of_landmarks:
             raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
@@ -148,7 +149,9 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
 def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     estimator, settings = options.estimator, dict(options.settings)
     if estimator not in MAPPERS:
-        raise InputError(f"--estimator is {estimator!r}, expected one that estimates landmarks: {', '.join(MAPPERS)}")
+        raise InputError(
+            f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAPPERS)}"
+        )
     if "landmarks" in settings:
         raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
     mapping.check(log)
@@ -231,7 +234,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
 def _along_reference(options: MapOptions, *, there: bool) -> bool:
     """Whether the robot's poses are those of the reference; ``there``: there is one that could be used."""
     if options.poses not in (None, "reference", "odometry"):
-        raise InputError(f"--poses is {options.poses!r}, expected reference or odometry")
+        raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")
     return there if options.poses is None else options.poses == "reference"
 
 

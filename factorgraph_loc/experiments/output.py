@@ -23,6 +23,7 @@ from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.files import write_text, write_toml
 from factorgraph_loc.log import Log
+from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Trajectory, write_tum
 from factors.se2 import Array
 
@@ -108,9 +109,9 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
     if it does not, if there is no folder for it, or if either is there already."""
     name = out.name.removesuffix(suffix)
     if name in ("", out.name):
-        raise InputError(f"--out is {str(out)!r}, expected a name that ends in {suffix}")
+        raise InputError(f"--out is {quoted(str(out))}, expected a name that ends in {suffix}")
     if not out.parent.is_dir():
-        raise InputError(f"--out is {str(out)!r}, but there is no folder {out.parent}")
+        raise InputError(f"--out is {quoted(str(out))}, but there is no folder {out.parent}")
     other = out.with_name(f"{name}{ending}")
     for path in (out, other):
         if path.exists() and not overwrite:

@@ -21,6 +21,7 @@ from factorgraph_loc.experiments.facts import Facts
 from factorgraph_loc.experiments.keys import FileDigests, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files import nearest
+from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.run import RunConfig
@@ -213,4 +214,4 @@ def _check(logs: Sequence[_PlannedLog], sensors: Sequence[tuple[str, ...] | None
     known = list(dict.fromkeys(sensor for log in logs for sensor in log.sensors))
     for sensor in (one for several in sensors for one in several or ()):
         if sensor not in known:
-            raise InputError(f"no log has a sensor {sensor!r}{nearest(sensor, known)}")
+            raise InputError(f"no log has a sensor {quoted(sensor)}{nearest(sensor, known)}")

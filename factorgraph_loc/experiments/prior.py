@@ -10,6 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior, SpacePose
 from factorgraph_loc.estimators.space_pose import planar_estimate
 from factorgraph_loc.log import Log
+from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory3 import Trajectory3
 
 # of a start read from the reference
@@ -104,9 +105,9 @@ def _parse(prior: str) -> list[float]:
     try:
         x, y, *heading = (float(part) for part in prior.split(","))
     except ValueError:
-        raise InputError(f"prior is {prior!r}, expected {EXPECTED}") from None
+        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}") from None
     if len(heading) > 1:
-        raise InputError(f"prior is {prior!r}, expected {EXPECTED}")
+        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}")
     if not all(map(math.isfinite, (x, y, *heading))) or any(abs(angle) > 2.0 * math.pi for angle in heading):
-        raise InputError(f"prior is {prior!r}, expected finite metres and a heading in radians")
+        raise InputError(f"prior is {quoted(prior)}, expected finite metres and a heading in radians")
     return [x, y, *heading]

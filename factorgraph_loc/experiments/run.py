@@ -44,6 +44,7 @@ from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
+from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
@@ -318,7 +319,7 @@ def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
     streams = {s: log.streams[s].t for s in sensors if s in log.streams}
     stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
     if not stamps:
-        raise InputError(f"{log.name}: has no measurements of {', '.join(sensors)}")
+        raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
     first, last = min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
     if not (abs(first) <= FARTHEST and abs(last) <= FARTHEST):
         raise InputError(f"{log.name}: has stamps from {first:g} to {last:g} s, expected at most {FARTHEST:g} s from 0")
@@ -333,15 +334,15 @@ def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
             if sensor in OF_READS and "rfid" not in asked:
                 raise InputError(f"{log.name}: {sensor} comes with reads of tags, expected rfid among the sensors too")
             if sensor in OF_READS and sensor not in there:
-                raise InputError(f"{log.name}: has no sensor {sensor!r}: none of its reads has a value of it")
+                raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: none of its reads has a value of it")
             if sensor not in there:
-                raise InputError(f"{log.name}: has no sensor {sensor!r}{nearest(sensor, list(there))}")
+                raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(there))}")
             if sensor in OF_CAMERA and log.rig.camera is None:
                 raise InputError(f"{log.name}: {sensor} needs [camera] in the rig, and {log.rig.name} has none")
     sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in there and s not in _blind(log))
     if not sensors:
         raise InputError(
-            f"{log.name}: has none of the rig's sensors {', '.join(log.rig.sensors)}{nearest('', list(there))}"
+            f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(there))}"
         )
     return sensors
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import quoted
 
 
 def parse_seeds(text: str, source: object = "--seeds") -> range:
@@ -13,5 +14,5 @@ def parse_seeds(text: str, source: object = "--seeds") -> range:
     except ValueError:
         seeds = range(0)
     if not seeds or seeds[0] < 0:
-        raise InputError(f"{source} is {text!r}, expected a number such as 3, or a range such as 0:10")
+        raise InputError(f"{source} is {quoted(text)}, expected a number such as 3, or a range such as 0:10")
     return seeds

@@ -21,6 +21,7 @@ from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.files import write_text
 from factorgraph_loc.log import MOTION, BearingRangeStream, Log
 from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.text import listed
 from factorgraph_loc.trajectory import Trajectory
 from factors.bearing_range import located, sigmas
 from factors.odometry import Increment
@@ -64,7 +65,7 @@ def pose_graph(
     moving = [s for s in MOTION if s in sensors and s in log.streams]
     if "odometry" not in moving:
         raise InputError(
-            f"{log.name}: has no odometry among {', '.join(sensors)}, expected it for the edges of a pose graph"
+            f"{log.name}: has no odometry among {listed(sensors)}, expected it for the edges of a pose graph"
         )
     landmarks = {name: np.array((mark.x, mark.y)) for name, mark in log.world.landmarks.items()}
     if not landmarks:

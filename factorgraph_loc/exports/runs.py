@@ -17,6 +17,7 @@ from factorgraph_loc.experiments.output import FILES
 from factorgraph_loc.experiments.stored_run import trajectory_of
 from factorgraph_loc.files import read_text, read_toml
 from factorgraph_loc.log import Log
+from factorgraph_loc.text import quoted, told
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -115,9 +116,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
             _events(folder.path / "events.csv", log.t0_ns),
         )
     except (OSError, pl.exceptions.PolarsError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{folder.path}: cannot be read as results of a run: {' '.join(str(error).split())}"
-        ) from error
+        raise InputError(f"{folder.path}: cannot be read as results of a run: {told(error)}") from error
     _check_times(run, log)
     return run
 
@@ -138,7 +137,7 @@ def _config(folder: Path) -> dict[str, Any]:
     config = read_toml(path)
     for key in ("log", "estimator"):
         if not isinstance(config.get(key), str):
-            raise InputError(f"{path}: {key} is {config.get(key)!r}, expected a name")
+            raise InputError(f"{path}: {key} is {quoted(config.get(key))}, expected a name")
     return config
 
 

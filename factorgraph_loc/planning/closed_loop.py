@@ -31,6 +31,7 @@ from factorgraph_loc.simulation.settings import FaultSettings, SimulationSetting
 from factorgraph_loc.simulation.simulate import generators
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.text import quoted
 from factorgraph_loc.world import World
 from factors import se2
 from factors.rfid_likelihood import RfidLikelihood
@@ -264,7 +265,7 @@ def _estimator(name: str, setup: registry.Setup, settings: ActiveSettings) -> Es
         space = free_space(setup.world, max(settings.clearance - SLACK, 0.0))
         return ActiveMcl(setup, ActiveMclSettings(particles=settings.particles), space)
     if name not in ESTIMATORS:
-        raise InputError(f"no estimator of active runs is called {name!r}{nearest(name, list(ESTIMATORS))}")
+        raise InputError(f"no estimator of active runs is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
     return registry.create(name, setup, registry.settings_of(name, {}))
 
 

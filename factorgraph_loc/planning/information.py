@@ -25,6 +25,7 @@ from factorgraph_loc.planning.expected_scans import Places, ScanTables
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
 from factorgraph_loc.simulation.free_space import FreeSpace
+from factorgraph_loc.text import quoted
 from factors.odometry import OdometryModel
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
@@ -159,7 +160,7 @@ def _columns(dims: Sequence[str]) -> list[int]:
         raise InputError(f"dims: are none, expected some of {', '.join(DIMS)}")
     for name in dims:
         if name not in DIMS:
-            raise InputError(f"dims: is {name!r}, expected some of {', '.join(DIMS)}")
+            raise InputError(f"dims: is {quoted(name)}, expected some of {', '.join(DIMS)}")
     return sorted({DIMS.index(name) for name in dims})
 
 

@@ -27,6 +27,7 @@ from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.free_space import FreeSpace
+from factorgraph_loc.text import quoted
 from factors import se2
 from factors.rfid_likelihood import RfidLikelihood
 from factors.se2 import Array
@@ -233,7 +234,7 @@ POLICIES = ("information", "paper_literal", "random", "patrol", "nearest_tags")
 def make_policy(name: str) -> Policy:
     """A policy by name; InputError names a wrong one."""
     if name not in POLICIES:
-        raise InputError(f"no policy is called {name!r}{nearest(name, list(POLICIES))}")
+        raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
     made: dict[str, Policy] = {
         "information": Information(),
         "paper_literal": Information(sign=-1.0),

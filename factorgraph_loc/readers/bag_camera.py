@@ -25,6 +25,7 @@ from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Clock, Stamper
 from factorgraph_loc.readers.bag_fields import as_nanoseconds
 from factorgraph_loc.readers.bag_file import Bag, Stamped
+from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.vision.feature_cache import cache_folder
 from factors.se2 import Array
@@ -95,7 +96,7 @@ class Images:
             content = item.message.data.tobytes()
             suffix = next((suffix for magic, suffix in MAGIC.items() if content.startswith(magic)), None)
             if suffix is None:
-                raise InputError(f"{where}: format is {item.message.format!r}, expected JPEG, PNG, WebP or BMP")
+                raise InputError(f"{where}: format is {quoted(item.message.format)}, expected JPEG, PNG, WebP or BMP")
         else:
             content, suffix = netpbm(item.message, where)
         file = f"{item.row:06d}{suffix}"
@@ -163,7 +164,7 @@ class Info:
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:
     """A raw image as the content of a file, and its suffix. InputError for an encoding that is not read, and missing pixels."""
     if image.encoding not in ENCODINGS:
-        raise InputError(f"{where}: encoding is {image.encoding!r}, expected one of {', '.join(ENCODINGS)}")
+        raise InputError(f"{where}: encoding is {quoted(image.encoding)}, expected one of {', '.join(ENCODINGS)}")
     kind, channels, convert = ENCODINGS[image.encoding]
     width, height, step = int(image.width), int(image.height), int(image.step)
     used = width * channels * np.dtype(kind).itemsize

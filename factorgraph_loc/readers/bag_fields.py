@@ -14,6 +14,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.readers.bag_file import Bag, Topic
+from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -65,9 +66,9 @@ def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
     """InputError with the fields that the topic's messages have, if ``path`` is none of them."""
     known = leaves(store, topic.type)
     if path not in known and path + LIST not in known:
-        raise InputError(f"{where} is {path!r}, which {topic.type} lacks; its fields: {', '.join(known)}")
+        raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
     if path.count(LIST) > 1:
-        raise InputError(f"{where} is {path!r}, a list within a list, expected at most one {LIST}")
+        raise InputError(f"{where} is {quoted(path)}, a list within a list, expected at most one {LIST}")
 
 
 def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import nearest
+from factorgraph_loc.text import quoted, told
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -70,7 +71,7 @@ class Bag:
     def topic(self, name: str) -> Topic:
         """A topic that has messages; InputError if the bag lacks it, or it has none."""
         if name not in self.topics:
-            raise InputError(f"{self.path}: has no topic {name!r}{nearest(name, list(self.topics))}")
+            raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")
         topic = self.topics[name]
         if not topic.count:
             raise InputError(f"{self.path}: topic {name} ({topic.type}) has no messages: leave it out of the manifest")
@@ -185,6 +186,6 @@ def _told(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path}: may not be read") from error
     except Exception as error:
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = told(error)
         hint = next((hint for words, hint in HINTS.items() if words in text), "")
         raise InputError(f"{path}: cannot be read as a bag: {text.rstrip('.')}{'; ' + hint if hint else ''}") from error

@@ -16,6 +16,7 @@ from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Stamper
 from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_poses import ReferenceTopic, check_rotations, seven
+from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors.reprojection import FORWARD
@@ -47,7 +48,7 @@ class StaticFrames:
         """The same; InputError where transforms do not join them."""
         pose = self.pose(frame, base)
         if pose is None:
-            there = ", ".join(sorted(self.parents)) or "none"
+            there = listed(sorted(self.parents)) or "none"
             raise InputError(f"{source}: tf_static does not say where {frame} sits on {base}; frames: {there}")
         return pose
 
@@ -127,7 +128,11 @@ class FrameReference:
             if frame not in parents or frame in chain:
                 known = sorted({*parents, *parents.values()})
                 wrong = next((name for name in (self._parent, self._child) if name not in known), None)
-                hint = f"there is no frame {wrong!r}{nearest(wrong, known)}" if wrong else f"it ends at {frame!r}"
+                hint = (
+                    f"there is no frame {quoted(wrong)}{nearest(wrong, known)}"
+                    if wrong
+                    else f"it ends at {quoted(frame)}"
+                )
                 raise InputError(f"{self._source}: no transforms lead from {self._child} to {self._parent}: {hint}")
             chain.append(frame)
             frame = parents[frame]

@@ -19,6 +19,7 @@ from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_frames import StaticFrames
 from factorgraph_loc.readers.bag_rows import Rows
 from factorgraph_loc.readers.tables import NAMES, Table
+from factorgraph_loc.text import listed
 from factors.se2 import Array
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
@@ -79,7 +80,7 @@ class Landmarks:
         wanted = {"landmark", "x", "y", "z"} if self._places else {"landmark", "range", "bearing"}
         if "landmark" not in fields or not set(fields) <= wanted or len(fields) < (4 if self._places else 2):
             expected = "landmark with x, y and z, or with range, bearing or both"
-            raise InputError(f"{bag.path} {topic.name}: fields are {', '.join(fields)}, expected {expected}")
+            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {expected}")
         self._fields = Fields(bag, topic, fields)
         self._rows = Rows(f"{bag.path} {topic.name}", 3 if self._places else 2)
         self._names: list[str] = []
@@ -126,10 +127,10 @@ class PixelsOfPoints:
         if self._corners:
             known = leaves(bag.store(topic.name), topic.type)
             if lacking := [path for path in CORNER_FIELDS if path not in known]:
-                raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {', '.join(lacking)}")
+                raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {listed(lacking)}")
         fields: dict[Any, str] = dict(options.fields or {})
         if fields and set(fields) != {"landmark", "u", "v"}:
-            raise InputError(f"{bag.path} {topic.name}: fields are {', '.join(fields)}, expected landmark, u and v")
+            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected landmark, u and v")
         self._fields = Fields(bag, topic, fields)
         self._rows = Rows(f"{bag.path} {topic.name}", 2)
         self._names: list[str] = []

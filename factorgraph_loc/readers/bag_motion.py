@@ -17,6 +17,7 @@ from factorgraph_loc.readers.bag_file import Bag, Stamped
 from factorgraph_loc.readers.bag_frames import StaticFrames
 from factorgraph_loc.readers.bag_poses import POSES, Poses
 from factorgraph_loc.readers.bag_rows import Rows
+from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Integers
 from factors import se2
 from factors.se2 import Array
@@ -122,7 +123,7 @@ class WheelMotion:
         if not len(self._rows):
             wrong = next((n for n in (self._wheels.left, self._wheels.right) if n not in self._seen), self._wheels.left)
             raise InputError(
-                f"{self._rows.source}: has no message with both wheels, {wrong!r}{nearest(wrong, sorted(self._seen))}"
+                f"{self._rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
             )
         t_ns, (left, right) = finite_columns(self._rows, ("left wheel", "right wheel"), warnings)
         radius, track = self._wheels.radius, self._wheels.track

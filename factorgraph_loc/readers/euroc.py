@@ -22,6 +22,7 @@ from factorgraph_loc.readers.bag_frames import angles_of_camera
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.space_poses import ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import listed
 from factorgraph_loc.world import World
 from factorgraph_loc.yaml_files import read_yaml
 from factors.se2 import Array
@@ -57,7 +58,7 @@ def read(path: Path | None, options: Options) -> Log:
     camera = inside(folder, f"cam{options.camera}", folder)
     if not camera.is_dir():
         there = sorted(f.name for f in folder.glob("cam?"))
-        raise InputError(f"{camera}: does not exist, there are {', '.join(there) or 'no cameras'}")
+        raise InputError(f"{camera}: does not exist, there are {listed(there) or 'no cameras'}")
     truth = next((inside(folder, f"{name}/data.csv", folder) for name in TRUTHS if (folder / name).is_dir()), None)
     if truth is None:
         raise InputError(f"{folder}: has no {TRUTHS[0]}, which a log without odometry needs")

@@ -20,6 +20,7 @@ from factorgraph_loc.readers.bag_file import is_bag
 from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
 from factorgraph_loc.shipped import manifests
+from factorgraph_loc.text import listed
 from factorgraph_loc.world import World, read_world
 
 RUN_FILE = "run.toml"
@@ -95,7 +96,7 @@ def read_log(
     """The one log that ``log`` names, which is what :func:`load` takes; InputError if it names several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
-        raise InputError(f"{log} stands for {len(logs)} logs, expected one: {', '.join(found.name for found in logs)}")
+        raise InputError(f"{log} stands for {len(logs)} logs, expected one: {listed(found.name for found in logs)}")
     return logs[0]
 
 

@@ -16,6 +16,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.readers.native_rfid import check_reads
 from factorgraph_loc.readers.tables import NAMES, Table
+from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
@@ -114,7 +115,7 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
     with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns of which pathlib makes nothing
         files = sorted(file for file in folder.glob(options.file) if file.is_file())
     if not files:
-        raise InputError(f"{folder}: rfid.file is {options.file!r}, expected the names of files that are there")
+        raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of files that are there")
     return joined(
         folder / options.file,
         [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files],

@@ -39,6 +39,7 @@ from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rfid_settings import RfidSettings
 from factorgraph_loc.rig import Rig, placed, read_rig, write_rig
+from factorgraph_loc.text import listed
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.world import TAGS_SUFFIX, World, parse_world, read_world, write_world
 from factors.se2 import Array
@@ -148,7 +149,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
         if file.suffix in SUFFIXES and file.stem not in SHAPES and not file.name.endswith((TAGS_SUFFIX, POINTS_SUFFIX))
     )
     if unread:
-        warnings.append(f"{folder}: this version does not read {', '.join(unread)}")
+        warnings.append(f"{folder}: this version does not read {listed(unread)}")
     return tables
 
 

@@ -12,6 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, nearest
 from factorgraph_loc.log import Log
 from factorgraph_loc.rig import BearingRangeSettings, Rig
+from factorgraph_loc.text import quoted
 
 READERS: dict[str, str] = {
     "native": "factorgraph_loc.readers.native",
@@ -46,6 +47,6 @@ class Reader:
 def reader(name: str) -> Reader:
     """The reader of a format; InputError with the nearest name if there is none."""
     if name not in READERS:
-        raise InputError(f"there is no reader {name!r}{nearest(name, list(READERS))}")
+        raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
     module = importlib.import_module(READERS[name])
     return Reader(module.Options, module.read)

@@ -23,6 +23,7 @@ from factorgraph_loc.readers.columns import read_columns
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.rounds import ends_of, make_rfid_stream, rounds_from_gaps
 from factorgraph_loc.readers.simulated_odometry import wheel_odometry
+from factorgraph_loc.text import listed
 from factorgraph_loc.trajectory import Integers, Trajectory
 from factorgraph_loc.world import Tag, World
 from factors import se2
@@ -50,7 +51,7 @@ def read(path: Path | None, options: Options) -> Log:
     folder = inside(path, f"run{options.run}", path)
     if not folder.is_dir():
         runs = sorted(f.name for f in path.glob("run*") if f.is_dir())
-        raise bad_field(path, "run", options.run, f"a folder of that number, one of {', '.join(runs) or '(none)'}")
+        raise bad_field(path, "run", options.run, f"a folder of that number, one of {listed(runs) or '(none)'}")
     warnings: list[str] = []
     reference, t0_ns = read_reference(inside(folder, "reference_pose.txt", folder), warnings)
     odometry = wheel_odometry(reference, options.odometry_seed)

@@ -23,6 +23,7 @@ from factorgraph_loc.readers.bag_motion import ImuTopic, OdometryTopic, YawRates
 from factorgraph_loc.readers.bag_poses import Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.readers.bag_rfid import Reads, RfidTopic
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import told
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
 
@@ -76,7 +77,7 @@ class Listeners:
                 except (AttributeError, TypeError) as error:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
-                    raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {error}") from error
+                    raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {told(error)}") from error
         for stamper in self.stampers:
             stamper.check()
 

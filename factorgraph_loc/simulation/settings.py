@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field, model_validator
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
 from factorgraph_loc.rig import Rig, placed, read_rig
+from factorgraph_loc.text import listed, quoted
 
 Metres = Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
 Seconds = Annotated[float, Field(ge=0.0, le=1e5, description="s")]
@@ -186,7 +187,7 @@ class SimulationSettings(FileModel):
         stop = self.faults.antenna_stop
         names = list(self.rig.rfid.all_antennas())
         if stop is not None and stop.antenna not in names:
-            raise ValueError(f"antenna {stop.antenna!r} stops, expected one of {', '.join(names)}")
+            raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
         return self
 
 
@@ -298,5 +299,5 @@ def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> Simul
 
 def _preset(name: Any, source: object) -> dict[str, Any]:
     if not isinstance(name, str) or name not in PRESETS:
-        raise InputError(f"{source}: preset is {name!r}{nearest(str(name), list(PRESETS))}")
+        raise InputError(f"{source}: preset is {quoted(name)}{nearest(str(name), list(PRESETS))}")
     return {"name": name, **PRESETS[name]}

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import nearest
+from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.competitors import DETECTORS
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
 from factorgraph_loc.vision.homography import corner_error
@@ -123,7 +124,7 @@ class RankedMatches:
 def feature(name: str, count: int) -> Feature:
     """The feature or detector of that name, at most ``count`` points an image; InputError if there is none."""
     if name not in EXTRACTORS and name not in DETECTORS:
-        raise InputError(f"feature {name!r} is not known{nearest(name, [*EXTRACTORS, *DETECTORS])}")
+        raise InputError(f"feature {quoted(name)} is not known{nearest(name, [*EXTRACTORS, *DETECTORS])}")
     if name in EXTRACTORS:
         return Feature(name, extractor(name, count).detectAndCompute)
     if count < 1:

@@ -12,6 +12,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import nearest
+from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.colour_features import ColourExtractor
 from factorgraph_loc.vision.images import as_image, as_mask, is_blank
 from factorgraph_loc.vision.keypoints import Descriptors, Extractor, Integers, Keypoints
@@ -87,7 +88,7 @@ def extractor(name: str, count: int = 1000) -> Extractor:
     """The feature of that name in :data:`EXTRACTORS`, at most ``count`` of them in an image; InputError if there is
     none."""
     if name not in EXTRACTORS:
-        raise InputError(f"feature {name!r} is not known{nearest(name, sorted(EXTRACTORS))}")
+        raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")
     if count < 1:
         raise InputError(f"feature {name}: count is {count}, expected at least 1")
     return EXTRACTORS[name](count)

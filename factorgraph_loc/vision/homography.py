@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import read_text
+from factorgraph_loc.text import told
 from factors.se2 import Array
 
 _MAX_CONDITION = 1e12  # of the matrix in pixels: good ones between images of 1000 px have 1e4 to 1e7
@@ -102,12 +103,12 @@ def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
         try:
             data = ET.fromstring(text.lstrip()).find(".//data")
         except ET.ParseError as error:
-            raise InputError(f"{path}: is not XML: {error}") from error
+            raise InputError(f"{path}: is not XML: {told(error)}") from error
         if data is None:
             raise InputError(f"{path}: has no <data>, expected a matrix as OpenCV writes it")
         text = data.text or ""
     try:
         numbers = np.array([float(word) for word in text.split()])
     except ValueError as error:
-        raise InputError(f"{path}: is not a matrix: {error}, expected nine numbers") from error
+        raise InputError(f"{path}: is not a matrix: {told(error)}, expected nine numbers") from error
     return checked(numbers.reshape(3, 3) if numbers.size == 9 else numbers, shape, path)

@@ -28,6 +28,7 @@ from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files import write_text
+from factorgraph_loc.text import listed, quoted
 
 SHOWN = 8  # variants that are visible at first
 _SWEPT = 3  # metrics that are drawn over a swept setting
@@ -60,7 +61,7 @@ def write_report(
     results = Results(rows)
     labels = {variant.label: name for name, variant in reversed(results.variants.items())}
     if baseline is not None and baseline not in labels:
-        raise InputError(f"the baseline is {baseline!r}, expected one of {', '.join(sorted(labels))}")
+        raise InputError(f"the baseline is {quoted(baseline)}, expected one of {listed(sorted(labels))}")
     page = _Page(
         results, _known(results, metrics), labels[baseline] if baseline else next(iter(results.variants)), runs, damaged
     )
