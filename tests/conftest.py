@@ -1,7 +1,11 @@
 """What several tests share."""
 
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -27,3 +31,69 @@ def data_root() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("FGLOC_DATA names no folder of recorded data")
     return Path(folder)
+
+
+class Processes:
+    """Starts processes, and looks at them."""
+
+    PATIENCE = 100.0  # s: other tests may keep all processors busy
+
+    def __init__(self) -> None:
+        self._started: list[subprocess.Popen[str]] = []
+
+    def start(self, *command: object, **options: object) -> subprocess.Popen[str]:
+        """A process that leads a group, as a shell starts it: signals that this process ignores are not ignored there."""
+        words = [str(word) for word in command]
+        begin = {"start_new_session": True, "preexec_fn": _ordinary_signals, "text": True} | options
+        process = subprocess.Popen(words, stdin=subprocess.DEVNULL, **begin)
+        self._started.append(process)
+        return process
+
+    def end(self) -> None:
+        """End all of them, with their groups."""
+        for process in self._started:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            for pipe in (process.stdout, process.stderr):
+                if pipe is not None:
+                    pipe.close()
+
+    def wait_until(self, condition: Callable[[], object]) -> None:
+        """Wait for a condition; it is an error if it never comes."""
+        until = time.monotonic() + self.PATIENCE
+        while not condition():
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+    def lives(self, pid: int) -> bool:
+        """Whether a process runs; one that has ended may not have been buried."""
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+        except OSError:
+            return False
+
+    def of_group(self, leader: int) -> list[int]:
+        """The processes of a group that run."""
+        found = []
+        for path in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                state, _, group = path.read_text().rpartition(")")[2].split()[:3]
+            except OSError:
+                continue
+            if int(group) == leader and state not in "ZX":
+                found.append(int(path.parent.name))
+        return found
+
+
+def _ordinary_signals() -> None:
+    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(one, signal.SIG_DFL)
+
+
+@pytest.fixture
+def processes() -> Iterator[Processes]:
+    """``processes.start(command, ...)``: a process that is ended with the test."""
+    those = Processes()
+    yield those
+    those.end()

@@ -25,12 +25,12 @@ from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, co
 from factorgraph_loc.evaluation.figures import save
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.experiments.output import file_name
-from factorgraph_loc.experiments.processes import run_each
 from factorgraph_loc.files import nearest, replacing, write_text, write_toml
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.text import quoted, told
 

@@ -5,13 +5,11 @@ A run that takes too long or too much memory is ended with its process, and stor
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -21,9 +19,8 @@ from factorgraph_loc.experiments.execute import Kind, Outcome, store_failure
 from factorgraph_loc.experiments.experiment_file import Limits
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.experiments.plan import PlannedRun
-from factorgraph_loc.experiments.processes import ProcessDiedError
 from factorgraph_loc.experiments.store import Store
-from factorgraph_loc.experiments.threads import use_one_thread
+from factorgraph_loc.processes import Child, ProcessDiedError, start
 
 LOOK = 0.1  # s between looks at memory and time
 AGAIN = 0.5  # s after which a run that another process had claimed is asked for again
@@ -33,7 +30,7 @@ SHARE = 0.9  # of the machine's memory, for all workers together
 
 @dataclass
 class _Worker:
-    process: multiprocessing.process.BaseProcess
+    process: Child
     connection: Connection
     ready: bool = False
     run: PlannedRun | None = None
@@ -137,14 +134,7 @@ class _Pool:
         Store(self._folder).sweep()
 
     def _start(self) -> _Worker:
-        use_one_thread()
-        context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe()
-        process = context.Process(target=worker.serve, args=(there, self._folder, self._again), daemon=True)
-        with _without_interrupts():
-            process.start()
-        there.close()
-        return _Worker(process, here)
+        return _Worker(*start(worker.serve, self._folder, self._again))
 
     def _assign(self, w: _Worker) -> None:
         others = [o.source for o in self._workers if o is not w and o.run is not None and o.source is not None]
@@ -195,20 +185,6 @@ class _Pool:
         if _resident(w.process.pid) > self._memory:
             return "memory", f"its process held more than {self._memory / 1e6:.0f} MB"
         return None
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that start meanwhile ignore an interrupt from the keyboard from their first moment on."""
-    try:
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not the main thread: only that one may choose
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _machine_memory() -> float:

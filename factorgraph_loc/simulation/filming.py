@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import ImageStream, Log
+from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.plans import make_plan
 from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene
@@ -35,7 +35,6 @@ JPEG = (
 MOMENT = 0.02  # s to either side, over which the velocity of the robot is taken
 PERIODS = (8.0, 13.0, 29.0)  # s, in which the brightness wanders
 FEW = 40  # images, for which it does not pay to start processes
-LOOK = 0.3  # s between two looks at how many images there are
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +137,11 @@ def _write_in_parallel(
     tell: Callable[[float, float], None],
 ) -> None:
     """Each process makes the scene for itself, and every n-th image."""
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        jobs = {pool.submit(_write, settings, seed, folder, range(i, count, workers)) for i in range(workers)}
-        while jobs:
-            done, jobs = wait(jobs, LOOK)
-            tell(sum(1 for _ in folder.glob("*.jpg")), count)
-            for job in done:
-                job.result()
+    write = partial(_write, settings, seed, folder)
+    parts = [range(i, count, workers) for i in range(workers)]
+    for _, outcome in run_each(write, parts, workers, beat=lambda: tell(sum(1 for _ in folder.glob("*.jpg")), count)):
+        if isinstance(outcome, Exception):
+            raise outcome
 
 
 def _write(

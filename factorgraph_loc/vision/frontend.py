@@ -7,15 +7,12 @@ a changed feature is another name, and the same image in two logs is one.
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import resources
-from itertools import repeat
 from pathlib import Path
 
 import cv2
@@ -25,6 +22,7 @@ from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.log import FeatureStream, ImageStream, Log
 from factorgraph_loc.measurements import CameraFrame
+from factorgraph_loc.processes import ProcessDiedError, run_each
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.features import Extractor, extractor
 from factorgraph_loc.vision.found import Found, decode, encode
@@ -49,6 +47,7 @@ FEATURE_CODE = (
     "weights.py",
 )
 TRACK_CODE = ("matching.py", "tracks.py")
+PART = 8  # images that a process is given at a time
 FEW = 64  # images: for fewer, processes take longer to start than the work takes
 
 Size = tuple[int, int]  # width, height
@@ -139,12 +138,24 @@ def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iter
     if processes < 2:
         yield from (_find(file, settings, size) for file in files)
         return
-    context = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(processes, context, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
-            yield from pool.map(_find, files, repeat(settings), repeat(size), chunksize=4)
-    except BrokenProcessPool:
-        raise RunFailedError("a process died while it looked for features in images") from None
+    parts = [files[i : i + PART] for i in range(0, len(files), PART)]
+    early: dict[int, list[bytes | _Image]] = {}  # of parts that come later
+    due = 0
+    for at, found in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
+        if isinstance(found, ProcessDiedError):
+            raise RunFailedError("a process died while it looked for features in images")
+        if isinstance(found, Exception):
+            raise found
+        early[at] = found
+        while due in early:
+            yield from early.pop(due)
+            due += 1
+
+
+def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _Image]:
+    """The same of some files, in a process among others."""
+    cv2.setNumThreads(1)
+    return [_find(file, settings, size) for file in files]
 
 
 def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _Image:

@@ -15,7 +15,7 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.evaluation.ensembles import Ratio, rmse_ratio, wilson
 from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.experiments.ensemble import Series
-from factorgraph_loc.experiments.processes import run_each
+from factorgraph_loc.processes import run_each
 
 
 @dataclass(frozen=True)

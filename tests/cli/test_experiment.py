@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import polars as pl
 import pytest
@@ -136,7 +135,7 @@ def test_ten_thousand_runs_can_be_listed(fgloc, file):
     assert document["seconds"] > 0.0
 
 
-def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path):
+def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, processes):
     (tmp_path / "slow.toml").write_text(
         file.read_text().replace('"ekf"]', '{name = "particle_filter", settings = {particles = 200000}}]')
     )
@@ -148,12 +147,10 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path):
         "run",
         "slow.toml",
     ]
-    process = subprocess.Popen([*command, "--jobs", "1"], stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 60.0
-    while not list(tmp_path.glob("out/lags/store/??/*")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = processes.start(*command, "--jobs", "1", stderr=subprocess.PIPE)
+    processes.wait_until(lambda: list(tmp_path.glob("out/lags/store/??/*")))
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
-    stderr = process.communicate(timeout=60)[1]
+    stderr = process.communicate(timeout=processes.PATIENCE)[1]
     assert process.returncode == 130
     assert "the same command goes on" in stderr
     assert "Traceback" not in stderr

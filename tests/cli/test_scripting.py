@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -75,14 +74,12 @@ def test_an_unknown_command_is_bad_input(monkeypatch, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_an_interrupted_comparison_has_its_code(tmp_path):
+def test_an_interrupted_comparison_has_its_code(tmp_path, processes):
     command = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
-    line = ["compare", "plaza2", "-e", "smoother", "--seeds", "0:50", "-o", str(tmp_path / "out"), "--jobs", "1"]
-    running = subprocess.Popen([*command, *line], stderr=subprocess.PIPE, text=True, start_new_session=True)
-    until = time.monotonic() + 30.0
-    while not (tmp_path / "out").exists() and time.monotonic() < until:
-        time.sleep(0.1)
+    line = ["compare", "plaza2", "-e", "smoother", "--seeds", "0:50", "-o", tmp_path / "out", "--jobs", "1"]
+    running = processes.start(*command, *line, stderr=subprocess.PIPE)
+    processes.wait_until((tmp_path / "out").exists)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does it
-    said = running.communicate(timeout=60.0)[1]
+    said = running.communicate(timeout=processes.PATIENCE)[1]
     assert running.returncode == 130
     assert said.endswith("interrupted\n")
