@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from factorgraph_loc.columns import LATEST, Column, require_span
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, nearest, read_text
@@ -29,7 +30,8 @@ JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
 ISO = "iso"
-MAX_STAMP = 2**62  # ns: leaves room for differences in 64 bits
+MOST_DIGITS = 20  # of a stamp before its decimal point
+LEAST_UNIT = 1e-12  # of ours, and the largest is its reciprocal
 
 EpcCase = Literal["as written", "upper", "lower"]
 
@@ -69,14 +71,14 @@ class Mapped:
         """The cells (N) of a field as they stand there."""
         return self.cells.columns[self.mapping.columns[field]]
 
-    def numbers(self, field: str, units: Mapping[str, float]) -> Array:
-        """A field (N,) in the first of ``units``, NaN where it is empty."""
-        column = self.mapping.columns[field]
+    def numbers(self, field: str, column: Column) -> Array:
+        """A field (N,), what ``column`` describes, in its unit; NaN where it is empty."""
+        name = self.mapping.columns[field]
         cells = self.cells
         if self.mapping.decimal == ",":
-            plain = [text.replace(",", ".") for text in cells.columns[column]]
-            cells = Cells(cells.path, cells.rows, {column: plain})
-        return cells.numbers(column) * self._factor(field, units)
+            plain = [text.replace(",", ".") for text in cells.columns[name]]
+            cells = Cells(cells.path, cells.rows, {name: plain})
+        return cells.numbers(name, column, self._unit(field, column.units))
 
     def stamps(self, field: str, offset: float = 0.0) -> NDArray[np.int64]:
         """A field (N,) as nanoseconds; ``offset`` [s] is added. Times of the day without a zone are UTC."""
@@ -89,26 +91,31 @@ class Mapped:
         for i, text in enumerate(self.cells.columns[column]):
             try:
                 stamp = iso_nanoseconds(text) if unit == ISO else self._decimal(text, SECONDS[str(unit)])
-                if abs(stamp + shift) >= MAX_STAMP:
+                if abs(stamp + shift) > LATEST:
                     raise OverflowError
-            except (ValueError, OverflowError, InvalidOperation):
-                expected = "a date and time, 2026-01-31T12:00:00.5Z" if unit == ISO else f"a number of {unit}"
+            except (ValueError, ArithmeticError):
+                most = LATEST / 10 ** SECONDS.get(str(unit), 0)
+                expected = f"a number of {unit} in {-most:g} to {most:g}"
+                if unit == ISO:
+                    expected = "a date and time, 2026-01-31T12:00:00.5Z"
                 raise bad_field(self.path, column, text, expected, row=self.cells.rows[i]) from None
             out[i] = stamp + shift
+        require_span([(self.path, self.cells.rows, out)])
         return out
 
     def _decimal(self, text: str, power: int) -> int:
         """A decimal number times ten to ``power``, rounded, without the errors of floating point."""
-        return round(Decimal(text.replace(self.mapping.decimal, ".")).scaleb(power))
+        number = Decimal(text.replace(self.mapping.decimal, "."))
+        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # before all of its digits are written out
+            raise OverflowError
+        return round(number.scaleb(power))
 
-    def _factor(self, field: str, units: Mapping[str, float]) -> float:
+    def _unit(self, field: str, units: Mapping[str, float]) -> str | float:
         unit = self.mapping.units.get(field, next(iter(units)))
-        if not isinstance(unit, str):
-            return float(unit)
-        if unit not in units:
-            expected = f"one of {', '.join(units)}, or a number"
-            raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}")
-        return units[unit]
+        if unit in units if isinstance(unit, str) else LEAST_UNIT <= abs(unit) <= 1.0 / LEAST_UNIT:
+            return unit
+        expected = f"one of {', '.join(units)}, or a number of them, at least {LEAST_UNIT:g}"
+        raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}")
 
 
 def read_mapped(

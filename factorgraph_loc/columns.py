@@ -7,15 +7,17 @@ unit, or is garbage. Readers and :class:`~factorgraph_loc.localizer.Localizer` r
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import bad_field
 from factors.se2 import Array
+
+Integers = NDArray[np.int64]
 
 LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 SPEED = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1.0 / 3.6, "ft/s": 0.3048}
@@ -59,22 +61,36 @@ class Column:
             return self.doc
         what = "a whole number" if self.kind in ("whole", "stamp") else "a finite number"
         unit = next(iter(self.units), "1")
-        of = {"rad": " of radians, not degrees,", "ns": " of nanoseconds", "1": ""}.get(unit, f" of {unit}")
+        of = {"rad": " of radians, not degrees,", "ns": " of nanoseconds", "s": " of seconds", "1": ""}.get(
+            unit, f" of {unit}"
+        )
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
-    def outside(self, values: Array) -> NDArray[np.bool_]:
+    def in_unit(self, unit: str | float) -> tuple[Column, float]:
+        """The same column in one of its units, or in one that is so many of ours; and what to multiply with. KeyError if it has
+        no such unit."""
+        factor = self.units[unit] if isinstance(unit, str) else unit
+        name = unit if isinstance(unit, str) else f"{factor:g} {next(iter(self.units))}"
+        low, high = sorted((self.low / factor, self.high / factor))
+        return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor
+
+    def outside(self, values: Array | Integers) -> NDArray[np.bool_]:
         """Which of ``values``, in our unit, cannot be; NaN cannot where no value may lack."""
         bad = ~((values >= self.low) & (values <= self.high))
+        if self.kind == "whole":
+            bad |= values != np.floor(values)
         return np.asarray(bad & ~np.isnan(values) if self.may_lack else bad)
 
-    def require(self, source: object, rows: Any, values: Array, name: str | None = None) -> None:
+    def require(
+        self, source: object, rows: Sequence[int] | Integers, values: Array | Integers, name: str | None = None
+    ) -> None:
         """InputError at the first of ``values`` (N,), in our unit, that cannot be; ``rows`` (N,): where they stand in ``source``;
         ``name``: the column's there."""
         bad = self.outside(values)
         if bad.any():
             i = int(np.argmax(bad))
             expected = self.expected + (", or nothing" if self.may_lack else "")
-            raise bad_field(source, name or self.name, float(values[i]), expected, row=int(rows[i]))
+            raise bad_field(source, name or self.name, values[i].item(), expected, row=int(rows[i]))
 
 
 @dataclass(frozen=True)
@@ -87,6 +103,22 @@ class Table:
 
     def __getitem__(self, name: str) -> Column:
         return next(column for column in self.columns if column.name == name)
+
+
+def require_span(tables: Iterable[tuple[object, Sequence[int] | Integers | None, Integers]]) -> None:
+    """InputError if stamps of tables, (source, rows (N,) or None, stamps (N,) [ns]), lie more than :data:`MAX_SPAN` apart: it names
+    that which is farthest from the middle one of all."""
+    filled = [(source, rows, t_ns) for source, rows, t_ns in tables if len(t_ns)]
+    first, last = min(int(t.min()) for _, _, t in filled), max(int(t.max()) for _, _, t in filled)
+    if last - first <= MAX_SPAN * 1e9:
+        return
+    stamps = np.concatenate([t_ns for _, _, t_ns in filled])
+    middle = int(np.sort(stamps)[len(stamps) // 2])
+    far = [np.abs(t_ns - middle) for _, _, t_ns in filled]
+    source, rows, t_ns = filled[int(np.argmax([distances.max() for distances in far]))]
+    i = int(np.argmax(np.abs(t_ns - middle)))
+    expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log, most are near {middle} ns"
+    raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]) if rows is not None else None)
 
 
 def _number(
@@ -188,13 +220,33 @@ FEATURES = Table(
     ),
     "one measurement",
 )
-REFERENCE = Table(
-    "reference",
+WAYS = Table(
+    "odometry",
     (
         STAMP,
-        *(_within(name, LENGTH, FARTHEST, "position of the robot in the world") for name in "xyz"),
-        *(_within(name, PURE, 1.01, "unit quaternion") for name in ("qx", "qy", "qz", "qw")),
+        *(_within(side, LENGTH, 1e9, "way of that wheel so far; counters hold 32 bits") for side in ("left", "right")),
+    ),
+    "one each",
+)
+POSES = Table(
+    "poses",
+    (
+        STAMP,
+        *(_within(name, LENGTH, FARTHEST, "position; of odometry in a frame of its own") for name in "xyz"),
+        *(_within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
         _within("heading", ANGLE, 1e5, "direction of the robot's x axis, or the sum of its turns"),
+    ),
+    "one each",
+)
+TAGS = Table(
+    "tags",
+    (
+        _name("epc", "the EPC of a tag"),
+        _within("x", LENGTH, FARTHEST, "position in the frame of the survey"),
+        _within("y", LENGTH, FARTHEST, "position in the frame of the survey"),
+        _number("z", LENGTH, -FARTHEST, FARTHEST, "height; 0 where it is empty", may_lack=True),
+        _number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that its front faces", may_lack=True),
+        _number("sigma", LENGTH, 0.0, 100.0, "standard deviation of its survey in x and y", may_lack=True),
     ),
     "one each",
 )
@@ -209,5 +261,7 @@ TABLES = (
     CAMERA,
     SIGHTINGS,
     FEATURES,
-    REFERENCE,
+    WAYS,
+    POSES,
+    TAGS,
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factorgraph_loc.columns import Column
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import nearest, read_text
 from factorgraph_loc.text import told
@@ -26,19 +27,33 @@ class Cells:
     rows: Sequence[int]
     columns: Mapping[str, Sequence[str]]
 
-    def numbers(self, name: str) -> Array:
-        """A column (N,), an empty cell as NaN; InputError at what is no number, or is written as NaN or infinite."""
+    def numbers(self, name: str, column: Column, unit: str | float = 1.0) -> Array:
+        """The numbers (N,) below ``name``, what ``column`` describes, in its own unit; in the file they are in ``unit``. An
+        empty cell is NaN.
+
+        InputError at the first that is no number, is written as NaN or infinite, or lies outside the column's bounds.
+        """
         cells = self.columns[name]
-        values = np.empty(len(cells))
-        for i, cell in enumerate(cells):
-            try:
-                values[i] = float(cell) if cell else np.nan
-            except ValueError:
-                raise bad_field(self.path, name, cell, "a number", row=self.rows[i]) from None
-        bad = np.flatnonzero(~np.isfinite(values) & np.array([bool(cell) for cell in cells], dtype=bool))
-        if len(bad):
-            raise bad_field(self.path, name, cells[bad[0]], "a finite number", row=self.rows[bad[0]])
-        return values
+        try:
+            values = np.array([float(cell) if cell else np.nan for cell in cells])
+        except ValueError:
+            i = next(i for i, cell in enumerate(cells) if cell and not _is_number(cell))
+            raise bad_field(self.path, name, cells[i], "a number", row=self.rows[i]) from None
+        if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
+            raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
+        told, factor = column.in_unit(unit)
+        if not column.may_lack and "" in cells:
+            raise bad_field(self.path, name, "", told.expected, row=self.rows[list(cells).index("")])
+        told.require(self.path, self.rows, values, name)
+        return values if factor == 1.0 else values * factor
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:

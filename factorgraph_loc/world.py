@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
 from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
-from factorgraph_loc.columns import ANGLE, LENGTH
+from factorgraph_loc.columns import TAGS
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
@@ -154,14 +154,13 @@ def read_tags(path: Path) -> dict[str, Tag]:
     of the two it hears, and only who surveyed them can.
     """
     cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
-    return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name) for name in shape[1:]})
+    return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name, TAGS[name]) for name in shape[1:]})
 
 
 def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
     """Read a table of another program; what is wrong with it is an InputError as of :func:`read_tags`."""
     mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
-    units = {"facing": ANGLE}
-    numbers = {name: mapped.numbers(name, units.get(name, LENGTH)) for name in mapped.fields if name != "epc"}
+    numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.fields if name != "epc"}
     return _tags(path, mapped.cells.rows, in_case(mapped.texts("epc"), mapping.epc_case), numbers)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
-from factorgraph_loc.columns import LENGTH
+from factorgraph_loc.columns import POSES, TAGS
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError
 
@@ -77,13 +77,13 @@ def read(tmp_path):
 )
 def test_ways_to_write_a_table(read, content, more):
     found = read(content, columns={"a": "x", "b": "y"}, **more)
-    np.testing.assert_array_equal(found.numbers("a", LENGTH), (1.0, 3.0))
-    np.testing.assert_array_equal(found.numbers("b", LENGTH), (2.0, 4.0))
+    np.testing.assert_array_equal(found.numbers("a", POSES["x"]), (1.0, 3.0))
+    np.testing.assert_array_equal(found.numbers("b", POSES["x"]), (2.0, 4.0))
 
 
 def test_columns_by_number_and_by_factor(read):
     found = read("1,2\n3,4\n", columns={"a": "2"}, units={"a": 0.5}, header=False)
-    np.testing.assert_array_equal(found.numbers("a", LENGTH), (1.0, 2.0))
+    np.testing.assert_array_equal(found.numbers("a", POSES["x"]), (1.0, 2.0))
     assert found.rows.tolist() == [1, 2]
 
 
@@ -97,7 +97,7 @@ def test_json_lines_of_several_kinds(read):
     found = read(lines, "a.jsonl", optional=("b",), columns={"a": "p.x", "b": "p.y"})
     assert found.passed == 1
     assert found.rows.tolist() == [1, 3, 4]
-    np.testing.assert_array_equal(found.numbers("b", LENGTH), (np.nan, np.nan, 4.0))
+    np.testing.assert_array_equal(found.numbers("b", TAGS["z"]), (np.nan, np.nan, 4.0))
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,17 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.column_mapping import SECONDS, EpcCase, in_case
-from factorgraph_loc.columns import ANGLE, FREQUENCY, POWER
+from factorgraph_loc.columns import LATEST, RFID
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel
 from factorgraph_loc.readers import native_rfid
 from factorgraph_loc.readers.bag_clock import Clock
 from factorgraph_loc.readers.bag_fields import LIST, Fields, as_nanoseconds, as_number, as_text
 from factorgraph_loc.readers.bag_file import Bag, Stamped
-from factorgraph_loc.readers.tables import MAX_STAMP, NAMES, Table
+from factorgraph_loc.readers.tables import NAMES, Table
 
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
-SIGNALS = {"rssi": POWER, "phase": ANGLE, "frequency": FREQUENCY}
+SIGNALS = {name: RFID[name].units for name in ("rssi", "phase", "frequency")}
 
 
 class RfidTopic(FileModel):
@@ -116,7 +116,7 @@ class Reads:
     def _stamp(self, value: Any, row: int) -> int:
         try:
             stamp = as_nanoseconds(value, self._stamp_unit)
-            if abs(stamp) > MAX_STAMP:
+            if abs(stamp) > LATEST:
                 raise OverflowError
             return stamp
         except (ValueError, OverflowError):

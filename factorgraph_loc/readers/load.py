@@ -17,6 +17,7 @@ from factorgraph_loc.markers import MarkerSettings
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers import registry as readers
 from factorgraph_loc.readers.bag_file import is_bag
+from factorgraph_loc.readers.bounds import require_bounds
 from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
 from factorgraph_loc.shipped import manifests
@@ -175,6 +176,7 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         start=source.start.pose(log.t0_ns) if source.start else log.start,
         metadata={**log.metadata, **source.metadata},
     )
+    require_bounds(log)
     if source.markers is not None:
         from factorgraph_loc.vision.fiducials import with_markers  # noqa: PLC0415 - few logs need OpenCV to be read
 

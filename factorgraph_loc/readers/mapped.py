@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.columns import ANGLE, LENGTH, PURE, RATE
+from factorgraph_loc.columns import IMU, require_span
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import Log, Stream
@@ -26,7 +27,7 @@ from factorgraph_loc.readers.mapped_rfid import RfidFile, joined, read_all_reads
 from factorgraph_loc.readers.native_camera import make_images
 from factorgraph_loc.readers.native_rfid import Rounds, read_rounds
 from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.readers.tables import NAMES, Table
+from factorgraph_loc.readers.tables import COLUMNS, NAMES, Table
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
@@ -37,7 +38,7 @@ SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
     "camera": (("t", "file"),),
     "sightings": (("t", "landmark", "u", "v"),),
 }
-UNITS = {"w": RATE, **dict.fromkeys(RATES, RATE), "range": LENGTH, "bearing": ANGLE, "u": PURE, "v": PURE}
+RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which not all are needed
 
 
 class SensorFile(ColumnMapping):
@@ -92,6 +93,10 @@ def read(path: Path | None, options: Options) -> Log:
     }
     rounds = _rounds(path, options, warnings)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
+    require_span(
+        [(odometry_path, None, odometry_t_ns), *((table.path, table.rows, table.t_ns) for table in tables.values())]
+        + ([(f"{path} rfid", None, rounds.end_ns)] if rounds else [])
+    )
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
     streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
     for sensor, table in tables.items():
@@ -127,7 +132,9 @@ def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) ->
     mapped = read_mapped(path, mapping, SHAPES[sensor])
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects without the columns of {sensor} are left out")
-    numbers = {name: mapped.numbers(name, UNITS[name]) for name in mapped.fields if name in UNITS}
+    columns = {**COLUMNS[sensor], **dict.fromkeys(RATES, RATE)}
+    numbered = [name for name in mapped.fields if name != "t" and columns[name].kind == "number"]
+    numbers = {name: mapped.numbers(name, columns[name]) for name in numbered}
     if sensor == "bearing_range":
         numbers = {name: numbers.get(name, np.full(len(mapped.rows), np.nan)) for name in ("range", "bearing")}
     if isinstance(mapping, ImuFile):

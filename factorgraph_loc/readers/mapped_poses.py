@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.columns import ANGLE, LENGTH, PURE, RATE, SPEED
+from factorgraph_loc.columns import INCREMENTS, LENGTH, VELOCITIES, WAYS
+from factorgraph_loc.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import IncrementStream, VelocityStream
 from factorgraph_loc.planar import Turned, on_floor, rotations_of
@@ -25,7 +26,7 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
 ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
 LEAST_AROUND = 300.0  # no robot turns by so many radians from one row to the next
-UNITS = {"v": SPEED, "w": RATE, "heading": ANGLE, "dtheta": ANGLE, **dict.fromkeys(QUATERNION, PURE)}
+COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) for c in table.columns}
 
 
 class OdometryFile(ColumnMapping, Turned):
@@ -107,10 +108,7 @@ def read_reference(
 
 
 def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
-    columns = {name: mapped.numbers(name, UNITS.get(name, LENGTH)) for name in mapped.fields if name != "t"}
-    for name, values in columns.items():
-        checks.require_finite(mapped.path, mapped.rows, mapped.mapping.columns[name], values)
-    return mapped.stamps("t", offset), columns
+    return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.fields if n != "t"}
 
 
 def _scale(options: OdometryFile, field: str) -> float:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc import bounded
 from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
-from factorgraph_loc.columns import ANGLE, DURATION, FREQUENCY, POWER, PURE
+from factorgraph_loc.columns import INVENTORIES, PURE, RFID, Column
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.readers.native_rfid import check_reads
@@ -20,8 +20,10 @@ from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
-SIGNALS = {"rssi": POWER, "phase": ANGLE, "frequency": FREQUENCY}
+SIGNALS = ("rssi", "phase", "frequency")
 OPTIONAL = (*SIGNALS, "channel", "last", "count")
+CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
+COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "how many reads the row stands for")
 REQUIRED = (("t", "epc", "antenna"), ("t", "epc"))
 
 # What tools write. ``impinj_itemtest``: the CSV of ItemTest; ``impinj_iot``: the stream of events of an R700; ``sllurp_log``: what
@@ -152,7 +154,7 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:
         warnings.append(f"{path}: {mapped.passed} objects that are no reads are left out")
     t_ns = mapped.stamps("t", options.clock_offset)
     antennas = [options.antenna] * len(t_ns) if options.antenna else texts_of(mapped, "antenna")
-    numbers = {name: _signal(mapped, name, units) for name, units in SIGNALS.items()}
+    numbers = {name: _signal(mapped, name) for name in SIGNALS}
     if "channel" in mapped.fields:
         numbers["frequency"] = _frequencies(mapped, options.channels)
     table = Table(
@@ -170,12 +172,12 @@ def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas
     """The rounds as the table ``inventories`` of the native format; ``antennas`` as of the reads."""
     mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
     names = [antennas.get(name, name) for name in texts_of(mapped, "antenna")]
-    duration = mapped.numbers("duration", DURATION)
+    duration = mapped.numbers("duration", INVENTORIES["duration"])
     return Table(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
 
 
-def _signal(mapped: Mapped, name: str, units: Mapping[str, float]) -> Array:
-    return mapped.numbers(name, units) if name in mapped.fields else np.full(len(mapped.rows), np.nan)
+def _signal(mapped: Mapped, name: str) -> Array:
+    return mapped.numbers(name, RFID[name]) if name in mapped.fields else np.full(len(mapped.rows), np.nan)
 
 
 def texts_of(mapped: Mapped, field: str) -> list[str]:
@@ -194,7 +196,7 @@ def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
 
 def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
     """The frequencies (N,) [Hz] of channels, which count from 1."""
-    number = mapped.numbers("channel", PURE)
+    number = mapped.numbers("channel", CHANNEL)
     last = len(channels) if isinstance(channels, tuple) else 1000
     with np.errstate(invalid="ignore"):
         bad = np.flatnonzero(~(np.isnan(number) | ((number >= 1) & (number <= last) & (number == np.floor(number)))))
@@ -211,7 +213,7 @@ def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) 
 def _with_last(table: Table, mapped: Mapped, options: RfidFile, warnings: list[str]) -> Table:
     """With a second read, of which only the time is known, for each row that stands for more than one."""
     if "last" not in mapped.fields:
-        if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", PURE) > 1.0))):
+        if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
             warnings.append(f"{table.path}: {many} rows stand for several reads, of which one time is known: one each")
         return table
     last_ns = mapped.stamps("last", options.clock_offset)
@@ -224,7 +226,7 @@ def _with_last(table: Table, mapped: Mapped, options: RfidFile, warnings: list[s
         )
     several = last_ns > table.t_ns
     if "count" in mapped.fields:
-        count = np.nan_to_num(mapped.numbers("count", PURE), nan=1.0)
+        count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
             warnings.append(f"{table.path}: {more} reads between the first and the last of their row are left out")

@@ -17,11 +17,11 @@ from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns
 from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.trajectory import Integers, Trajectory
+from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import Landmark, World
 from factors import se2
-from factors.se2 import Array
 
+MICROSECONDS = 1e6  # in a second: the files give milliseconds, and a double near 10^9 s holds no nanoseconds
 ROBOTS = range(1, 6)  # subjects; those after them are landmarks
 
 
@@ -41,7 +41,7 @@ def read(path: Path | None, options: Options) -> Log:
     table, rows = read_columns(file, ("time", "forward velocity", "angular velocity"))
     if len(rows) == 0:
         raise InputError(f"{file}: holds no rows: has no odometry, which every estimator needs")
-    t_ns = nanoseconds(table[:, 0])
+    t_ns = checks.stamps(file, rows, table[:, 0], per_second=MICROSECONDS)
     keep = checks.in_order(file, rows, t_ns, warnings)
     t0_ns = int(t_ns[0])
     streams: dict[str, Stream] = {
@@ -63,11 +63,6 @@ def read(path: Path | None, options: Options) -> Log:
         t0_ns=t0_ns,
         warnings=tuple(warnings),
     )
-
-
-def nanoseconds(t: Array) -> Integers:
-    """Stamps (N,) [s] in whole microseconds: the files give milliseconds, and a double near 10^9 s holds no nanoseconds."""
-    return np.asarray(np.rint(t * 1e6).astype(np.int64) * 1000)
 
 
 def read_landmarks(file: Path) -> World:
@@ -112,7 +107,7 @@ def read_sightings(folder: Path, prefix: str, t0_ns: int, warnings: list[str]) -
     landmark = np.array([subject is not None and subject not in ROBOTS for subject in seen], dtype=bool)
     names = [str(subject) for subject, kept in zip(seen, landmark, strict=True) if kept]
     table, rows = table[landmark], rows[landmark]
-    t_ns = nanoseconds(table[:, 0])
+    t_ns = checks.stamps(file, rows, table[:, 0], per_second=MICROSECONDS)
     keep = checks.sightings_in_order(file, rows, t_ns, names, warnings)
     return BearingRangeStream(
         checks.seconds(t_ns[keep], t0_ns), [names[i] for i in keep], table[keep, 2], se2.wrap(table[keep, 3])
@@ -125,7 +120,7 @@ def read_reference(file: Path, t0_ns: int, warnings: list[str]) -> Trajectory | 
     if len(rows) == 0:
         warnings.append(f"{file}: holds no rows")
         return None
-    t_ns = nanoseconds(table[:, 0])
+    t_ns = checks.stamps(file, rows, table[:, 0], per_second=MICROSECONDS)
     keep = checks.in_order(file, rows, t_ns, warnings)
     poses = table[keep, 1:]
     poses[:, 2] = se2.wrap(poses[:, 2])

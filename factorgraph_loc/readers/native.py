@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.columns import BEARING_RANGE, NEAREST, require_span
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.log import (
@@ -94,8 +95,9 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     rounds = None
     if reads is not None or inventories is not None:
         rounds = read_rounds(reads, inventories, rig.rfid.round_gap if rig.rfid else ROUND_GAP, warnings)
-    stamps = [table.t_ns for table in tables.values()] + ([rounds.end_ns] if rounds else [])
-    t0_ns = min(int(t_ns.min()) for t_ns in stamps)
+    stamped = [(table.path, table.rows, table.t_ns) for table in (*tables.values(), reads, inventories) if table]
+    require_span(stamped)
+    t0_ns = min(int(t_ns.min()) for _, _, t_ns in stamped)
     streams: dict[str, Stream] = {}
     for sensor, table in tables.items():
         streams[sensor] = make_stream(sensor, table, t0_ns, warnings)
@@ -138,7 +140,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, Table]:
         if len(files) > 1:
             raise InputError(f"{folder}: holds both {files[0].name} and {files[1].name}, expected one of them")
         for file in files:
-            table = read_table(inside(folder, file.name, folder), shapes)
+            table = read_table(inside(folder, file.name, folder), sensor, shapes)
             if len(table.rows):
                 tables[sensor] = table
             else:
@@ -162,8 +164,6 @@ def make_stream(sensor: str, table: Table, t0_ns: int, warnings: list[str]) -> S
             return make_images(table, t0_ns, warnings)
         case "sightings":
             return make_pixels(table, t0_ns, warnings)
-    for field, values in table.numbers.items():
-        checks.require_finite(table.path, table.rows, field, values)
     if "dx" in table.numbers:
         moves = np.column_stack([table.numbers[field] for field in INCREMENTS[1:]])
         t_ns, moves = checks.increments_in_order(table.path, table.rows, table.t_ns, moves, warnings)
@@ -178,19 +178,17 @@ def make_stream(sensor: str, table: Table, t0_ns: int, warnings: list[str]) -> S
 
 def make_sightings(table: Table, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
     ranges, bearings = table.numbers["range"], table.numbers["bearing"]
+    for name, values in (("range", ranges), ("bearing", bearings)):
+        BEARING_RANGE[name].require(table.path, table.rows, values)
     nothing = np.flatnonzero(np.isnan(ranges) & np.isnan(bearings))
     if len(nothing):
         raise bad_field(table.path, "row", "", "a range, a bearing or both", row=int(table.rows[nothing[0]]))
-    if len(short := np.flatnonzero(ranges <= 0.0)):  # radios that got no answer say 0, and gross errors may be below
+    if len(short := np.flatnonzero(ranges < NEAREST)):  # radios that got no answer say 0, and gross errors may be below
         first = f"{table.path}:{int(table.rows[short[0]])}"
         warnings.append(
             f"{first}: range is {ranges[short[0]]:g}: {len(short)} ranges that are not above 0 are left out"
         )
-        ranges = np.where(ranges > 0.0, ranges, np.nan)
-    turned = np.flatnonzero(np.abs(bearings) > 2.0 * np.pi)
-    if len(turned):
-        i = int(turned[0])
-        raise bad_field(table.path, "bearing", float(bearings[i]), "radians, not degrees", row=int(table.rows[i]))
+        ranges = np.where(ranges >= NEAREST, ranges, np.nan)
     names = table.names["landmark"]
     keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
     keep = keep[np.isfinite(ranges[keep]) | np.isfinite(bearings[keep])]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from factorgraph_loc.bounded import NoFileNameError, copy_file
+from factorgraph_loc.columns import SIGHTINGS
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside
 from factorgraph_loc.log import ImageStream, SightingStream
@@ -47,7 +48,7 @@ def make_images(table: Table, t0_ns: int, warnings: list[str], folder: Path | No
 def make_pixels(table: Table, t0_ns: int, warnings: list[str]) -> SightingStream:
     """Identified pixels in order of arrival; of one point at one stamp the last."""
     for field in ("u", "v"):
-        checks.require_finite(table.path, table.rows, field, table.numbers[field])
+        SIGHTINGS[field].require(table.path, table.rows, table.numbers[field])
     names = table.names["landmark"]
     keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
     t = checks.seconds(table.t_ns[keep], t0_ns)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.columns import RFID
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.log import RfidStream
 from factorgraph_loc.readers import checks
@@ -29,8 +30,7 @@ _READ = ("t_ns", "antenna", "epc")
 _SIGNALS = (("rssi", "phase", "frequency"), ("rssi",), ())  # what readers tell of a read
 READS = tuple((*_READ, *signals, *told) for signals in _SIGNALS for told in (("inventory",), ()))
 INVENTORIES = ("t_ns", "antenna", "duration")
-MAX_DURATION = 3600.0  # s
-FREQUENCIES = (1e8, 1e10)  # Hz
+SIGNALS = _SIGNALS[0]
 
 Columns = Mapping[str, Array | Integers | Sequence[str]]
 
@@ -73,11 +73,6 @@ def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warn
 def _from_inventories(reads: Table | None, inventories: Table, warnings: list[str]) -> Rounds:
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
-    bad = np.flatnonzero(~((duration >= 0.0) & (duration <= MAX_DURATION)))  # an empty one is not a number
-    if len(bad):
-        i = int(bad[0])
-        expected = f"seconds in 0 to {MAX_DURATION:g}"
-        raise bad_field(inventories.path, "duration", float(duration[i]), expected, row=int(inventories.rows[i]))
     # a reader's clock that jumps is a fault of the recording: what it stamped in the past is for the estimators to drop
     checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
     if reads is None:
@@ -120,18 +115,10 @@ def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, an
 
 
 def check_reads(reads: Table) -> None:
-    """InputError for a phase or a frequency that has another unit."""
-    if "phase" not in reads.numbers:
-        return
-    phase, frequency = reads.numbers["phase"], reads.numbers["frequency"]
-    low, high = FREQUENCIES
-    for name, values, bad, expected in (
-        ("phase", phase, np.abs(phase) > 2.0 * np.pi, "radians, not degrees"),
-        ("frequency", frequency, (frequency < low) | (frequency > high), f"Hz, {low:g} to {high:g}"),
-    ):
-        if len(rows := np.flatnonzero(bad)):
-            i = int(rows[0])
-            raise bad_field(reads.path, name, float(values[i]), expected, row=int(reads.rows[i]))
+    """InputError for what no radio measures, as in another unit."""
+    for name in SIGNALS:
+        if name in reads.numbers:
+            RFID[name].require(reads.path, reads.rows, reads.numbers[name])
 
 
 def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:

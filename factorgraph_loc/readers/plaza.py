@@ -77,13 +77,9 @@ def rows_of(table: Array) -> Integers:
     return np.arange(1, len(table) + 1, dtype=np.int64)
 
 
-def nanoseconds(t: Array) -> Integers:
-    return np.asarray(np.rint(t * 1e9).astype(np.int64))
-
-
 def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Integers]:
     """The rows of a table to keep, and their stamps [ns]."""
-    t_ns = nanoseconds(table[:, 0])
+    t_ns = checks.stamps(source, rows_of(table), table[:, 0])
     keep = checks.in_order(source, rows_of(table), t_ns, warnings)
     return table[keep], t_ns[keep]
 
@@ -104,7 +100,8 @@ def beacon_name(number: float) -> str:
 def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> IncrementStream:
     """The odometry, led by a row without motion at ``t0_ns``: without it the duration of the first one is not known."""
     moves = np.column_stack((table[:, 1], np.zeros(len(table)), table[:, 2]))
-    t_ns, moves = checks.increments_in_order(source, rows_of(table), nanoseconds(table[:, 0]), moves, warnings)
+    rows = rows_of(table)
+    t_ns, moves = checks.increments_in_order(source, rows, checks.stamps(source, rows, table[:, 0]), moves, warnings)
     if t_ns[0] > t0_ns:
         moves = np.vstack((np.zeros(3), moves))
         t_ns = np.concatenate(([t0_ns], t_ns))
@@ -115,7 +112,7 @@ def ranges(source: str, table: Array, t0_ns: int, warnings: list[str]) -> Bearin
     """The ranges by time: the file joins recordings that overlap, so its order is not that of arrival."""
     rows = rows_of(table)
     checks.require_above_zero(source, rows, "range", table[:, 3])
-    t_ns = nanoseconds(table[:, 0])
+    t_ns = checks.stamps(source, rows, table[:, 0])
     if moved := int(np.count_nonzero(t_ns < np.maximum.accumulate(t_ns))):
         warnings.append(f"{source}: {moved} rows are older than one before them: sorted by time")
     order = np.argsort(t_ns, kind="stable")

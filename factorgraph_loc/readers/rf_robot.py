@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.columns import TAGS
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, read_text
@@ -31,6 +32,7 @@ from factors.se2 import Array
 
 ANTENNAS = ("first", "second", "third")
 TAG_COLUMNS = ("epc", "x_m", "y_m", "z_m", "facing_deg")
+TAG_FIELDS = {"x_m": TAGS["x"], "y_m": TAGS["y"], "z_m": TAGS["z"], "facing_deg": TAGS["facing"]}
 READ_FIELDS = ("number", "EPC", "port", "carrier MHz", "phase degrees", "RSSI dBm", "reader clock us", "host clock us")
 BOUNDS = {"carrier MHz": (840.0, 960.0), "phase degrees": (0.0, 360.0), "RSSI dBm": (-120.0, 20.0)}
 ROUND_GAP = 0.05  # s, between the inventory rounds of an antenna
@@ -71,7 +73,7 @@ def read(path: Path | None, options: Options) -> Log:
 def read_tags(path: Path) -> dict[str, Tag]:
     """The surveyed tags by EPC."""
     cells, _ = read_cells(path, (TAG_COLUMNS,))
-    numbers = [cells.numbers(name) for name in TAG_COLUMNS[1:]]
+    numbers = [cells.numbers(name, column, name.split("_")[1]) for name, column in TAG_FIELDS.items()]
     rows: dict[str, int] = {}
     tags: dict[str, Tag] = {}
     for row, epc, (x, y, z, facing) in zip(
@@ -83,10 +85,8 @@ def read_tags(path: Path) -> dict[str, Tag]:
         for name, value in zip(TAG_COLUMNS[1:], (x, y, z, facing), strict=True):
             if math.isnan(value):
                 raise bad_field(path, name, "", "a number", row=row)
-        if abs(facing) > 360.0:
-            raise bad_field(path, "facing_deg", facing, "degrees in -360 to 360", row=row)
         rows[epc] = row
-        tags[epc] = Tag(x=x, y=y, z=z, facing=math.radians(facing))
+        tags[epc] = Tag(x=x, y=y, z=z, facing=facing)
     if not tags:
         raise InputError(f"{path}: holds no tags, expected at least one row")
     return tags
@@ -95,7 +95,7 @@ def read_tags(path: Path) -> dict[str, Tag]:
 def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
     """All poses, in seconds after the first, and the time of that."""
     table, rows = read_columns(path, ("x", "y", "heading", "time"))
-    t_ns = np.rint(table[:, 3] * 1e6).astype(np.int64) * 1000  # a double holds no more digits of such a time
+    t_ns = checks.stamps(path, rows, table[:, 3], per_second=1e6)  # a double holds no more digits of such a time
     keep = checks.in_order(path, rows, t_ns, warnings)
     if len(keep) < 2 or t_ns[keep[-1]] - t_ns[keep[0]] < 1e9 / simulated_odometry.RATE:
         raise InputError(f"{path}: holds less than 0.1 s of poses, expected a run of them")

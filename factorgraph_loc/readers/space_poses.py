@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from factorgraph_loc.column_mapping import ColumnMapping, read_mapped
-from factorgraph_loc.columns import PURE
+from factorgraph_loc.columns import POSES
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.planar import rotations_of
 from factorgraph_loc.readers import checks
@@ -73,9 +73,7 @@ def read_poses(
     named = {name: str(i) for i, name in enumerate(columns, start=1)}
     told = ColumnMapping(file=path.name, columns=named, units={"t": unit}, separator=separator, header=False)
     mapped = read_mapped(path, told, (tuple(columns),))
-    numbers = {name: mapped.numbers(name, PURE) for name in columns if name != "t"}
-    for name, values in numbers.items():
-        checks.require_finite(path, mapped.rows, name, values)
+    numbers = {name: mapped.numbers(name, POSES[name]) for name in columns if name != "t"}
     t_ns = mapped.stamps("t")
     rotations = rotations_of(path, mapped.rows, np.column_stack([numbers[name] for name in ("qx", "qy", "qz", "qw")]))
     positions = np.column_stack([numbers[name] for name in "xyz"])

@@ -71,7 +71,7 @@ def read(path: Path | None, _: Options) -> Log:
             raise bad_field(path, name, float(values[tuple(bad[0])]), "a finite number", row=int(bad[0, 1]) + 1)
     numbers = np.arange(1, count + 1, dtype=np.int64)
     warnings: list[str] = []
-    t_ns = np.rint(fields["t"][0] * 1e9).astype(np.int64)
+    t_ns = checks.stamps(path, numbers, fields["t"][0])
     keep = checks.in_order(path, numbers, t_ns, warnings)
     t0_ns = int(t_ns[0])
     t = checks.seconds(t_ns[keep], t0_ns)

@@ -9,19 +9,17 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from factorgraph_loc.columns import LATEST, STAMP, TABLES, Column
 from factorgraph_loc.csv_cells import Shape, read_cells, shape_of
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
-STAMP = "t_ns"
-NAMES = {
-    "landmark": "the name of a landmark",
-    "antenna": "the name of an antenna",
-    "epc": "the EPC of a tag",
-    "file": "the name of an image",
+COLUMNS = {
+    table.name: {column.name: column for other in TABLES if other.name == table.name for column in other.columns}
+    for table in TABLES
 }
-MAX_STAMP = 2**62  # ns: leaves room for differences in 64 bits
+NAMES = {c.name: c.doc for table in TABLES for c in table.columns if c.kind in ("name", "file")}
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,13 @@ class Table:
     names: dict[str, list[str]]
 
 
-def read_table(path: Path, shapes: Sequence[Shape]) -> Table:
+def read_table(path: Path, sensor: str, shapes: Sequence[Shape]) -> Table:
     """Read CSV or Parquet with the columns of one of ``shapes``, in any order; other columns are not looked at.
 
-    InputError names file, row and field of what is missing or is not a number.
+    InputError names file, row and field of what is missing, is not a number, or lies outside the bounds of the sensor's column.
     """
-    return _read_parquet(path, shapes) if path.suffix == ".parquet" else _read_csv(path, shapes)
+    columns = COLUMNS[sensor]
+    return _read_parquet(path, columns, shapes) if path.suffix == ".parquet" else _read_csv(path, columns, shapes)
 
 
 def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
@@ -57,33 +56,37 @@ def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[st
 
 
 def _kind(column: str) -> type[pl.DataType]:
-    if column in {STAMP, "inventory"}:
+    if column in {STAMP.name, "inventory"}:
         return pl.Int64
     return pl.String if column in NAMES else pl.Float64
 
 
-def _read_csv(path: Path, shapes: Sequence[Shape]) -> Table:
+def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
     cells, shape = read_cells(path, shapes)
     return Table(
         path,
         np.array(cells.rows, dtype=np.int64),
-        _stamps(path, cells.rows, cells.columns[STAMP]),
-        {name: cells.numbers(name) for name in shape if name not in NAMES and name != STAMP},
+        _stamps(path, cells.rows, cells.columns[STAMP.name]),
+        {name: cells.numbers(name, columns[name]) for name in shape if name not in NAMES and name != STAMP.name},
         {name: _texts(path, cells.rows, name, cells.columns[name]) for name in shape if name in NAMES},
     )
 
 
 def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Integers:
-    stamps = []
-    for row, cell in zip(rows, cells, strict=True):
-        try:
-            stamp = int(cell)
-        except ValueError:
-            raise bad_field(path, STAMP, cell, "a whole number of nanoseconds", row=row) from None
-        if abs(stamp) > MAX_STAMP:
-            raise bad_field(path, STAMP, cell, "nanoseconds below 2^62", row=row)
-        stamps.append(stamp)
-    return np.array(stamps, dtype=np.int64)
+    try:
+        stamps = np.array([int(cell) for cell in cells], dtype=np.int64)
+    except (ValueError, OverflowError):
+        i = next(i for i, cell in enumerate(cells) if not _is_stamp(cell))
+        raise bad_field(path, STAMP.name, cells[i], STAMP.expected, row=rows[i]) from None
+    STAMP.require(path, rows, stamps)
+    return stamps
+
+
+def _is_stamp(cell: str) -> bool:
+    try:
+        return abs(int(cell)) <= LATEST
+    except ValueError:
+        return False
 
 
 def _texts(path: Path, rows: Sequence[int], name: str, cells: Sequence[str | None]) -> list[str]:
@@ -95,21 +98,25 @@ def _texts(path: Path, rows: Sequence[int], name: str, cells: Sequence[str | Non
     return texts
 
 
-def _read_parquet(path: Path, shapes: Sequence[Shape]) -> Table:
+def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
     try:
         frame = pl.read_parquet(path)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(f"{path}: is not a Parquet file that can be read") from error
     shape = shape_of(path, frame.columns, shapes)
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    if not frame[STAMP].dtype.is_integer():
-        raise InputError(f"{path}: {STAMP} is of type {frame[STAMP].dtype}, expected integers, nanoseconds")
-    stamps = frame[STAMP].cast(pl.Int64, strict=False)
+    if not frame[STAMP.name].dtype.is_integer():
+        raise InputError(f"{path}: {STAMP.name} is of type {frame[STAMP.name].dtype}, expected integers, nanoseconds")
+    stamps = frame[STAMP.name].cast(pl.Int64, strict=False)
     if missing := np.flatnonzero(stamps.is_null().to_numpy()).tolist():
-        raise bad_field(path, STAMP, frame[STAMP][missing[0]], "a whole number of nanoseconds", row=missing[0] + 1)
+        raise bad_field(
+            path, STAMP.name, frame[STAMP.name][missing[0]], "a whole number of nanoseconds", row=missing[0] + 1
+        )
+    t_ns = stamps.to_numpy().copy()
+    STAMP.require(path, rows, t_ns)
     numbers = {}
     for name in shape:
-        if name in NAMES or name == STAMP:
+        if name in NAMES or name == STAMP.name:
             continue
         column = frame[name]
         if not column.dtype.is_numeric() and column.dtype != pl.Null:
@@ -119,9 +126,10 @@ def _read_parquet(path: Path, shapes: Sequence[Shape]) -> Table:
             i = int(infinite[0])
             raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
         numbers[name] = column.cast(pl.Float64).to_numpy().copy()
+        columns[name].require(path, rows, numbers[name])
     names = {
         name: _texts(path, rows.tolist(), name, frame[name].cast(pl.String).to_list())
         for name in shape
         if name in NAMES
     }
-    return Table(path, rows, stamps.to_numpy().copy(), numbers, names)
+    return Table(path, rows, t_ns, numbers, names)

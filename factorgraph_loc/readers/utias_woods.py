@@ -44,7 +44,7 @@ def read(path: Path | None, options: Options) -> Log:
     series = {name: fields[name][:, 0] for name in SERIES}
     for name in ("t", "v", "om"):
         checks.require_finite(path, rows, name, series[name])
-    t_ns = np.rint(series["t"] * 1e9).astype(np.int64)
+    t_ns = checks.stamps(path, rows, series["t"])
     t0_ns = int(t_ns[0])
     keep = checks.in_order(path, rows, t_ns, warnings)
     t = checks.seconds(t_ns, t0_ns)

@@ -197,8 +197,12 @@ def test_a_wrong_manifest(hall, refused, old, new, fragments):
             ("reads.csv:6", "Timestamp", "2026-01-31"),
         ),
         ("reads.csv", READS.replace(",e2002,", ",,"), ("reads.csv:4", "EPC is ''", "the EPC of a tag")),
-        ("reads.csv", READS.replace(",1.5,", ",150,"), ("reads.csv:3", "phase is 150.0", "radians")),
-        ("reads.csv", READS.replace("866.3", "866300000"), ("reads.csv:3", "frequency", "Hz")),
+        ("reads.csv", READS.replace(",1.5,", ",150,"), ("reads.csv:3", "PhaseAngle is 150.0", "radians")),
+        (
+            "reads.csv",
+            READS.replace("866.3", "866300000"),
+            ("reads.csv:3", "Frequency is 866300000.0", "MHz in 100 to 10000"),
+        ),
         ("reads.csv", '"' + READS, ("reads.csv",)),
     ],
 )

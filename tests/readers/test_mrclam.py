@@ -45,6 +45,7 @@ def test_only_odometry_and_map_are_needed(mrclam, read):
 
 def test_duplicate_odometry_stamps_the_last_wins(mrclam, read):
     (mrclam / "Robot1_Odometry.dat").write_text("1.0 1 0\n1.0 2 0\n1.5 3 0\n")
+    (mrclam / "Robot1_Measurement.dat").unlink()
     log = read(mrclam)
     np.testing.assert_array_equal(log.streams["odometry"].v, (2.0, 3.0))
     assert "Robot1_Odometry.dat: 1 rows" in log.warnings[0]

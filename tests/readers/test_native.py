@@ -79,10 +79,10 @@ def test_line_ends_and_blank_lines(native, one, end):
 BAD_ODOMETRY = {
     "nan": ("t_ns,v,w\n1,0.5,0\n2,nan,0\n", ":3: v is 'nan'", "finite"),
     "infinity": ("t_ns,v,w\n1,0.5,-inf\n", ":2: w is '-inf'", "finite"),
-    "empty field": ("t_ns,v,w\n1,,0\n", ":2: v is nan", "finite"),
+    "empty field": ("t_ns,v,w\n1,,0\n", ":2: v is ''", "finite"),
     "word": ("t_ns,v,w\n1,fast,0\n", ":2: v is 'fast'", "a number"),
     "seconds for nanoseconds": ("t_ns,v,w\n1.5,0,0\n", ":2: t_ns is '1.5'", "whole number of nanoseconds"),
-    "huge stamp": ("t_ns,v,w\n99999999999999999999,0,0\n", ":2: t_ns", "2^62"),
+    "huge stamp": ("t_ns,v,w\n99999999999999999999,0,0\n", ":2: t_ns", "in -4.6e+18 to 4.6e+18"),
     "short row": ("t_ns,v,w\n1,0.5,0\n\n2,0.5\n", ":4: row is '2,0.5'", "3 values: t_ns,v,w"),
     "no header": ("1,0.5,0\n2,0.5,0\n", ":1: column t_ns is missing", "expected t_ns,v,w or t_ns,dx,dy,dtheta"),
     "column missing": ("t_ns,v\n1,0.5\n", ":1: column w is missing"),
@@ -260,7 +260,8 @@ def test_bad_parquet(native, refused, columns, fragment):
     refused(native, "odometry.parquet", fragment)
 
 
-finite = st.floats(-1e6, 1e6)
+rates = st.floats(-100.0, 100.0)
+finite = st.floats(-1e7, 1e7)
 stamps = st.lists(st.integers(0, 10**13), min_size=1, max_size=8, unique=True).map(sorted)
 names = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1, max_size=5)
 
@@ -269,7 +270,7 @@ names = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1, max_
 def logs(draw: st.DrawFn) -> Log:
     t0_ns = draw(st.integers(-(10**18), 2 * 10**18))
 
-    def column(n: int, values: st.SearchStrategy[float] = finite) -> np.ndarray:
+    def column(n: int, values: st.SearchStrategy[float] = rates) -> np.ndarray:
         return np.array(draw(st.lists(values, min_size=n, max_size=n)), dtype=float)
 
     def times() -> np.ndarray:

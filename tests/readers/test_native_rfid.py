@@ -114,7 +114,7 @@ BAD = {
     "text": ("rfid.csv", READS + "1,left,E1,loud,,\n", "rfid.csv:2: rssi is 'loud'", "a number"),
     "column missing": ("rfid.csv", "t_ns,antenna,epc,rssi,phase\n", "column frequency is missing"),
     "time going back": ("rfid.csv", READS + "9000000000,left,E1,,,\n1,left,E1,,,\n", "rfid.csv:3: time"),
-    "no duration": ("inventories.csv", INVENTORIES + "1,left,\n", "inventories.csv:2: duration is nan", "seconds"),
+    "no duration": ("inventories.csv", INVENTORIES + "1,left,\n", "inventories.csv:2: duration is ''", "seconds"),
     "negative duration": ("inventories.csv", INVENTORIES + "1,left,-0.5\n", "duration is -0.5", "seconds"),
     "milliseconds": ("inventories.csv", INVENTORIES + "1,left,5000\n", "duration is 5000.0", "0 to 3600"),
 }
@@ -128,8 +128,8 @@ def test_what_is_refused(hall, refused, name, text, fragments):
 
 BAD_PLACES = {
     "beyond": ("3", "inventory is 3.0", "1 to 2"),
-    "none": ("", "inventory is nan", "1 to 2"),
-    "half": ("1.5", "inventory is 1.5", "1 to 2"),
+    "none": ("", "inventory is ''", "a whole number"),
+    "half": ("1.5", "inventory is 1.5", "a whole number"),
     "of another antenna": ("2", "inventory is 2.0", "of the same antenna"),
 }
 

@@ -102,7 +102,7 @@ BAD = {
     ),
     "tags without facing": ("tags.csv", "epc,x_m,y_m,z_m\nE-1,1,1,1\n", "column facing_deg is missing"),
     "tag twice": ("tags.csv", TAGS + "E-1,A3,1,1,1,0\n", "tags.csv:4: epc is 'E-1'", "than in row 2"),
-    "tag nowhere": ("tags.csv", TAGS + "E-3,A3,,1,1,0\n", "tags.csv:4: x_m is ''", "a number"),
+    "tag nowhere": ("tags.csv", TAGS + "E-3,A3,,1,1,0\n", "tags.csv:4: x_m is ''", "a finite number of m"),
     "facing beyond": ("tags.csv", TAGS + "E-3,A3,1,1,1,500\n", "tags.csv:4: facing_deg is 500.0"),
     "no tags": ("tags.csv", TAGS[:33] + "\n", "holds no tags"),
     "reference short": ("run4/reference_pose.txt", "0 0 0 1673511856.0\n", "less than 0.1 s of poses"),

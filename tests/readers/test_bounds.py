@@ -1,0 +1,148 @@
+"""What lies within the bounds of a column is read as it is; what does not is told with file, row and column."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from factorgraph_loc.columns import (
+    BEARING_RANGE,
+    IMU,
+    INCREMENTS,
+    INVENTORIES,
+    LATEST,
+    RFID,
+    SIGHTINGS,
+    STAMP,
+    VELOCITIES,
+)
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.log import IncrementStream, StartPose
+from factorgraph_loc.readers import load
+from factorgraph_loc.readers.bounds import require_bounds
+
+UNIX = 1_700_000_000_000_000_000
+ROW = {"landmark": "A", "antenna": "left", "epc": "E1", "file": "a.png", "duration": 1.0}
+NATIVE = [VELOCITIES, INCREMENTS, IMU, BEARING_RANGE, RFID, INVENTORIES, SIGHTINGS]
+NUMBERS = [
+    (table, column)
+    for table in NATIVE
+    for column in table.columns
+    if column.kind == "number" and column.name != "inventory"
+]
+
+
+def write(folder, table, column, value, kind):
+    """A log whose ``table`` has ``value`` in its second row; its file."""
+    names = [c.name for c in table.columns if c.name not in ("inventory", STAMP.name)]
+    rows = {
+        name: [ROW.get(name, 0.5 if name == "range" else None if name in ("phase", "frequency", "rssi") else 0.0)] * 2
+        for name in names
+    }
+    rows[column.name] = [rows[column.name][0], value]
+    frame = pl.DataFrame({STAMP.name: [UNIX, UNIX + 10**9], **rows}, strict=False)
+    if kind == "csv":
+        frame.write_csv(folder / f"{table.name}.csv")
+    else:
+        frame.write_parquet(folder / f"{table.name}.parquet")
+    if table.name != "odometry":
+        (folder / "odometry.csv").write_text(f"t_ns,v,w\n{UNIX},0,0\n{UNIX + 10**9},0,0\n")
+    (folder / "run.toml").write_text("")
+    return folder / f"{table.name}.{kind}"
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(place=st.sampled_from(NUMBERS), share=st.floats(0.0, 1.0), kind=st.sampled_from(["csv", "parquet"]))
+@example(place=(INCREMENTS, INCREMENTS["dx"]), share=0.0, kind="csv")
+@example(place=(INCREMENTS, INCREMENTS["dx"]), share=1.0, kind="parquet")
+def test_what_lies_within_the_bounds_comes_back(tmp_path_factory, place, share, kind):
+    table, column = place
+    value = (1.0 - share) * column.low + share * column.high
+    folder = tmp_path_factory.mktemp("log")
+    write(folder, table, column, value, kind)
+    (log,) = load(str(folder))
+    stream = log.streams["rfid" if table.name == "inventories" else table.name]
+    if table is BEARING_RANGE and column.name == "range" and value < 1e-3:
+        assert any("not above 0 are left out" in line for line in log.warnings)
+    elif table is not INVENTORIES:
+        assert float(getattr(stream, column.name)[-1]) == value
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    place=st.sampled_from(NUMBERS),
+    value=st.floats(allow_nan=False) | st.integers(0, 400).map(lambda power: 10.0 ** min(power, 308)),
+    kind=st.sampled_from(["csv", "parquet"]),
+)
+@example(place=(VELOCITIES, VELOCITIES["v"]), value=math.inf, kind="parquet")
+def test_what_lies_outside_is_told_with_file_row_and_column(tmp_path_factory, place, value, kind):
+    table, column = place
+    if column.low <= value <= column.high:
+        value = math.nextafter(column.high, math.inf)
+    folder = tmp_path_factory.mktemp("log")
+    file = write(folder, table, column, value, kind)
+    with pytest.raises(InputError) as caught:
+        load(str(folder))
+    row = 3 if kind == "csv" else 2
+    assert f"{file.name}:{row}: {column.name} is " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("first", [0, UNIX - 10**18, UNIX + 31 * 86_400 * 10**9, -LATEST])
+def test_a_stamp_that_is_far_from_all_others_is_told_with_its_row(native, refused, first):
+    rows = "".join(f"{UNIX + i * 10**8},0.1,0\n" for i in range(20))
+    (native / "bearing_range.csv").unlink()
+    (native / "reference.tum").unlink()
+    late = first > UNIX
+    text = f"t_ns,v,w\n{rows}{first},0,0\n" if late else f"t_ns,v,w\n{first},0,0\n{rows}"
+    (native / "odometry.csv").write_text(text)
+    refused(native, f"odometry.csv:{22 if late else 2}: stamp is '{first} ns'", "at most 30 days from all others")
+
+
+def test_tables_by_different_clocks_are_told(native, refused):
+    rows = "".join(f"{UNIX + i * 10**8},0.1,0\n" for i in range(20))
+    (native / "odometry.csv").write_text("t_ns,v,w\n" + rows)
+    refused(native, "bearing_range.csv:2: stamp is '1200000000 ns'", "30 days")
+
+
+@pytest.mark.parametrize("stamp", [2**62, -(2**62), 10**30, "1" * 5000])
+def test_stamps_beyond_64_bits(native, refused, stamp):
+    (native / "odometry.csv").write_text(f"t_ns,v,w\n{UNIX},0,0\n{stamp},0,0\n")
+    refused(native, "odometry.csv:3: t_ns is", "in -4.6e+18 to 4.6e+18")
+
+
+@pytest.mark.parametrize("stamp", ["1e1000000", "-1e1000000", "1e999999999999999999", "nan", "inf", "9" * 400])
+def test_a_stamp_of_another_program_that_is_no_time(hall, refused, stamp):
+    (hall.parent / "run" / "wheels.csv").write_text(f"time_ms;speed;turn\n{stamp};1,8;90\n1500;1,8;0\n")
+    refused(hall, "wheels.csv:2: time_ms is", "expected a number of ms in -4.6e+12 to 4.6e+12")
+
+
+def test_bounds_are_told_in_the_unit_of_the_file(hall, refused):
+    (hall.parent / "run" / "wheels.csv").write_text("time_ms;speed;turn\n1000;361;90\n1500;1,8;0\n")
+    refused(hall, "wheels.csv:2: speed is 361.0, expected a finite number of km/h in -360 to 360")
+
+
+@pytest.mark.parametrize("unit", ["0", "1e-300", "1e300", "-1e13"])
+def test_a_unit_that_is_no_unit(hall, refused, unit):
+    hall.write_text(hall.read_text().replace('v = "km/h"', f"v = {unit}"))
+    refused(hall, "wheels.csv: the unit of v is", "expected one of m/s, cm/s")
+
+
+def test_what_no_reader_looked_at_is_found_in_the_log(native, one):
+    log = one(native)
+    t = log.streams["odometry"].t
+    moves = IncrementStream(t, np.array((0.0, 2000.0, 0.0)), np.zeros(3), np.zeros(3))
+    with pytest.raises(InputError, match=r"hall: odometry at 0.500 s: dx is 2000.0, expected a finite number of m"):
+        require_bounds(replace(log, streams={"odometry": moves}))
+    with pytest.raises(InputError, match=r"hall: the start is at -1700000000 s after the first stamp, expected one at"):
+        require_bounds(replace(log, start=StartPose(-1.7e9, np.zeros(3), np.ones(3))))
+    with pytest.raises(InputError, match=r"hall: start at 0.000 s: x is 1e\+300, expected"):
+        require_bounds(replace(log, start=StartPose(0.0, np.array((1e300, 0.0, 0.0)), np.ones(3))))
+    poses = np.array(log.reference.poses)
+    poses[1, 0] = 1e12
+    with pytest.raises(InputError, match=r"hall: reference at 0.500 s: x is 1000000000000.0, expected"):
+        require_bounds(replace(log, reference=replace(log.reference, poses=poses)))
