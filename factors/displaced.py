@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 
@@ -14,7 +14,7 @@ def displaced(
     """Whitened residuals (K, 2) with Jacobians (K, 2, d), the first of them by the pose at the sighting's time, as those of a
     factor on the pose ``offset`` (3,) before it, with ``spread`` (K, 2, 2) added to the unit noise; None where there is none."""
     if spread is not None:
-        whitener = np.linalg.inv(np.linalg.cholesky(np.eye(2) + spread))
+        whitener = positive.whitener(np.eye(2) + spread)
         error = np.einsum("kij,kj->ki", whitener, error)
         blocks = [whitener @ block for block in blocks]
     if offset is not None:

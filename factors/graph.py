@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 
@@ -83,7 +83,7 @@ class PriorFactor:
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean
-        self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+        self._whitener = positive.whitener(covariance)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(mean^-1 * pose)`` and its Jacobian."""

@@ -11,6 +11,10 @@ import numpy as np
 from factors.se2 import Array
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
 
+# Of a covariance of positions: what is less than this share of it is a matter of rounding. A robot that is not known to a hundred
+# metres is not known better than to a tenth of a millimetre in any direction: else its covariance could not be inverted.
+ROUNDING, FAR = 1e-12, 1e4  # m^2
+
 # direction of travel; variances per distance, rotation and time, of what is along, lateral and of the heading; those per time
 # without odometry, of position and of heading; the least ones, and the least ones per time
 Noise = tuple[float, ...]
@@ -39,6 +43,7 @@ def relative(noise: Noise, start: State, end: State) -> tuple[Array, Array, floa
     covariance[0, 0] = ahead**2 * along + aside**2 * lateral + heading * nx * nx / 3.0 + noise[12]
     covariance[1, 1] = aside**2 * along + ahead**2 * lateral + heading * ny * ny / 3.0 + noise[12]
     covariance[2, 2] = heading + noise[13]
+    _widen(covariance)
     covariance[0, 1] = covariance[1, 0] = ahead * aside * (along - lateral) + heading * nx * ny / 3.0
     covariance[0, 2] = covariance[2, 0] = heading * nx / 2.0
     covariance[1, 2] = covariance[2, 1] = heading * ny / 2.0
@@ -61,7 +66,17 @@ def carried(covariance: Array, delta: Array, noise: Array) -> Array:
         for j in range(3):
             q = adjoint[j]
             out[i, j] = a * q[0] + b * q[1] + d * q[2] + noise[i, j]
+    _widen(out)
     return out
+
+
+@numba.njit(cache=True, inline="always")
+def _widen(covariance: Array) -> None:
+    """Keep a covariance (3, 3) that can be inverted: see :data:`FAR`."""
+    spread = covariance[0, 0] + covariance[1, 1]
+    if spread > FAR:
+        covariance[0, 0] += ROUNDING * spread
+        covariance[1, 1] += ROUNDING * spread
 
 
 @numba.njit(cache=True)

@@ -21,7 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import reprojection_kernels, se2
+from factors import positive, reprojection_kernels, se2
 from factors.reprojection_kernels import Lens
 from factors.se2 import Array
 
@@ -200,7 +200,7 @@ def log_likelihood(
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
     else:
-        whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
+        whiteners = positive.whitener(covariances)
     arguments = (lens_of(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
     return model.tempering * np.asarray(
         reprojection_kernels.log_likelihood(

@@ -329,7 +329,8 @@ class KeyframeGraph(ABC):
         """An error of the solver, or of GTSAM's, in one line."""
         key = blamed(error)
         if key is None:
-            return str(error).strip().splitlines()[0]
+            lines = str(error).strip().splitlines()
+            return lines[0] if lines else "no step leads to a better solution"
         return f"the measurements do not determine {self._named(key)}"
 
     def _named(self, key: int) -> str:

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-import numpy as np
-
 from factorgraph_loc.estimators.robust_update import GATE
+from factors import positive
 from factors.se2 import Array
 
 MAX_PENDING = 5  # sightings that wait for another to agree
@@ -33,6 +32,6 @@ class NewLandmarks(Generic[Sighting]):
         waiting = self.pending.get(name, ())
         for earlier, spread, candidate in reversed(waiting):
             apart = point - earlier
-            if apart @ np.linalg.solve(spread + covariance, apart) < GATE:
+            if positive.squared(apart, spread + covariance) < GATE:
                 return NewLandmarks({other: rows for other, rows in self.pending.items() if other != name}), candidate
         return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None

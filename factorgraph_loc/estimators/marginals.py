@@ -52,7 +52,7 @@ def damped(damping: float) -> str:
     return f"covariances: the graph hardly determines them, relative damping of {damping:g}"
 
 
-def blamed(error: RuntimeError) -> int | None:
+def blamed(error: Exception) -> int | None:
     """The variable that ours or one of GTSAM's errors names, None where it names none."""
     if isinstance(error, IndeterminateError):
         return error.key
@@ -75,7 +75,7 @@ def _solved(
                 conditional = tree.marginalFactor(key, gtsam.EliminateQR)  # owns what R() shows
                 root = np.linalg.inv(conditional.R())
                 found[key] = np.asarray(root @ root.T, dtype=float)
-    except RuntimeError as error:
+    except (RuntimeError, IndexError) as error:  # IndexError: a variable that no factor is on
         return IndeterminateError(blamed(error))
     except np.linalg.LinAlgError:
         return IndeterminateError(key)

@@ -22,7 +22,7 @@ from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.robust_update import GATE
 from factorgraph_loc.estimators.sighting_window import Sighting, Window
-from factors import se2
+from factors import positive, se2
 from factors.bearing_range import BearingRangeModel, robust_loss
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import ChainState
@@ -232,11 +232,11 @@ def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.
         difference = poses - poses[kept[-1]]
         difference[:, 2] = se2.wrap(difference[:, 2])
         losses[np.all(np.abs(difference) < apart, axis=1)] = np.inf
-    return np.array(kept)
+    return np.array(kept, dtype=np.int64)
 
 
 def _distance(pose: Array, other: Array, covariance: Array) -> float:
     """Squared Mahalanobis distance between two poses (3,) under a covariance (3, 3) in the world's frame."""
     difference = pose - other
     difference[2] = se2.wrap_scalar(difference[2])
-    return float(difference @ np.linalg.solve(covariance, difference))
+    return float(positive.squared(difference, covariance))

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
-from factors import se2
+from factors import positive, se2
 from factors.bearing_range import BearingRangeModel, jacobians, located, residuals, robust_loss, robust_weight, sigmas
 from factors.odometry import ChainState
 from factors.se2 import Array
@@ -119,7 +119,7 @@ class Window:
         # without a bearing the direction of the range is not known: the worst
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
         covariance[:, 0, 0] = np.where(self._missing[:, 1], 1.0 + worst, covariance[:, 0, 0])
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+        return positive.whitener(covariance)
 
     def squared(self, poses: Array, whitener: Array) -> Array:
         """Squared whitened residuals (N, K) at present poses (N, 3)."""

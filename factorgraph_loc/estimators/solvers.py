@@ -75,6 +75,10 @@ class FullHistory:
         self._linear: defaultdict[int, list[_Linear]] = defaultdict(list)  # our factors on each variable
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
+        with _gtsam():
+            self._update(nodes, values)
+
+    def _update(self, nodes: Sequence[Node], values: Values) -> None:
         ours = self._relinearized()
         old = [linear.slot for linear in ours]
         self._at |= values
@@ -95,8 +99,7 @@ class FullHistory:
                 self._linear[key].append(linear)
         for i in range(len(old)):
             ours[i].slot = i
-        with _gtsam():
-            slots = self._isam.update(graph, to_gtsam(values), old).getNewFactorsIndices()
+        slots = self._isam.update(graph, to_gtsam(values), old).getNewFactorsIndices()
         for linear in ours:
             linear.slot = slots[linear.slot]
         self._updates += 1
@@ -119,7 +122,8 @@ class FullHistory:
         return None
 
     def value(self, key: int) -> Array:
-        return read(self._isam, key)
+        with _gtsam():
+            return read(self._isam, key)
 
     def covariance(self, key: int) -> Array:
         with _gtsam():
@@ -179,7 +183,8 @@ class Window:
             self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
     def value(self, key: int) -> Array:
-        return read(self._smoother, key)
+        with _gtsam():
+            return read(self._smoother, key)
 
     def covariance(self, key: int) -> Array:
         with _gtsam():
@@ -201,8 +206,9 @@ class Window:
 
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""
-        joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
-        return [np.asarray(joint.at(key, key)) for key in keys]
+        with _gtsam():
+            joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
+            return [np.asarray(joint.at(key, key)) for key in keys]
 
     def _custom(self, node: Node) -> gtsam.NonlinearFactor:
         assert node.factor is not None

@@ -26,6 +26,7 @@ from factorgraph_loc.estimators.space_motion import RobotState, TwistChain
 from factorgraph_loc.measurements import CameraFrame, Measurement, PixelSightings, Twist
 from factorgraph_loc.rig import TwistSettings
 from factorgraph_loc.trajectory3 import Trajectory3
+from factors import positive
 from factors.reprojection import huber_loss, huber_weight
 from factors.se2 import Array
 
@@ -65,7 +66,7 @@ class _Image:
 
     def _whitened(self, pose: gtsam.Pose3) -> tuple[Array, Array, Array]:
         sights = self.eye.known(_robot(pose), self.points, self.spreads)
-        whitener = np.asarray(np.linalg.inv(np.linalg.cholesky(sights.noise)), dtype=float)
+        whitener = positive.whitener(sights.noise)
         return np.einsum("kij,kj->ki", whitener, sights.pixels - self.pixels), whitener, sights.by_pose
 
 

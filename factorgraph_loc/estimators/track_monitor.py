@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.estimators.robust_update import GATE, Sightings
+from factors import positive
 from factors.se2 import Array
 
 STAMPS, DURATION = 4, 2.0  # at least as many, over at least so many seconds
@@ -32,7 +33,7 @@ class TrackMonitor:
         """Take the landmarks of a stamp, with the ``pose`` (3,) predicted there and its body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = seen.whitened([pose])
         spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-        squared = np.sum(residual * np.linalg.solve(spread, residual[..., None])[..., 0], axis=1)
+        squared = positive.squared(residual, spread)
         self._stamps = [s for s in self._stamps if s[0] < t][-KEPT:]
         self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
         last = self._last()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from factors import reprojection, reprojection_kernels
+from factors import positive, reprojection, reprojection_kernels
 from factors.reprojection import CameraModel
 from factors.reprojection_kernels import Lens
 from factors.se2 import Array
@@ -51,7 +51,10 @@ def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Ar
     """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], lie
     together as near to what is predicted as they should."""
     seen = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, spreads))
-    joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *seen)
+    try:
+        joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *seen)
+    except np.linalg.LinAlgError:  # a covariance that is beyond numbers: each point is looked at by itself
+        return False
     return bool(joint < _largest(2 * len(points)))
 
 
@@ -63,7 +66,7 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
         return np.ones(count, dtype=bool)
     if count < FEWEST:
         return np.zeros(count, dtype=bool)
-    whiteners, root = np.linalg.inv(np.linalg.cholesky(spreads)), _root(camera)
+    whiteners, root = positive.whitener(spreads), _root(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
     inside = squared < LOOSE
     for _ in range(2):
@@ -120,7 +123,7 @@ def _largest(dof: int) -> float:
     return float(chdtri(dof, 1.0 - JOINT))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, spreads: Array
 ) -> float:

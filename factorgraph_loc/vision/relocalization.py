@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
-from factors import reprojection, se2
+from factors import positive, reprojection, se2
 from factors.reprojection import CameraModel, huber_weight
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
@@ -109,7 +109,7 @@ def _refined(
         noise = np.broadcast_to(model.sigma**2 * np.eye(2), (len(points), 2, 2))
         if spreads is not None:
             noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
-        whitener = np.linalg.inv(np.linalg.cholesky(noise))
+        whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
         # wrong points far off would pull as one under the loss

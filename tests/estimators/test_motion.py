@@ -1,11 +1,12 @@
 """How estimators take odometry in."""
 
+import numpy as np
 import pytest
 
 from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.motion import Motion
+from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.rig import ImuSettings, Rig
+from factorgraph_loc.rig import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings, Rig
 
 RIG = Rig(imu=ImuSettings(bias=0.1))
 
@@ -36,3 +37,20 @@ def test_a_sensor_that_is_not_used_is_ignored_and_counted():
     motion.add(VelocityOdometry(0.0, 1.0, 5.0))
     assert motion.state(1.0).x == 0.0
     assert diagnostics.ignored == {"odometry": 1}
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-6, 5.0])
+def test_a_covariance_can_be_inverted_however_far_the_robot_seems_to_go(sigma):
+    """The heading's error moves the robot across, along it only the odometry's own noise does."""
+    growth, across = GrowthSettings(per_distance=1e-6), GrowthSettings(per_distance=sigma, per_rotation=5.0)
+    noise = OdometryNoise(along=growth, lateral=growth, heading=across)
+    motion = Motion(Rig(odometry=OdometrySettings(noise=noise)), ("odometry",), Diagnostics())
+    covariance, before = 1e-8 * np.eye(3), motion.state(0.0)
+    for i in range(40):
+        motion.add(IncrementOdometry(0.1 * i, 1000.0, 0.0, 90.0))
+        now = motion.state(0.1 * i)
+        increment = motion.relative(before, now)
+        covariance, before = propagate(covariance, increment), now
+        for found in (increment.covariance, covariance):
+            np.linalg.cholesky(found)
+            assert np.all(np.linalg.eigvalsh(np.linalg.inv(found)) > 0.0)

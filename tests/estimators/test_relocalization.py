@@ -10,7 +10,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.relocalization import Relocalizer
+from factorgraph_loc.estimators.relocalization import Relocalizer, _apart
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.log import BearingRangeStream
 from factorgraph_loc.measurements import BearingRange
@@ -147,6 +147,12 @@ def test_nothing_is_left_to_search(log):
     relocalizer.forget(np.inf)
     relocalizer.search()
     assert (relocalizer.status, relocalizer.hypotheses) == ("unlocalized", ())
+
+
+def test_nowhere_to_search_is_no_hypothesis():
+    """Where no candidate has a finite loss there is none to refine."""
+    chosen = _apart(np.zeros((2, 3)), np.full(2, np.nan), np.ones(3), 5)
+    assert np.zeros((2, 3))[chosen].shape == (0, 3)
 
 
 def test_a_wrong_track_is_suspected_and_refuted_and_a_right_one_is_not(log):
