@@ -1,0 +1,172 @@
+"""Processes that try cases one after the other, with limits of memory and time; one that ends or hangs is started anew."""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import re
+import resource
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+from fuzzing.verdicts import Verdict
+
+SECONDS = 8.0  # of the processor, or of waiting for something that does not come
+AT_MOST = 60.0  # s by the clock, on a machine that does other things
+STARTING = 240.0  # s, for a process that imports, compiles and makes seeds
+MEMORY = 2 * 10**9  # bytes, beside what a process has when it is ready
+LIBRARIES = ("OPENBLAS", "OMP", "NUMBA", "RAYON")
+ONE_THREAD = {"POLARS_MAX_THREADS": "1"} | {f"{name}_NUM_THREADS": "1" for name in LIBRARIES}
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+class Worker:
+    """A process that tries cases below ``root``; ``name`` tells it from others there. ``command``: what is run, as :func:`_serve`
+    speaks; ``seconds``: that a case may take."""
+
+    def __init__(
+        self, root: Path, name: str = "w0", command: Sequence[str] = ("-m", "fuzzing.workers"), seconds: float = SECONDS
+    ) -> None:
+        self.root, self.name = root, name
+        self._command, self._seconds = command, seconds
+        self.case_folder = root / name
+        self._process: subprocess.Popen[str] | None = None
+        self._said = root / f"{name}.stderr"
+
+    def try_cases(self, kind: str, seed: int, first: int, count: int) -> Iterator[tuple[int, Verdict]]:
+        """The verdict of each case by its number. The files of a case are there until the next is asked for."""
+        number = first
+        while number < first + count:
+            process = self._running()
+            self._tell({"kind": kind, "seed": seed, "number": number})
+            if (failed := self._wait(process, STARTING)) is not None:  # the kind is ready, or could not be
+                self.close()
+                yield number, Verdict("bad", failed, "while the seed was made", self._last_words())
+                return
+            self._tell({})
+            if (failed := self._wait(process, self._seconds)) is None:
+                yield number, Verdict(**json.loads(self._line))
+            else:
+                words, place = self._last_words(), self._place()
+                self.close()
+                yield number, Verdict("bad", failed, place, words)
+            number += 1
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._process is None or self._process.poll() is not None:
+            self.root.mkdir(parents=True, exist_ok=True)
+            scripts = str(Path(__file__).parents[1])
+            places = [scripts, str(Path(scripts).parent), os.environ.get("PYTHONPATH", "")]
+            environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, places))}
+            with self._said.open("a") as said:
+                self._process = subprocess.Popen(
+                    [sys.executable, *self._command, str(self.root), self.name],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=said,
+                    text=True,
+                    env=environment,
+                )
+        return self._process
+
+    def _tell(self, what: dict[str, object]) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(what) + "\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            pass  # it has ended: waiting for its answer tells
+
+    def _wait(self, process: subprocess.Popen[str], seconds: float) -> str | None:
+        """Wait for a line; None when it has come, else what is wrong."""
+        assert process.stdout is not None
+        began, used = time.monotonic(), _processor_seconds(process.pid)
+        while True:
+            if select.select([process.stdout], [], [], 0.25)[0]:
+                self._line = process.stdout.readline()
+                if self._line:
+                    return None
+                code = process.wait()
+                return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
+            waited, worked = time.monotonic() - began, _processor_seconds(process.pid) - used
+            if (
+                worked > seconds
+                or waited > max(AT_MOST, seconds)
+                or (waited > seconds and worked < 0.1 * waited and _sleeps(process.pid))
+            ):
+                process.send_signal(signal.SIGUSR1)  # it says where it is
+                time.sleep(0.3)
+                return f"hangs for {waited:.0f} s"
+
+    def _last_words(self) -> str:
+        return self._said.read_text(errors="replace")[:3000] if self._said.exists() else ""
+
+    def _place(self) -> str:
+        """The innermost line of the project in what it said."""
+        found = re.findall(r'File "[^"]*?((?:factorgraph_loc|factors)/[^"]+)", line (\d+) in (\w+)', self._last_words())
+        return "{}:{} {}".format(*found[0]) if found else "outside of the project"
+
+
+def _processor_seconds(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def _sleeps(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+    except OSError:
+        return False
+
+
+def _limit_memory() -> None:
+    """From now on, that much more than there is."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+
+
+def _serve(root: Path, name: str, asked: IO[str], answers: IO[str]) -> None:
+    """Try what is asked for: a line with a case, and one when its answer is awaited."""
+    from fuzzing.cases import Bench, Case  # noqa: PLC0415
+
+    bench = Bench(root, name)
+    faulthandler.register(signal.SIGUSR1, all_threads=False)
+    ready: set[str] = set()
+    for line in asked:
+        case = Case(**json.loads(line))
+        if case.kind not in ready:
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+            bench.prepare(case.kind)
+            _limit_memory()
+            ready.add(case.kind)
+        print("ready", file=answers, flush=True)
+        os.ftruncate(2, 0)
+        asked.readline()
+        verdict = bench.try_case(case)
+        print(json.dumps(verdict.plain()), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    faulthandler.enable(all_threads=False)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _serve(Path(sys.argv[1]), sys.argv[2], sys.stdin, answers)
