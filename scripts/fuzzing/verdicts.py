@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from factorgraph_loc.errors import FglocError
 
-LONGEST = 450  # letters of a message; about 300 of them are ours, the others are paths
+LONGEST = 300  # letters of a message
 PACKAGES = ("factorgraph_loc", "factors", "scripts")
 
 

@@ -50,7 +50,9 @@ def test_verdicts():
 
     assert judge(lambda: None).outcome == "read"
     assert fail(InputError("x.csv:3: t is 'a', expected a number")).outcome == "refused"
-    for error in (InputError("two\nlines"), InputError("x" * 5000), InputError("\x1b[31m"), InputError("")):
+    for text in ("two\nlines", "x" * 5000, "\x1b[31m", ""):
+        error = InputError("")
+        error.args = (text,)  # as an error that does not look after itself
         assert fail(error).outcome == "bad"
     assert fail(KeyError("a")).error == "KeyError"
     assert fail(SystemExit(3)).outcome == "bad"
