@@ -48,19 +48,43 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 def read_toml(path: Path) -> dict[str, Any]:
     """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or
     has a date or an integer of more than 64 bits, of which no file of ours has any."""
-    text = read_text(path, bounded.SETTINGS)
+    return parse_toml(read_text(path, bounded.SETTINGS), path)
+
+
+def parse_toml(text: str, source: object) -> dict[str, Any]:
+    """The content of a text in TOML; InputError as of :func:`read_toml`."""
     if found := _LONG_KEY.search(text):  # the time that tomllib takes grows with the square of the parts
-        raise InputError(f"{path}:{text.count(chr(10), 0, found.start()) + 1}: a key has more than {DEEPEST} parts")
-    with bounded.foreign(path, "is not TOML"):
+        line = text.count(chr(10), 0, found.start()) + 1
+        raise InputError(f"{plain(source)}:{line}: a key has more than {DEEPEST} parts")
+    with bounded.foreign(source, "is not TOML"):
         content = tomllib.loads(text)
-    for key, value in _leaves(content, path):
+    check_content(content, source)
+    return content
+
+
+def check_content(content: dict[str, Any], source: object) -> None:
+    """InputError for what none of our files has: what is nested deeper than :data:`DEEPEST`, a date, an integer of more than 64
+    bits, text that is none in UTF-8, or what is no value of TOML at all."""
+    for key, value in _leaves(content, source):
         if isinstance(value, int) and abs(value) >= 2**63:
-            raise InputError(f"{plain(path)}: {plain(key)} is a whole number of more than 64 bits")
+            raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
         if isinstance(value, date | time):
             raise InputError(
-                f"{plain(path)}: {plain(key)} is a date or time, expected a number, or text between quotes"
+                f"{plain(source)}: {plain(key)} is a date or time, expected a number, or text between quotes"
             )
-    return content
+        if not isinstance(value, str | int | float):
+            raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, expected a number or text")
+        if isinstance(value, str) and not is_utf8(value):
+            raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, which is not text in UTF-8")
+
+
+def is_utf8(text: str) -> bool:
+    """Whether a text can be written into a file."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def read_json(path: Path) -> Any:
@@ -83,7 +107,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
         return kind.model_validate(content)
     except ValidationError as error:
         # a misspelt key is also a missing one: the spelling is what the user can act on
-        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
         key = plain(".".join(str(part) for part in first["loc"]))
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":

@@ -56,17 +56,20 @@ def run(
     """Make the runs of an experiment whose results are not there yet; can be stopped and started again at any time."""
     from factorgraph_loc.experiments.cluster import on_cluster
     from factorgraph_loc.experiments.experiment import run_experiment
+    from factorgraph_loc.experiments.plan import TooManyRunsError
 
     if scheduler is not None and jobs is not None:
         raise InputError("--jobs is of this machine, but --scheduler names a cluster: expected one of them")
-    prepared = _prepared(file, set_, out, data_root, verify=verify)
+    if yes or dry_run:
+        prepared = _prepared(file, set_, out, data_root, verify=verify)
+    else:
+        try:
+            prepared = _prepared(file, set_, out, data_root, verify=verify, most=MANY)
+        except TooManyRunsError as error:
+            raise InputError(f"{error}: give --yes if that is meant, --dry-run to see them") from error
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return
-    if len(prepared.runs) > MANY and not yes:
-        raise InputError(
-            f"{file}: plans {len(prepared.runs):,} runs, more than {MANY:,}: give --yes if that is meant, --dry-run to see them"
-        )
     try:
         with show.progress("runs", counted=True) as bar:
             done = run_experiment(
@@ -153,12 +156,20 @@ def report(
 
 
 def _prepared(
-    file: Path, changes: list[str] | None, out: Path | None, data_root: Path | None, *, verify: bool = False
+    file: Path,
+    changes: list[str] | None,
+    out: Path | None,
+    data_root: Path | None,
+    *,
+    verify: bool = False,
+    most: int | None = None,
 ) -> Prepared:
     from factorgraph_loc.experiments.experiment import prepare
+    from factorgraph_loc.experiments.plan import MOST_RUNS
 
     pairs = [key_and_value(text, "--set") for text in changes or ()]
-    return prepare(file, pairs, data_root=None if data_root is None else str(data_root), out=out, verify=verify)
+    root = None if data_root is None else str(data_root)
+    return prepare(file, pairs, data_root=root, out=out, verify=verify, most=most or MOST_RUNS)
 
 
 def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import listed, plain, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.log import Log
@@ -136,22 +135,29 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
         for key in keys[:-1]:
             table = table.setdefault(key, {})
             if not isinstance(table, dict):
-                raise InputError(f"--set is {quoted(text)}, but {key} is set to {quoted(table)} already")
+                raise InputError(f"--set is {quoted(text)}, but {plain(key)} is set to {quoted(table)} already")
         table[keys[-1]] = value
     return settings
 
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
+    """``a.b=3`` as ("a.b", 3)."""
+    from factorgraph_loc.files import DEEPEST, is_utf8
+
     key, equals, value = text.partition("=")
-    if not equals or not key.strip() or not value.strip():
+    if not equals or not key.strip() or not value.strip() or not is_utf8(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")
+    if key.count(".") >= DEEPEST:
+        raise InputError(f"{option} is {quoted(text)}, expected a key of at most {DEEPEST} parts")
     return key.strip(), _scalar(value.strip())
 
 
 def _scalar(text: str) -> Any:
-    """A value as TOML has it; a word that is not TOML is itself."""
+    """A value as TOML files of ours have it; a word that is none, such as a date, is itself."""
+    from factorgraph_loc.files import parse_toml
+
     try:
-        table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        table = parse_toml(f"value = {text}", "a value")
+    except InputError:
         return text
     return table["value"] if len(table) == 1 else text

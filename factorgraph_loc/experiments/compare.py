@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -118,10 +119,13 @@ def _execute(job: _Job) -> _Outcome:
 
 def _without_needless_seeds(configs: Sequence[RunConfig]) -> list[RunConfig]:
     kept: list[RunConfig] = []
+    first: list[RunConfig] = []  # of those without randomness
     for config in configs:
-        same = [k for k in kept if replace(k, seed=config.seed) == config]
-        if not (same and _is_deterministic(config.estimator)):
-            kept.append(config)
+        if _is_deterministic(config.estimator):
+            if any(replace(one, seed=config.seed) == config for one in first):
+                continue
+            first.append(config)
+        kept.append(config)
     return kept
 
 
@@ -147,10 +151,9 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
     for log, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"two logs are called {log.name}, expected different names")
-    pairs = [(config.estimator, config.seed) for config in configs]
-    for estimator, seed in pairs:
-        if pairs.count((estimator, seed)) > 1:
-            raise InputError(f"{estimator} with seed {seed} is given twice")
+    pairs = Counter((config.estimator, config.seed) for config in configs)
+    if twice := [pair for pair, count in pairs.items() if count > 1]:
+        raise InputError(f"{twice[0][0]} with seed {twice[0][1]} is given twice")
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:

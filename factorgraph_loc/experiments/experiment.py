@@ -10,13 +10,15 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.execute import Outcome
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
-from factorgraph_loc.experiments.plan import PlannedRun, plan
+from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan
 from factorgraph_loc.experiments.pool import execute
 from factorgraph_loc.experiments.store import State, Store
+from factorgraph_loc.text import plain
 
 if TYPE_CHECKING:
     import polars as pl
@@ -74,18 +76,23 @@ def prepare(
     data_root: str | None = None,
     out: Path | None = None,
     verify: bool = False,
+    most: int = MOST_RUNS,
 ) -> Prepared:
     """Plan the experiment of a ``file`` with ``changes``, and look at what is stored; ``verify``: by all checksums.
 
-    InputError for what is wrong in the file, StoreError if the folder for results cannot be written.
+    InputError for what is wrong in the file, TooManyRunsError for more than ``most`` runs, StoreError if the folder for results
+    cannot be written.
     """
     experiment = read_experiment(file, changes)
     folder = out or experiment.folder()
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, expected a folder for the results")
+    if (found := kind(folder)) not in ("", "a folder"):
+        raise InputError(f"{folder}: is {found}, expected a folder for the results")
     store = Store(folder)
     store.create()
-    runs = plan(experiment, file.parent, store.folder, data_root)
+    try:
+        runs = plan(experiment, file.parent, store.folder, data_root, most=most)
+    except TooManyRunsError as error:
+        raise TooManyRunsError(f"{plain(file)}: {error}") from error
     states = {key: store.state(key, thorough=verify) for key in dict.fromkeys(run.key for run in runs)}
     return Prepared(experiment, folder, runs, states)
 

@@ -4,24 +4,47 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import os
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scoring import MAX_GAP
-from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.files import FileModel, nearest, parse_model, read_toml
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
+from factorgraph_loc.files import DEEPEST, FileModel, check_content, nearest, parse_model, read_toml
+from factorgraph_loc.text import listed, plain, quoted
 from factorgraph_loc.ticks import LONGEST, SHORTEST, TICK_GAP
 
 SIMULATION = "simulation"  # the first word of settings of simulated logs
 METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")
+PATH, PART = 1000, 255  # bytes of a path, and of a name within it
+LONGEST_NAME = 200  # characters of the experiment's name, which is that of a folder
+MOST = 1000  # logs, estimators, sets of sensors and metrics that a file lists; globs and seeds make more of them
+MOST_SWEPT, MOST_VALUES = 50, 10_000  # swept settings, and values of one
 Name = Annotated[str, Field(min_length=1)]
-Seed = Annotated[int, Field(ge=0)]
+Seeds = Annotated[
+    tuple[Annotated[int, Field(ge=0, le=LARGEST_SEED)], ...], Field(min_length=1, max_length=MOST_SEEDS, fail_fast=True)
+]
 Scalar = str | int | float | bool
+
+
+def _is_scalar(value: Any) -> bool:
+    return isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
+
+
+def _path(text: str) -> str:
+    parts = [os.fsencode(part) for part in Path(text).parts]
+    if "\0" in text or len(os.fsencode(text)) > PATH or any(len(part) > PART for part in parts):
+        raise ValueError("expected a path that a file can have")
+    return text
+
+
+PathName = Annotated[Name, AfterValidator(_path)]
 
 
 def _seeds(value: Any) -> Any:
@@ -50,14 +73,14 @@ class LogEntry(FileModel):
     ``reader``, ``options`` of the reader, and files ``rig`` and ``world`` in place of the log's own; or ``simulate``, a preset or
     a TOML file, with changed ``settings`` and ``seeds``, a log of each."""
 
-    log: Name | None = None
+    log: PathName | None = None
     reader: Name | None = None
     options: dict[str, Any] = Field(default_factory=dict)
-    rig: Name | None = None
-    world: Name | None = None
-    simulate: Name | None = None
+    rig: PathName | None = None
+    world: PathName | None = None
+    simulate: PathName | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    seeds: Seeds = (0,)
 
     _parse_seeds = field_validator("seeds", mode="before")(_seeds)
 
@@ -98,29 +121,49 @@ class Sweep(FileModel):
             return content
         rest = {key: value for key, value in content.items() if key != "mode"}
         mode = {"mode": content["mode"]} if "mode" in content else {}
-        return mode | {"over": dict(_flat(rest))}
+        over = dict(_flat(rest))
+        if len(over) > MOST_SWEPT:
+            raise ValueError(f"{len(over):,} settings are swept over, expected at most {MOST_SWEPT}")
+        for key, values in over.items():
+            if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST_VALUES:
+                raise ValueError(f"{plain(key)} is {quoted(values)}, expected a list of 1 to {MOST_VALUES:,} values")
+            if wrong := [value for value in values if not _is_scalar(value)]:
+                raise ValueError(f"{plain(key)} has {quoted(wrong[0])}, expected text, finite numbers, true or false")
+        return mode | {"over": over}
 
     @model_validator(mode="after")
-    def _has_values(self) -> Sweep:
-        for key, values in self.over.items():
-            if not values:
-                raise ValueError(f"{key} has no values")
+    def _in_step(self) -> Sweep:
         if self.mode == "list" and len({len(values) for values in self.over.values()}) > 1:
             raise ValueError(f"a list needs as many values of each of {listed(self.over)}")
         return self
 
-    def points(self) -> list[dict[str, Scalar]]:
-        """What is set together, one after the other; one empty point if nothing is swept."""
+    def points(self, *words: str) -> list[dict[str, Scalar]]:
+        """What is set together of keys that begin with one of ``words``, by default of all, each once; one empty point if none
+        does."""
+        columns = self._columns(words)
         combined = (
-            zip(*self.over.values(), strict=True) if self.mode == "list" else itertools.product(*self.over.values())
+            self._rows(columns) if self.mode == "list" else itertools.product(*map(dict.fromkeys, columns.values()))
         )
-        return [dict(zip(self.over, values, strict=True)) for values in combined] or [{}]
+        return [dict(zip(columns, values, strict=True)) for values in combined]
+
+    def count(self, *words: str) -> int:
+        """How many :meth:`points` there are, which are not made for that."""
+        columns = self._columns(words)
+        if self.mode == "list":
+            return len(self._rows(columns))
+        return math.prod(len(set(values)) for values in columns.values())
+
+    def _columns(self, words: Sequence[str]) -> dict[str, Sequence[Scalar]]:
+        return {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
+
+    def _rows(self, columns: Mapping[str, Sequence[Scalar]]) -> Collection[tuple[Scalar, ...]]:
+        return dict.fromkeys(zip(*columns.values(), strict=True)) or [()]
 
 
 class ReportSettings(FileModel):
     """``metrics``: the scores that the report shows; ``baseline``: the label that the others are compared with."""
 
-    metrics: Annotated[tuple[Name, ...], Field(min_length=1)] = METRICS
+    metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = METRICS
     baseline: str | None = None
 
 
@@ -137,13 +180,16 @@ class Experiment(FileModel):
     estimates may lie between which the score interpolates; ``tick_gap`` [s]: gaps between measurements that are longer than this
     hold no estimates."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-    out: Name | None = None
-    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
-    estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1)]
-    sensors: tuple[tuple[Name, ...] | None, ...] = (None,)
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
+    out: PathName | None = None
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1, max_length=MOST, fail_fast=True)]
+    estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1, max_length=MOST, fail_fast=True)]
+    sensors: Annotated[
+        tuple[Annotated[tuple[Name, ...], Field(max_length=MOST, fail_fast=True)] | None, ...],
+        Field(max_length=MOST, fail_fast=True),
+    ] = (None,)
     prior: Name | None = None
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    seeds: Seeds = (0,)
     max_gap: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = MAX_GAP
     tick_gap: Annotated[float, Field(ge=SHORTEST, le=LONGEST)] = TICK_GAP
     sweep: Sweep = Sweep()
@@ -167,7 +213,7 @@ class Experiment(FileModel):
     @model_validator(mode="after")
     def _fits(self) -> Experiment:
         labels = [entry.shown for entry in self.estimators]
-        if twice := [label for label in labels if labels.count(label) > 1]:
+        if twice := [label for label, count in Counter(labels).items() if count > 1]:
             raise ValueError(f"two estimators are called {quoted(twice[0])}, expected a label of its own for each")
         known = {SIMULATION, *labels, *(entry.name for entry in self.estimators)}
         for key in self.sweep.over:
@@ -194,6 +240,7 @@ def read_experiment(path: Path, changes: Sequence[tuple[str, Any]] = ()) -> Expe
     content = read_toml(path)
     for key, value in changes:
         _change(content, key, value, path)
+    check_content(content, path)
     return parse_model(Experiment, content, path)
 
 
@@ -210,23 +257,37 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
     if first in Experiment.model_fields:
         _set(content, key, value, source)
         return
-    logs = [one for one in content.get("logs", []) if isinstance(one, dict) and "simulate" in one]
-    estimators = [{"name": one} if isinstance(one, str) else one for one in content.get("estimators", [])]
-    content["estimators"] = estimators
+    logs = [one for one in _tables(content, "logs", "log", source) if "simulate" in one]
+    estimators = _tables(content, "estimators", "name", source)
     chosen = logs if first == SIMULATION else [e for e in estimators if first in (e.get("label"), e.get("name"))]
     if not chosen or not rest:
         labels = [str(e.get("label", e.get("name"))) for e in estimators]
-        raise InputError(f"{source}: no key {key}{nearest(first, [*Experiment.model_fields, SIMULATION, *labels])}")
+        raise InputError(
+            f"{source}: no key {plain(key)}{nearest(first, [*Experiment.model_fields, SIMULATION, *labels])}"
+        )
     for entry in chosen:
         _set(entry, f"settings.{rest}", value, source)
 
 
+def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
+    """The entries of a list of the file, in place of names tables with the key ``named``."""
+    found = content.setdefault(key, [])
+    if not isinstance(found, list):
+        raise InputError(f"{source}: {key} is {quoted(found)}, expected a list")
+    found[:] = [{named: one} if isinstance(one, str) else one for one in found]
+    if wrong := [one for one in found if not isinstance(one, dict)]:
+        raise InputError(f"{source}: {key} has {quoted(wrong[0])}, expected names or tables")
+    return found
+
+
 def _set(table: dict[str, Any], key: str, value: Any, source: object) -> None:
     *parts, last = key.split(".")
+    if len(parts) >= DEEPEST:
+        raise InputError(f"{source}: {plain(key)} has {len(parts) + 1} parts, expected at most {DEEPEST}")
     for part in parts:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise InputError(f"{source}: no key {key}, as {part} is {quoted(table)}")
+            raise InputError(f"{source}: no key {plain(key)}, as {plain(part)} is {quoted(table)}")
     table[last] = value
 
 

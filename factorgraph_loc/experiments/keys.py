@@ -20,6 +20,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scoring import RULE
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.files import write_text
+from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
 # parts of the package that no run goes through: a change to the report must not undo a night's work
@@ -107,7 +108,11 @@ class FileDigests:
 
     def of_source(self, source: LogSource) -> str:
         """The digest of what a log is made from; InputError if a file is not there."""
-        files = {name: self.of_file(path) for name, path in source.files().items()}
+        try:
+            found = source.files()
+        except OSError as error:  # a folder that may not be looked into
+            raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
+        files = {name: self.of_file(path) for name, path in found.items()}
         return digest_of({"identity": source.identity(), "files": files})
 
     def of_file(self, path: Path) -> str:

@@ -8,10 +8,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.globs import is_pattern, matching
 from factorgraph_loc.files import inside, read_toml
 from factorgraph_loc.shipped import manifests
 from factorgraph_loc.text import quoted
@@ -86,7 +89,8 @@ class RecordedSource:
         beside = inside(path.parent, str(content["path"]), path).exists()  # one's own manifest, beside its log
         given = None if self.data_root is None else Path(self.data_root)
         root = path.parent if beside else find_data_root(given, path)
-        names = list(content.get("checksums", {})) or [str(content["path"])]
+        summed = content.get("checksums")
+        names = list(summed) if isinstance(summed, dict) and summed else [str(content["path"])]
         for name in names:
             data = inside(root, name, path)
             yield from _of_folder(data) if data.is_dir() else [(name, data)]
@@ -130,14 +134,12 @@ def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSou
     known = manifests()
     if name in known:
         return [RecordedSource(name, **others)]
-    if not any(c in name for c in "*?["):
+    if not is_pattern(name):
         # what is nothing at all is for the reader to tell, which knows the nearest name
-        is_path = (folder / name).exists() or Path(name).exists()
+        is_path = kind(folder / name) or kind(Path(name))
         return [RecordedSource(str(folder / name) if is_path else name, **others)]
-    found = [k for k in known if Path(k).match(name)]
-    pattern = Path(name)
-    base, below = (Path(pattern.anchor), str(pattern.relative_to(pattern.anchor))) if pattern.anchor else (folder, name)
-    found += [str(path) for path in sorted(base.glob(below)) if others.get("reader") or _is_log(path)]
+    found = [one for one in known if fnmatchcase(one, name)]
+    found += [str(path) for path in matching(name, folder, "logs") if others.get("reader") or _is_log(path)]
     if not found:
         raise InputError(
             f"no log matches {quoted(name)}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
@@ -171,7 +173,9 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
         met.add(file)
         yield file.relative_to(Path(path).parent).as_posix(), file
         if file.suffix in NAMING and file.is_file():
-            named = (file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text) < 200)
+            named = (
+                file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text.encode()) < 200
+            )
             waiting += [one for one in named if one.is_relative_to(Path(path).parent) and one.is_file()]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,8 @@ from factorgraph_loc.experiments.experiment_file import (
     EstimatorEntry,
     Experiment,
     LogEntry,
+    Scalar,
+    Sweep,
     canonical,
     nested,
 )
@@ -25,6 +28,8 @@ from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.run import RunConfig
+
+MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True)
@@ -76,36 +81,82 @@ class _PlannedLog:
     sensors: tuple[str, ...]
 
 
-def plan(experiment: Experiment, folder: Path, cache: Path, data_root: str | None = None) -> list[PlannedRun]:
+class TooManyRunsError(InputError):
+    """An experiment would have more runs than are to be planned."""
+
+
+def plan(
+    experiment: Experiment, folder: Path, cache: Path, data_root: str | None = None, *, most: int = MOST_RUNS
+) -> list[PlannedRun]:
     """All runs of an experiment whose paths start from ``folder``; what had to be looked up is kept below ``cache``.
 
     An estimator is not run again for values of a sweep that do not concern it, and one without randomness only with the first
     seed. InputError, before anything runs, for a log that cannot be read, two logs of one name, settings that are none, a prior
-    that is none, or a sensor that no log has.
+    that is none, or a sensor that no log has; TooManyRunsError, before any log is read, for more than ``most`` runs.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
-    points = experiment.sweep.points()
-    runs: list[PlannedRun] = []
+    sweep = experiment.sweep
     if experiment.prior is not None:
         facts.check_prior(experiment.prior)
+    recorded = {
+        place: _recorded(entry, folder, data_root)
+        for place, entry in enumerate(experiment.logs)
+        if entry.simulate is None
+    }
+    _check_count(_count(experiment, sum(map(len, recorded.values())), facts), most)
+    of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
+    of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
     for entry in experiment.estimators:
-        for point in points:
-            facts.estimator(entry.name, _settings(entry, point))  # a wrong setting is told before logs are read
-    met: set[str] = set()
-    for point in _unlike(points, (SIMULATION,)):
-        logs = [log for entry in experiment.logs for log in _logs(entry, point, folder, data_root, digests, facts)]
+        for swept in of_others[entry.shown]:
+            facts.estimator(entry.name, _settings(entry, swept))  # a wrong setting is told before logs are read
+    runs: dict[str, PlannedRun] = {}
+    of_recorded = {place: [*_logs(sources, digests, facts)] for place, sources in recorded.items()}
+    for point in sweep.points(SIMULATION):
+        simulated = tuple(point.values())
+        logs = [
+            log
+            for place, entry in enumerate(experiment.logs)
+            for log in (
+                of_recorded[place] if place in of_recorded else _logs(_simulated(entry, point, folder), digests, facts)
+            )
+        ]
         _check(logs, experiment.sensors)
         for log in logs:
             for entry in experiment.estimators:
-                concerned = (SIMULATION, entry.shown, entry.name) if _is_simulated(log) else (entry.shown, entry.name)
-                for swept in _unlike([p for p in points if _part(p, (SIMULATION,)) == point], concerned):
+                concerns = of_simulated[entry.shown][simulated] if _is_simulated(log) else of_others[entry.shown]
+                for swept in concerns:
                     for run in _runs(experiment, log, entry, swept, facts):
-                        if f"{run.label} {run.key}" not in met:
-                            met.add(f"{run.label} {run.key}")
-                            runs.append(run)
+                        runs.setdefault(f"{run.label} {run.key}", run)
+                _check_count(len(runs), most)
     digests.save()
     facts.save()
-    return runs
+    return list(runs.values())
+
+
+def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
+    """The number of runs on so many recorded sources, each of which is a log at least, and on the simulated logs."""
+    simulated = sum(len(entry.seeds) for entry in experiment.logs if entry.simulate is not None)
+    total = 0
+    for entry in experiment.estimators:
+        words = (entry.shown, entry.name)
+        logs = simulated * experiment.sweep.count(SIMULATION, *words) + recorded * experiment.sweep.count(*words)
+        seeds = 1 if facts.estimator(entry.name, {}).deterministic else len(experiment.seeds)
+        total += logs * seeds * len(experiment.sensors)
+    return total
+
+
+def _check_count(count: int, most: int) -> None:
+    if count > most:
+        shown = f"{count:,}" if count < 10**12 else f"{count:.1g}"
+        raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
+
+
+def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
+    """The points of a sweep that concern an estimator or simulated logs, by the values of the latter."""
+    found: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
+    for swept in sweep.points(SIMULATION, entry.shown, entry.name):
+        found.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
+    return found
 
 
 def _runs(
@@ -142,30 +193,30 @@ def _runs(
             )
 
 
-def _logs(
-    entry: LogEntry, point: Mapping[str, Any], folder: Path, data_root: str | None, digests: FileDigests, facts: Facts
-) -> Iterator[_PlannedLog]:
-    sources: Sequence[LogSource]
-    if entry.simulate is not None:
-        settings = json.loads(canonical(entry.settings))
-        for key, value in point.items():
-            _merge(settings, nested(key.partition(".")[2], value))
-        preset = entry.simulate
-        if preset.endswith(".toml"):
-            preset = str(folder / preset)
-        sources = [SimulatedSource(preset, canonical(settings), seed) for seed in entry.seeds]
-    else:
-        assert entry.log is not None
-        rig, world = (None if name is None else str(folder / name) for name in (entry.rig, entry.world))
-        sources = recorded_sources(
-            entry.log,
-            folder,
-            reader=entry.reader,
-            options=canonical(entry.options),
-            rig=rig,
-            world=world,
-            data_root=data_root,
-        )
+def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[RecordedSource]:
+    assert entry.log is not None
+    rig, world = (None if name is None else str(folder / name) for name in (entry.rig, entry.world))
+    return recorded_sources(
+        entry.log,
+        folder,
+        reader=entry.reader,
+        options=canonical(entry.options),
+        rig=rig,
+        world=world,
+        data_root=data_root,
+    )
+
+
+def _simulated(entry: LogEntry, point: Mapping[str, Any], folder: Path) -> list[SimulatedSource]:
+    assert entry.simulate is not None
+    settings = json.loads(canonical(entry.settings))
+    for key, value in point.items():
+        _merge(settings, nested(key.partition(".")[2], value))
+    preset = str(folder / entry.simulate) if entry.simulate.endswith(".toml") else entry.simulate
+    return [SimulatedSource(preset, canonical(settings), seed) for seed in entry.seeds]
+
+
+def _logs(sources: Sequence[LogSource], digests: FileDigests, facts: Facts) -> Iterator[_PlannedLog]:
     for first in sources:
         for number, found in enumerate(facts.logs(first, digests.of_source(first))):
             source = RecordedSource(**vars(first) | {"number": number}) if isinstance(first, RecordedSource) else first
@@ -193,23 +244,13 @@ def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
     return {key: value for key, value in point.items() if key.partition(".")[0] in words}
 
 
-def _unlike(points: Sequence[Mapping[str, Any]], words: Sequence[str]) -> list[dict[str, Any]]:
-    """The points, of each only what concerns ``words``, each once."""
-    kept: list[dict[str, Any]] = []
-    for point in points:
-        part = _part(point, words)
-        if part not in kept:
-            kept.append(part)
-    return kept
-
-
 def _is_simulated(log: _PlannedLog) -> bool:
     return isinstance(log.source, SimulatedSource)
 
 
 def _check(logs: Sequence[_PlannedLog], sensors: Sequence[tuple[str, ...] | None]) -> None:
     names = [log.name for log in logs]
-    if twice := [name for name in names if names.count(name) > 1]:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"two logs are called {twice[0]}, expected different names")
     known = list(dict.fromkeys(sensor for log in logs for sensor in log.sensors))
     for sensor in (one for several in sensors for one in several or ()):

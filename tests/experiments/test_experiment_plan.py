@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments import facts, keys
+from factorgraph_loc.experiments import facts, globs, keys
+from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
-from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
 from factorgraph_loc.readers import write_native
 
 
@@ -26,9 +27,9 @@ def logs(tmp_path, log):
 def planned(logs, tmp_path):
     """``planned(**content)``: the runs of an experiment with other keys than the usual ones."""
 
-    def make(**content):
+    def make(most=MOST_RUNS, **content):
         usual = {"name": "a", "logs": ["one", "two"], "estimators": ["dead_reckoning"]}
-        return plan(Experiment.model_validate(usual | content), logs, tmp_path)
+        return plan(Experiment.model_validate(usual | content), logs, tmp_path, most=most)
 
     return make
 
@@ -38,6 +39,69 @@ def test_a_glob_stands_for_all_logs_of_a_folder_and_for_known_names(planned):
     assert {run.log for run in planned(logs=["plaza*"])} == {"plaza1", "plaza2"}
     with pytest.raises(InputError, match=r"no log matches 'thre\*'"):
         planned(logs=["thre*"])
+
+
+@pytest.mark.parametrize(
+    ("glob", "found"),
+    [
+        ("./**", ["one", "two"]),
+        ("./*", ["one", "two"]),
+        ("../logs/t?o", ["two"]),
+        ("**/one", ["one"]),
+        ("./**/run.toml", ["one", "two"]),
+        ("../l*/one", ["one"]),
+    ],
+)
+def test_globs_go_through_folders(planned, glob, found):
+    assert [run.log for run in planned(logs=[glob])] == found
+
+
+@pytest.mark.parametrize("glob", ["**foo", "a**", "/".join(["*"] * 100), "[", "?" * 200, "*/" + "n" * 250])
+def test_a_glob_that_is_none_or_matches_nothing_is_one_line(planned, glob):
+    with pytest.raises(InputError, match=r"whole part|no log matches|at most 64"):
+        planned(logs=[glob])
+
+
+def test_a_glob_looks_at_so_many_files_and_no_more(planned, logs, monkeypatch):
+    monkeypatch.setattr(globs, "VISITED", 20)
+    for i in range(30):
+        (logs / f"x{i}").mkdir()
+    with pytest.raises(InputError, match="looks at more than"):
+        planned(logs=["**/nothing"])
+    assert len(planned(logs=["one"])) == 1
+
+
+def test_a_link_to_a_folder_above_ends_no_walk(planned, logs):
+    (logs / "loop").symlink_to(logs)
+    assert [run.log for run in planned(logs=["./**"])] == ["one", "two"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"estimators": ["particle_filter"], "seeds": range(10_000), "sensors": [["odometry"]] * 300},
+        {
+            "logs": [{"simulate": "office", "seeds": range(10_000)}],
+            "sweep": {"simulation.world.tags": list(range(10_000))},
+        },
+        {"sweep": {f"dead_reckoning.k{i}": list(range(10_000)) for i in range(50)}},
+        {"logs": ["one"] * 1000, "sweep": {"dead_reckoning.x": list(range(10_000))}},
+    ],
+)
+def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
+    monkeypatch.setattr(plan_module, "_runs", lambda *_: pytest.fail("was planned"))
+    monkeypatch.setattr(plan_module, "_logs", lambda *_: pytest.fail("a log was looked at"))
+    with pytest.raises(TooManyRunsError, match="more than 100,000"):
+        planned(**content)
+
+
+def test_what_is_not_run_again_does_not_count(planned):
+    sweep = {"short.lag": [1, 2, 3], "ekf.max_delay": [0.4, 0.5]}
+    estimators = ["ekf", {"name": "smoother", "label": "short"}, "dead_reckoning"]
+    content = {"estimators": estimators, "sweep": sweep, "seeds": [1, 2]}
+    assert len(planned(**content, most=12)) == 12
+    with pytest.raises(TooManyRunsError, match="plans 12 runs, more than 11"):
+        planned(**content, most=11)
 
 
 def test_seeds_are_for_estimators_that_are_random(planned):
