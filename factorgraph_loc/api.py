@@ -9,7 +9,6 @@ so a script that calls them needs the usual ``if __name__ == "__main__"``.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from factorgraph_loc.experiments.cluster import on_cluster
 from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
 from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.files import write_text
+from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers import Dataset, describe, load, read_log, write_log, write_native
 from factorgraph_loc.readers.native import require_new
@@ -38,6 +37,7 @@ from factorgraph_loc.rig import write_rig
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
 from factorgraph_loc.simulation import simulate as make_log
 from factorgraph_loc.simulation.recorded import RecordedLooks
+from factorgraph_loc.temporary import of_system, temporary_folder
 from factorgraph_loc.text import listed
 from factorgraph_loc.ticks import TICK_GAP
 from factorgraph_loc.vision.feature_evaluation import feature
@@ -203,12 +203,13 @@ def calibrate(
     rig, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = _all(logs)
     # learnt grids lie here until the rig is written: nothing is left of a calibration that fails
-    with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
-        grids = Path(folder) / rig.name.removesuffix(RIG)
+    with temporary_folder(of_system("grids")) as folder:
+        grids = folder / rig.name.removesuffix(RIG)
         found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
         try:
-            write_text(page, rig_report.page(found))
-            write_rig(found.rig, rig)
+            with replacing(page) as temporary:  # both are there or none
+                temporary.write_text(rig_report.page(found), encoding="utf-8")
+                write_rig(found.rig, rig)
         except OSError as error:
             raise InputError(f"{rig}: cannot be written: {error.strerror}") from error
     return found
@@ -353,6 +354,6 @@ def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder
     """The images go to a folder beside the log's first, so that there is a whole log or none."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside:
+    with temporary_folder(folder) as beside:
         workers = os.cpu_count() or 1
-        write_native(with_images(log, settings, seed, Path(beside), workers=workers, tell=progress), folder)
+        write_native(with_images(log, settings, seed, beside, workers=workers, tell=progress), folder)

@@ -4,7 +4,6 @@ import difflib
 import json
 import os
 import re
-import tempfile
 import tomllib
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted
 
 DEEPEST = 64  # tables or lists within each other, and parts of a key
@@ -171,17 +171,12 @@ def inside(root: Path, name: str, source: object) -> Path:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside ``path``; what is written to it takes the place of ``path`` when the block ends well."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    with temporary_file(path) as temporary:
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

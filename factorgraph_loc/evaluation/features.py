@@ -15,6 +15,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import COLOURS, grid, legend, save
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files import replacing, write_text
+from factorgraph_loc.temporary import sweep
 from factorgraph_loc.vision.feature_evaluation import Feature, RankedMatches, evaluate
 from factorgraph_loc.vision.matching import RATIO
 from factorgraph_loc.vision.sequences import OTHER, Sequence
@@ -96,6 +97,7 @@ def evaluate_all(
 
 def check_free(out: Path, *, overwrite: bool) -> None:
     """InputError if ``out`` is no folder to write to, or holds such results already."""
+    sweep(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is not a folder")
     if not overwrite and (there := [name for name in FILES if (out / name).exists()]):

@@ -32,6 +32,7 @@ from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.temporary import sweep
 from factorgraph_loc.text import quoted, told
 
 CHUNK = 10  # runs of one process: to start one takes longer than a run
@@ -244,9 +245,12 @@ def write_picture(figure: Any, path: Path) -> None:
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder, or holds results that may not be replaced. Parts of them may be there."""
+    """InputError if ``out`` is no folder, or holds results that may not be replaced. Parts of them may be there. What
+    earlier calls have left behind is removed."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
+    for folder in (out, out / PARTS, out / PLOTS):
+        sweep(folder)
     held = [name for name in FILES if (out / name).exists()]
     if held and not overwrite:
         raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,10 +31,12 @@ from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
 from factorgraph_loc.files import nearest, replacing, write_text
 from factorgraph_loc.log import Log
 from factorgraph_loc.processes import run_each
+from factorgraph_loc.temporary import sweep
 from factorgraph_loc.text import quoted
 from factorgraph_loc.ticks import check_tick_gap
 
 _ERROR = "error.txt"
+_BEGUN = "unfinished.txt"  # is there until a comparison is done, with a digest of what was asked for
 _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "report.html")
 
 
@@ -83,16 +87,19 @@ def compare(
     """
     configs = _without_needless_seeds(configs)
     _check(logs, configs)
-    _prepare(out, overwrite)
+    _prepare(out, overwrite, _asked(logs, configs))
     work = [_Job(log, config, _folder(out, log.name, config)) for log in logs for config in configs]
     for log in logs:
         if any(CAMERA in (config.sensors or log.rig.sensors) and takes_pixels(config.estimator) for config in configs):
             fill_cache(log)
     outcomes: dict[int, _Outcome | Exception] = {}
-    for i, outcome in run_each(_execute, work, jobs or os.cpu_count() or 1):
-        outcomes[i] = outcome
-        if progress is not None:
-            progress(len(outcomes), len(work))
+    try:
+        for i, outcome in run_each(_execute, work, jobs or os.cpu_count() or 1):
+            outcomes[i] = outcome
+            if progress is not None:
+                progress(len(outcomes), len(work))
+    finally:
+        _sweep(out)
     rows = [_row(job, outcomes[i]) for i, job in enumerate(work)]
     keys = list(dict.fromkeys(key for row in rows for key in row))
     rows = [{key: row.get(key) for key in keys} for row in rows]
@@ -106,6 +113,7 @@ def compare(
                 tracks.setdefault(job.config.estimator, outcome.track)  # the first seed stands for all
         if tracks:
             plot_log(log, tracks, out / "plots", file_name(log.name))
+    (out / _BEGUN).unlink(missing_ok=True)
     failed = [row for row in rows if row["status"] == "failed"]
     failures = [f"{r['log']}, {r['estimator']}, seed {r['seed']}: {r['reason']}" for r in failed]
     return Comparison(rows, failures, lines(rows))
@@ -156,25 +164,44 @@ def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
         raise InputError(f"{twice[0][0]} with seed {twice[0][1]} is given twice")
 
 
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder, or holds results that may not be replaced."""
+def _asked(logs: Sequence[Log], configs: Sequence[RunConfig]) -> str:
+    return hashlib.sha256(repr(([log.name for log in logs], configs)).encode()).hexdigest()[:16]
+
+
+def check_free(out: Path, *, overwrite: bool, asked: str | None = None) -> None:
+    """InputError if ``out`` is no folder, or holds results that may not be replaced: those of an unfinished comparison may, by the
+    same one, if it is known which is ``asked`` for. What earlier ones have left behind is removed."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
+    _sweep(out)
     held = [name for name in (*_TABLES, *FILES) if (out / name).exists()]
     held += [str(run.relative_to(out)) for run in _runs(out)]
-    if held and not overwrite:
+    try:
+        begun = (out / _BEGUN).read_text(encoding="ascii", errors="replace").split()[0]
+    except (OSError, IndexError):
+        begun = None
+    same = begun is not None and asked in (None, begun)
+    if held and not overwrite and not same:
         raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+
+
+def _sweep(out: Path) -> None:
+    for folder in (out.parent, out, out / "plots", *out.glob("runs/*/*")):
+        sweep(folder)
 
 
 def _runs(out: Path) -> list[Path]:
     return sorted(out.glob("runs/*/*/seed*"))
 
 
-def _prepare(out: Path, overwrite: bool) -> None:
+def _prepare(out: Path, overwrite: bool, asked: str) -> None:
     """Refuse what may not be replaced, remove what may: only files that an earlier comparison wrote."""
-    check_free(out, overwrite=overwrite)
+    check_free(out, overwrite=overwrite, asked=asked)
     try:
         out.mkdir(parents=True, exist_ok=True)
+        write_text(
+            out / _BEGUN, f"{asked} of a comparison that is not done; the same command makes it from its start\n"
+        )
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     for name in _TABLES:
@@ -183,6 +210,8 @@ def _prepare(out: Path, overwrite: bool) -> None:
     for folder in _runs(out):
         remove_run(folder)
         (folder / _ERROR).unlink(missing_ok=True)
+        with suppress(OSError):  # there is something of somebody else
+            folder.rmdir()
 
 
 def _folder(out: Path, log: str, config: RunConfig) -> Path:

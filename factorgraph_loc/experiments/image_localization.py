@@ -20,6 +20,7 @@ from factorgraph_loc.evaluation.figures import COLOURS, grid, legend, save
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files import replacing, write_text
 from factorgraph_loc.log import FeatureStream, Log
+from factorgraph_loc.temporary import sweep
 from factorgraph_loc.vision.frontend import with_features
 from factors.se2 import Array
 
@@ -129,6 +130,7 @@ def evaluate_images(
 
 def check_free(folder: Path, *, overwrite: bool) -> None:
     """InputError if a result is in ``folder`` already."""
+    sweep(folder)
     there = [name for name in FILES if (folder / name).exists()]
     if there and not overwrite:
         raise InputError(f"{folder / there[0]}: exists already; choose another folder or give --overwrite")

@@ -98,9 +98,9 @@ class MadeMap:
         """Write the map, and its picture beside it. InputError as of :func:`picture_beside`, or if they cannot be written."""
         picture = picture_beside(out, overwrite=overwrite)
         try:
-            with replacing(picture) as temporary:
+            with replacing(picture) as temporary:  # both are there or none
                 save(self.draw(), temporary)
-            write_world(self.world, out)
+                write_world(self.world, out)
         except OSError as error:
             raise InputError(f"{out}: cannot be written: {error.strerror}") from error
 

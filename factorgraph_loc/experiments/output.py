@@ -6,9 +6,8 @@ import io
 import json
 import math
 import re
-import shutil
-import tempfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.files import write_text, write_toml
 from factorgraph_loc.log import Log
+from factorgraph_loc.temporary import sweep, temporary_folder
 from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Trajectory, write_tum
 from factors.se2 import Array
@@ -62,19 +62,20 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     """
     check_free(out, overwrite=overwrite)
     scores = score(result, log)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    try:
-        write_files(result, log, scores, temporary)
-        remove_run(out)
-        out.mkdir(exist_ok=True)
-        for name in FILES:
-            (temporary / name).replace(out / name)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with ExitStack() as stack:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            content = stack.enter_context(temporary_folder(out)) / "run"  # its mode is that of any new folder
+            content.mkdir()
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+        write_files(result, log, scores, content)
+        if out.exists():
+            remove_run(out)
+            for name in FILES:
+                (content / name).replace(out / name)
+        else:
+            content.replace(out)
     return scores
 
 
@@ -112,6 +113,7 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
         raise InputError(f"--out is {quoted(str(out))}, expected a name that ends in {suffix}")
     if not out.parent.is_dir():
         raise InputError(f"--out is {quoted(str(out))}, but there is no folder {out.parent}")
+    sweep(out.parent)
     other = out.with_name(f"{name}{ending}")
     for path in (out, other):
         if path.exists() and not overwrite:
@@ -120,7 +122,10 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder, or holds the results of a run that may not be replaced."""
+    """InputError if ``out`` is no folder, or holds the results of a run that may not be replaced. What earlier attempts to write
+    there have left behind is removed."""
+    for folder in (out.parent, out, out / "plots"):
+        sweep(folder)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
     found = [name for name in FILES if (out / name).exists()]

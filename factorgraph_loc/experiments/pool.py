@@ -21,6 +21,7 @@ from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.processes import Child, ProcessDiedError, start
+from factorgraph_loc.temporary import of_system, sweep
 
 LOOK = 0.1  # s between looks at memory and time
 AGAIN = 0.5  # s after which a run that another process had claimed is asked for again
@@ -132,6 +133,7 @@ class _Pool:
         for w in self._workers:
             w.process.join()
         Store(self._folder).sweep()
+        sweep(of_system("").parent)
 
     def _start(self) -> _Worker:
         return _Worker(*start(worker.serve, self._folder, self._again))

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, Manifest, parse_stored
+from factorgraph_loc.temporary import sweep
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
@@ -46,6 +47,8 @@ class Store:
         with self._writing():
             for name in ("claims", "tmp"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
+        for folder in (self.folder.parent, self.folder):
+            sweep(folder)
         self.sweep()
 
     def sweep(self) -> None:

@@ -8,10 +8,8 @@ from __future__ import annotations
 import io
 import json
 import math
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -24,6 +22,7 @@ from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.output import COVARIANCES, FILES, write_files
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.log import Log
+from factorgraph_loc.temporary import of_system, temporary_folder
 from factorgraph_loc.trajectory import Trajectory
 
 
@@ -35,9 +34,9 @@ def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
     scores = score(result, log)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
     untimed = replace(result, timings=replace(result.timings, update_t=np.empty(0), update_ms=np.empty(0)))
-    with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
-        write_files(untimed, log, {k: v for k, v in scores.items() if k not in timings}, Path(folder))
-        files = {name: (Path(folder) / name).read_bytes() for name in FILES}
+    with temporary_folder(of_system("run")) as folder:
+        write_files(untimed, log, {k: v for k, v in scores.items() if k not in timings}, folder)
+        files = {name: (folder / name).read_bytes() for name in FILES}
     return files | {TIMINGS: timings_file(timings | {"timing.run_seconds": perf_counter() - started})}
 
 

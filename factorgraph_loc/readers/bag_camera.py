@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import shutil
-import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.bag_clock import Clock, Stamper
 from factorgraph_loc.readers.bag_fields import as_nanoseconds
 from factorgraph_loc.readers.bag_file import Bag, Stamped
+from factorgraph_loc.temporary import locked, sweep, temporary_folder
 from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory import Integers
 from factorgraph_loc.vision.feature_cache import cache_folder
@@ -35,6 +35,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 INDEX = "images.csv"
+LOCK = ".lock"  # held by who puts a folder of images into its place
 COLUMNS = ("row", "header", "received", "file")
 Pixels = NDArray[Any]
 _Row = tuple[int, int, int, str]  # number, stamp of the header [ns], receipt [ns], file
@@ -75,22 +76,20 @@ class Images:
         self._source = f"{bag.path} {name}"
         self._compressed = topic.type == COMPRESSED
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
-        self._rows: list[_Row] = []
         self._stamper = stamper
         self._t_ns: list[int] = []
-        self._temporary: Path | None = None
-        if (self._folder / INDEX).is_file():
-            self._rows = _read_index(self._folder)
-        self.known = bool(self._rows) and all((self._folder / file).is_file() for *_, file in self._rows)
-        if self.known:
-            self._t_ns = [stamper.heard(header, received) for _, header, received, _ in self._rows]
-        else:
-            self._rows = []
+        self._written: Path | None = None  # the folder that those which are read now are written to
+        self._held = ExitStack()
+        sweep(self._folder.parent)
+        self._rows = _read_whole(self._folder)
+        self.known = bool(self._rows)
+        self._t_ns = [stamper.heard(header, received) for _, header, received, _ in self._rows]
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        if self._temporary is None:
+        if self._written is None:
             self._folder.parent.mkdir(parents=True, exist_ok=True)
-            self._temporary = Path(tempfile.mkdtemp(prefix=".images.", dir=self._folder.parent))
+            self._written = self._held.enter_context(temporary_folder(self._folder)) / "images"
+            self._written.mkdir()
         where = f"{self._source}:{item.row}"
         if self._compressed:
             content = item.message.data.tobytes()
@@ -100,26 +99,29 @@ class Images:
         else:
             content, suffix = netpbm(item.message, where)
         file = f"{item.row:06d}{suffix}"
-        (self._temporary / file).write_bytes(content)
+        (self._written / file).write_bytes(content)
         self._rows.append((item.row, as_nanoseconds(item.message.header.stamp, 1), item.received, file))
         self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
         """The images by their stamps; those that were written now take their place in the cache folder."""
-        if self._temporary is not None:
-            with (self._temporary / INDEX).open("w", newline="", encoding="utf-8") as file:
+        if self._written is not None:
+            with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerows([COLUMNS, *self._rows])
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._temporary.replace(self._folder)
-            self._temporary = None
+            with locked(self._folder.parent / LOCK):
+                if not _read_whole(self._folder):  # else another process was faster, and may be using what it wrote
+                    if self._folder.exists():
+                        self._folder.rename(self._written.with_name("damaged"))
+                    self._written.rename(self._folder)
+            self.discard()
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
         keep = _last_of_each(self._source, rows, t_ns, warnings)
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
 
     def discard(self) -> None:
         """Leave nothing half-written behind."""
-        if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+        self._held.close()
+        self._written = None
 
 
 class Info:
@@ -193,13 +195,14 @@ def _key(path: Path, topic: str) -> str:
     return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
 
 
-def _read_index(folder: Path) -> list[_Row]:
-    """What the index says; nothing if it is damaged."""
+def _read_whole(folder: Path) -> list[_Row]:
+    """What the index says; nothing if it is damaged, or if an image is not there."""
     try:
         with (folder / INDEX).open(newline="", encoding="utf-8") as file:
-            return [
+            rows = [
                 (int(row["row"]), int(row["header"]), int(row["received"]), str(row["file"]))
                 for row in csv.DictReader(file)
             ]
     except (OSError, ValueError, KeyError, TypeError):
         return []
+    return rows if all((folder / file).is_file() for *_, file in rows) else []

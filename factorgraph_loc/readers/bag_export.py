@@ -4,8 +4,6 @@ log back; rig and map are no messages and go into files beside it."""
 from __future__ import annotations
 
 import heapq
-import shutil
-import tempfile
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +31,7 @@ from factorgraph_loc.readers.bag_poses import POINT
 from factorgraph_loc.readers.native import absolute
 from factorgraph_loc.readers.native_rfid import tables_of
 from factorgraph_loc.rig import write_rig
+from factorgraph_loc.temporary import sweep, temporary_folder
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import write_world
 from factors import se2
@@ -58,18 +57,16 @@ def write_bag(log: Log, path: Path) -> list[Path]:
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: is no name of a bag, expected one that ends with {', '.join(SUFFIXES)}")
     rig, world = path.with_suffix(".rig.toml"), path.with_suffix(".world.toml")
+    sweep(path.parent)
     for file in (path, rig, world):
         if file.exists():
             raise InputError(f"{file}: exists, expected a new file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
+    with temporary_folder(path) as temporary:
         made = _write(log, temporary, path.suffix)
         write_rig(log.rig, rig)
         write_world(log.world, world)
         made.replace(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return [path, rig, world]
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -40,6 +38,7 @@ from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.readers.tables import Table, read_table, write_table
 from factorgraph_loc.rfid_settings import RfidSettings
 from factorgraph_loc.rig import Rig, placed, read_rig, write_rig
+from factorgraph_loc.temporary import sweep, temporary_folder
 from factorgraph_loc.text import listed
 from factorgraph_loc.trajectory import Integers, Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.world import TAGS_SUFFIX, World, parse_world, read_world, write_world
@@ -215,18 +214,16 @@ def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"]
     folder = Path(folder)
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        content = temporary / "log"  # its mode is that of any new folder, mkdtemp's own is private
+    with temporary_folder(folder) as temporary:
+        content = temporary / "log"  # its mode is that of any new folder, the other's is private
         content.mkdir()
         write_files(log, content, format)
         content.replace(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def require_new(folder: Path) -> None:
-    """InputError if ``folder`` holds something."""
+    """InputError if ``folder`` holds something; what earlier attempts to write it have left beside it is removed."""
+    sweep(folder.parent)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
 

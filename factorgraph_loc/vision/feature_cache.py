@@ -66,8 +66,8 @@ class FeatureCache:
 
     def trim(self) -> None:
         """Remove what was not used for longest, until the rest is within the limit."""
-        files = []
-        for path in self._folder.glob("*/*"):
+        files = []  # but for those that are being written
+        for path in self._folder.glob("*/[!.]*"):
             try:
                 status = path.stat()
             except OSError:  # another process removed it

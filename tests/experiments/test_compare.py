@@ -79,3 +79,30 @@ def test_bad_input_is_found_before_anything_runs(log, tmp_path):
         with pytest.raises(InputError, match=message):
             compare(logs, configs, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_same_comparison_may_be_made_again_where_it_was_interrupted(log, tmp_path):
+    out = tmp_path / "out"
+    configs = [RunConfig("dead_reckoning", prior="reference"), RunConfig("ekf", prior="reference")]
+
+    def interrupt(done, _):
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare([log], configs, out, progress=interrupt)
+    assert len(list(out.glob("runs/*/*/seed*"))) >= 1
+    with pytest.raises(InputError, match="holds results already"):
+        compare([log], configs[:1], out)
+    compare([log], configs, out)
+    assert not (out / "unfinished.txt").exists()
+    with pytest.raises(InputError, match="holds results already"):
+        compare([log], configs, out)
+
+
+def test_what_a_killed_run_has_left_beside_its_place_is_removed(log, tmp_path):
+    place = tmp_path / "out/runs/straight/ekf"
+    (place / ".seed0.fgloc-0123abcd").mkdir(parents=True)
+    (place / ".seed0.fgloc-0123abcd" / "final.tum").write_text("half")
+    compare([log], [RunConfig("dead_reckoning", prior="reference")], tmp_path / "out")
+    assert list(place.iterdir()) == []

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from rosbag_drive import MS, T0, add_frames, transform
 
+from factorgraph_loc.readers.bag_camera import Images
 from factors.reprojection import mounting
 
 
@@ -50,6 +51,23 @@ def test_images_without_loss(maker, read_drive, one):
     assert [file.stat().st_mtime_ns for file in again.file] == before  # were not written again
     images.file[2].unlink()
     assert one(maker.path, reader="rosbag", options=options).streams["camera"].file[2].is_file()
+
+
+def test_images_that_another_process_has_written_meanwhile_are_left_as_they_are(maker, read_drive, one, monkeypatch):
+    add_image(maker, T0, np.zeros((4, 4)), "mono8")
+    options = {"odometry": {"topic": "/odom"}, "camera": {"topic": "/camera/image_raw"}}
+    stream, seen = Images.stream, []
+
+    def late(images, *args):
+        monkeypatch.setattr(Images, "stream", stream)
+        (file,) = one(maker.path, reader="rosbag", options=options).streams["camera"].file
+        seen.append((file, file.stat().st_ino))
+        return stream(images, *args)
+
+    monkeypatch.setattr(Images, "stream", late)
+    (file,) = read_drive(maker, camera={"topic": "/camera/image_raw"}).streams["camera"].file
+    assert [(file, file.stat().st_ino)] == seen
+    assert sorted(path.name for path in file.parent.parent.iterdir()) == [".lock", file.parent.name]
 
 
 def test_a_bayer_pattern_becomes_colour(maker, read_drive):
