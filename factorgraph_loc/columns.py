@@ -136,6 +136,7 @@ def _name(name: str, doc: str, kind: Literal["name", "file"] = "name") -> Column
 
 
 STAMP = Column("t_ns", "stamp", STAMPS, -LATEST, LATEST, False, "when it was, by the sensor's clock")
+SECONDS = replace(STAMP.in_unit("s")[0], name="t", kind="number")
 LANDMARK = _name("landmark", "the name of a landmark")
 ANTENNA = _name("antenna", "the name of an antenna")
 
@@ -180,6 +181,7 @@ BEARING_RANGE = Table(
 )
 # radios that got no answer say 0, and gross errors may lie below: no measurement then
 MEASURED_RANGE = replace(BEARING_RANGE["range"], low=NEAREST)
+AGE = _number("age", DURATION, 0.0, 3600.0, "how long before the end of its round a tag was read")
 RFID = Table(
     "rfid",
     (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import InputError, RunFailedError, bad_field
 from factorgraph_loc.estimators import registry
 from factorgraph_loc.estimators.base import (
     Belief,
@@ -26,12 +26,11 @@ from factorgraph_loc.estimators.base import (
 )
 from factorgraph_loc.estimators.guarded import Guard, sound, sound_trajectory
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
-from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
-from factorgraph_loc.files import nearest
-from factorgraph_loc.measurements import Exteroceptive, IncrementOdometry, Odometry, Tick
-from factorgraph_loc.pushed import ALL_SENSORS, RfidRead, checked, numbers, scan_of, sensor_of
+from factorgraph_loc.live_start import prior_of, require_options, usable_sensors
+from factorgraph_loc.measurements import CameraFrame, Exteroceptive, IncrementOdometry, Odometry, Tick
+from factorgraph_loc.pushed import RfidRead, checked, scan_of, seconds_of, sensor_of
 from factorgraph_loc.rig import Rig
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import plain
 from factorgraph_loc.ticks import Ticks
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import World
@@ -73,12 +72,11 @@ class Localizer:
         history: float = HISTORY,
         seed: int = 0,
     ) -> None:
-        if not history > 0.0:
-            raise InputError(f"history is {quoted(history)}, expected more than 0 s")
+        require_options(rig, world, settings, history, seed)
         self._rig, self._world, self._name = rig, world or World(), estimator
         default = {"lag": LAG} if estimator == "smoother" else {}
         self._settings = registry.settings_of(estimator, default | dict(settings or {}))
-        self._sensors = _sensors(rig, sensors)
+        self._sensors = usable_sensors(rig, sensors)
         self._history, self._seed = history, seed
         self._lock = threading.Lock()
         self._image_lock = threading.Lock()
@@ -97,7 +95,7 @@ class Localizer:
         InputError if these are no pose, or if the estimator cannot begin from an unknown one; RunFailedError if it cannot begin
         there. All goes on as before then.
         """
-        start = None if pose is None else _start(pose, covariance, t)
+        start = None if pose is None else prior_of(pose, covariance, t)
         setup = registry.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
         guard = Guard(self._name)
         with guard:
@@ -137,6 +135,7 @@ class Localizer:
         Its features are looked for in the calling thread, while other measurements go on: it arrives late by the time that takes.
         InputError as of :meth:`push`, or if it is no such image.
         """
+        t = seconds_of("image", t)
         if self._rig.camera is None:
             raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
         if CAMERA not in self._sensors or not takes_pixels(self._name):
@@ -206,6 +205,7 @@ class Localizer:
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
         self._newest = self._newest_increment = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # nothing has changed since
+        self._widths: dict[str, int] = {}  # of descriptors, by their feature
 
     def _require_whole(self) -> None:
         if self._failure is not None:
@@ -225,6 +225,8 @@ class Localizer:
             return
         m = replace(m, t=m.t + self._rig.time_offset(sensor))
         self._check_stamp(m)
+        if isinstance(m, CameraFrame) and len(m.pixels):
+            self._check_width(m)
         self._newest, self._last = max(self._newest, m.t), None
         try:
             self._feed(estimator, m)
@@ -267,15 +269,23 @@ class Localizer:
                 )
             self._newest_increment = m.t
 
+    def _check_width(self, m: CameraFrame) -> None:
+        """InputError if descriptors are of another length than the map's, or those that came first."""
+        width = m.descriptors.shape[1]
+        points = self._world.points
+        if points is not None and points.feature == m.feature:
+            self._widths[m.feature] = points.descriptors.shape[1]
+        if width != self._widths.setdefault(m.feature, width) or not width:
+            expected = f"{self._widths[m.feature]} numbers each, as those of {plain(m.feature)} before"
+            raise bad_field(f"CameraFrame at {m.t:.3f} s", "length of descriptors", width, expected)
+
     def _is_under_way(self, t: float) -> bool:
         """Whether there is something to tell of ``t``: it is not before the start, nor before the first measurement."""
         return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:
         self._require_whole()
-        if t is not None and not math.isfinite(t):
-            raise InputError(f"t is {quoted(t)}, expected a finite number of seconds")
-        at = self._newest if t is None else max(self._newest, t)
+        at = self._newest if t is None else max(self._newest, seconds_of("estimate()", t))
         if self._last is not None and self._last.t == at:
             return copy.deepcopy(self._last)
         if self._estimator is None or not math.isfinite(self._newest) or not self._is_under_way(at):
@@ -303,34 +313,3 @@ class Localizer:
         for residuals in found.residuals.values():
             del residuals[:-ROWS_KEPT]
         del found.events[:-ROWS_KEPT]
-
-
-def _sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The sensors that may be used: without those that need a camera if there is none."""
-    if asked is None:
-        asked = rig.sensors
-    for name in asked:
-        if name not in ALL_SENSORS:
-            raise InputError(f"no sensor is called {quoted(name)}{nearest(name, list(ALL_SENSORS))}")
-    return tuple(name for name in asked if rig.camera is not None or not name.startswith((CAMERA, "sightings")))
-
-
-def _start(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
-    """The Gaussian to begin from; its time is NaN where none is given."""
-    mean = numbers("initialize()", "pose", pose)
-    if mean.shape != (3,) or not np.all(np.isfinite(mean[:2])) or np.isinf(mean[2]):
-        raise InputError(f"pose is {mean.tolist()}, expected finite x, y [m] and heading [rad], which may be NaN")
-    size = 2 if np.isnan(mean[2]) else 3
-    if covariance is None:
-        covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA))[:size])
-    spread = numbers("initialize()", "covariance", covariance)
-    if (
-        spread.shape != (size, size)
-        or not np.allclose(spread, spread.T)
-        or not np.all(np.linalg.eigvalsh(spread) > 0.0)
-    ):
-        raise InputError(f"covariance is {spread.tolist()}, expected ({size}, {size}), symmetric and positive definite")
-    if t is not None and not math.isfinite(t):
-        raise InputError(f"t is {quoted(t)}, expected a finite number of seconds")
-    at = math.nan if t is None else float(t)
-    return PosePrior(at, mean, spread) if size == 3 else PosePrior.at_position(at, mean[:2], spread)

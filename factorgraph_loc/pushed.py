@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -10,6 +11,20 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.columns import (
+    AGE,
+    BEARING_RANGE,
+    FEATURES,
+    IMU,
+    INCREMENTS,
+    MEASURED_RANGE,
+    RFID,
+    SECONDS,
+    SIGHTINGS,
+    TWIST,
+    VELOCITIES,
+    Column,
+)
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.measurements import (
     BearingRange,
@@ -23,7 +38,7 @@ from factorgraph_loc.measurements import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import listed, plain
 from factors.se2 import Array
 
 M = TypeVar("M", bound=Odometry | Exteroceptive)
@@ -41,9 +56,19 @@ SENSORS: dict[type, str] = {
 ALL_SENSORS = (*dict.fromkeys(SENSORS.values()), "sightings_right", "rssi", "phase")
 # fields that name something, of which each has a row in the fields that are not numbers of their own
 NAMES: dict[type, str] = {BearingRange: "landmarks", RfidScan: "tags", PixelSightings: "points"}
-MAY_LACK = ("range", "bearing", "rssi", "phase", "frequency")  # NaN: not measured
-ABOVE_ZERO = ("range", "frequency")
-WIDTHS = {"pixels": 2}
+# fields that hold numbers, and their bounds
+COLUMNS: dict[type, dict[str, Column]] = {
+    VelocityOdometry: {name: VELOCITIES[name] for name in ("v", "w")},
+    IncrementOdometry: {name: INCREMENTS[name] for name in ("dx", "dy", "dtheta")},
+    YawRate: {"w": IMU["w"]},
+    Twist: {name: TWIST[name] for name in ("v", "w")},
+    BearingRange: {"range": MEASURED_RANGE, "bearing": BEARING_RANGE["bearing"]},
+    RfidScan: {"age": AGE} | {name: RFID[name] for name in ("rssi", "phase", "frequency")},
+    PixelSightings: {"pixels": SIGHTINGS["u"]},
+    CameraFrame: {name: FEATURES[name] for name in ("pixels", "sizes")},
+}
+NUMBER = (int, float, np.integer, np.floating)
+BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 
 
 @dataclass(frozen=True)
@@ -73,18 +98,28 @@ def sensor_of(m: Odometry | Exteroceptive) -> str:
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
     """The scan of rounds that ended at ``t``, in which ``antennas`` listened; InputError if a read is of another antenna, or of
-    another one's round."""
-    names, rows = tuple(antennas), tuple(reads)
+    another one's round, or is none."""
+    t = seconds_of("RfidScan", t)
+    where = f"RfidScan at {t:.3f} s"
+    names = _names(where, "antennas", _listed(where, "antennas", antennas))
+    rows = _listed(where, "reads", reads)
+    for read in rows:
+        if not isinstance(read, RfidRead):
+            raise bad_field(where, "read", read, "an RfidRead")
     return RfidScan(
         t,
         names,
-        _rounds(f"RfidScan at {t:.3f} s", t, names, rows),
+        _rounds(where, t, names, rows),
         tuple(read.epc for read in rows),
-        np.array([0.0 if read.t is None else t - read.t for read in rows]),
-        np.array([read.rssi for read in rows]),
-        np.array([read.phase for read in rows]),
-        np.array([read.frequency for read in rows]),
+        np.array([0.0 if read.t is None else t - seconds_of(where, read.t, "time of a read") for read in rows]),
+        *(numbers(where, name, [getattr(read, name) for read in rows]) for name in ("rssi", "phase", "frequency")),
     )
+
+
+def _listed(where: str, field: str, values: object) -> tuple[Any, ...]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise bad_field(where, field, values, "a list of them")
+    return tuple(values)
 
 
 def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
@@ -95,18 +130,20 @@ def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRe
     """
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
-        if read.antenna not in names:
+        if not isinstance(read.antenna, str) or read.antenna not in names:
             raise bad_field(where, "antenna", read.antenna, f"one that listened: {listed(names)}")
+        if not isinstance(read.epc, str):
+            raise bad_field(where, "epc", read.epc, RFID["epc"].doc)
         if read.round is None:
             continue
         own = [k for k, name in enumerate(names) if name == read.antenna]
-        if read.round not in own:
-            expected = f"one of antenna {read.antenna}: {listed(own)}"
+        if not isinstance(read.round, (int, np.integer)) or read.round not in own:
+            expected = f"one of antenna {plain(read.antenna)}: {listed(own)}"
             raise bad_field(where, "round", read.round, expected)
         out[i] = read.round
     taken = {(read.epc, int(k)) for read, k in zip(reads, out, strict=True) if k >= 0}
     untold = [i for i in range(len(reads)) if out[i] < 0]
-    for i in sorted(untold, key=lambda i: t if (at := reads[i].t) is None else at):
+    for i in sorted(untold, key=lambda i: t if (at := reads[i].t) is None else seconds_of(where, at, "time of a read")):
         mine = [k for k, name in enumerate(names) if name == reads[i].antenna]
         out[i] = next((k for k in mine if (reads[i].epc, k) not in taken), mine[-1])
         taken.add((reads[i].epc, int(out[i])))
@@ -116,31 +153,80 @@ def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRe
 def checked(m: M) -> M:
     """The same measurement with arrays of its own; InputError names the first field that cannot be, its value, and what can."""
     sensor_of(m)
-    if not isinstance(m.t, (int, float, np.number)) or not math.isfinite(m.t):
-        raise bad_field(type(m).__name__, "t", m.t, "a finite number of seconds")
-    where = f"{type(m).__name__} at {m.t:.3f} s"
-    names: Sequence[str] | None = getattr(m, NAMES[type(m)]) if type(m) in NAMES else None
-    count = len(m.pixels) if isinstance(m, CameraFrame) else None if names is None else len(names)
-    new: dict[str, Any] = {"t": float(m.t)}
+    kind = type(m)
+    t = seconds_of(kind.__name__, m.t)
+    where = f"{kind.__name__} at {t:.3f} s"
+    new: dict[str, Any] = {"t": t}
+    count = None
+    if kind in NAMES:
+        new[NAMES[kind]] = _names(where, NAMES[kind], getattr(m, NAMES[kind]))
+        count = len(new[NAMES[kind]])
+    elif isinstance(m, CameraFrame):
+        new["pixels"] = numbers(where, "pixels", m.pixels)
+        if new["pixels"].ndim != 2:
+            raise InputError(f"{where}: pixels has shape {new['pixels'].shape}, expected (K, 2)")
+        count = len(new["pixels"])
     for field in fields(m):
-        value = getattr(m, field.name)
-        if field.name in ("t", "feature", "right"):
-            continue
-        if field.name in ("landmarks", "tags", "points", "antennas"):
-            new[field.name] = _names(where, field.name, value)
-        elif field.name in ("antenna", "tracks"):
-            new[field.name] = _integers(where, field.name, value, count)
-        elif field.name == "descriptors":
-            new[field.name] = _descriptors(where, value, count)
-        elif count is not None:
-            new[field.name] = _column(where, field.name, value, count)
-        elif isinstance(m, Twist):
-            new[field.name] = _finite(where, field.name, _shaped(where, field.name, value, (3,)))
-        else:
-            new[field.name] = float(_finite(where, field.name, _shaped(where, field.name, value, ())))
-    if isinstance(m, RfidScan):
-        _check_rounds(where, m, new["antenna"], new["age"])
+        name, value = field.name, getattr(m, field.name)
+        if name in COLUMNS[kind]:
+            shape = (3,) if kind is Twist else () if count is None else (count, 2) if name == "pixels" else (count,)
+            new[name] = _within(where, COLUMNS[kind][name], name, value, shape)
+        elif name == "antennas":
+            new[name] = _names(where, name, value)
+        elif name in ("antenna", "tracks"):
+            new[name] = _integers(where, name, value, count)
+        elif name == "descriptors":
+            new[name] = _descriptors(where, value, count, getattr(m, "feature", ""))
+        elif name == "feature" and not isinstance(value, str):
+            raise bad_field(where, name, value, "the name of a feature")
+        elif name == "right":
+            new[name] = _truth(where, name, value)
+        if isinstance(m, RfidScan) and name == "antenna":
+            _check_rounds(where, m, new[name])
     return replace(m, **new)
+
+
+def seconds_of(where: str, value: object, name: str = "t") -> float:
+    """A time [s]; InputError if it is none, or is further away than stamps can be."""
+    found = math.nan
+    if isinstance(value, NUMBER) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):
+            found = float(value)
+    if SECONDS.outside(np.array(found)):
+        raise bad_field(where, name, value, SECONDS.expected)
+    return found
+
+
+def numbers(where: str, field: str, value: object) -> Array:
+    """A new array of ``value``; InputError if it is not of real numbers."""
+    try:
+        found = np.array(value)
+        if found.dtype.kind == "O" and all(
+            isinstance(item, NUMBER) and not isinstance(item, bool) for item in found.flat
+        ):
+            found = found.astype(float)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, whole numbers of hundreds of digits
+        raise bad_field(where, field, value, "numbers") from None
+    if found.dtype.kind not in "iuf" and found.size:
+        raise bad_field(where, field, value, "numbers")
+    return np.asarray(found, dtype=float)
+
+
+def _within(where: str, column: Column, field: str, value: object, shape: tuple[int, ...]) -> Any:
+    """Numbers of a shape within the bounds of their column: a float where the shape is ()."""
+    found = numbers(where, field, value)
+    if found.shape != shape:
+        raise InputError(f"{where}: {field} has shape {found.shape}, expected {shape}")
+    if (bad := column.outside(found)).any():
+        lack = ", or NaN where not measured" if column.may_lack else ""
+        raise bad_field(where, field, float(found[bad].flat[0]), column.expected + lack)
+    return found if shape else float(found)
+
+
+def _truth(where: str, field: str, value: object) -> bool:
+    if not isinstance(value, (bool, np.bool_)):
+        raise bad_field(where, field, value, "True or False")
+    return bool(value)
 
 
 def _names(where: str, field: str, value: object) -> tuple[str, ...]:
@@ -150,54 +236,26 @@ def _names(where: str, field: str, value: object) -> tuple[str, ...]:
 
 
 def _integers(where: str, field: str, value: object, count: int | None) -> Any:
-    found = np.asarray(value)
-    if found.shape != (count,) or (count and found.dtype.kind not in "iu"):
+    found = numbers(where, field, value)
+    if found.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, field, value, f"{count} whole numbers")
+    if (bad := FEATURES["tracks"].outside(found)).any():
+        raise bad_field(where, field, float(found[bad][0]), FEATURES["tracks"].expected)
     return found.astype(np.int64)
 
 
-def _descriptors(where: str, value: object, count: int | None) -> Any:
-    rows = np.array(value)
+def _descriptors(where: str, value: object, count: int | None, feature: str) -> Any:
+    """Descriptors (K, D), bytes of a feature that is compared by bits."""
+    rows = numbers(where, "descriptors", value)
     if rows.ndim != 2 or len(rows) != count:
         raise InputError(f"{where}: descriptors has shape {rows.shape}, expected ({count}, D)")
-    return rows
+    binary = feature == "orb"
+    column = BYTE if binary else FEATURES["descriptors"]
+    if (bad := column.outside(rows)).any():
+        raise bad_field(where, "descriptors", float(rows[bad][0]), column.expected)
+    return rows.astype(np.uint8 if binary else np.float32)
 
 
-def _column(where: str, field: str, value: object, count: int) -> Array:
-    """Numbers (N,), or (N, 2) of pixels."""
-    width = WIDTHS.get(field)
-    column = _shaped(where, field, value, (count,) if width is None else (count, width))
-    known = column[~np.isnan(column)] if field in MAY_LACK else column
-    _finite(where, field, known)
-    if field in ABOVE_ZERO and np.any(known <= 0.0):
-        raise bad_field(where, field, float(known[known <= 0.0][0]), "more than 0, NaN where not measured")
-    return column
-
-
-def numbers(where: str, field: str, value: object) -> Array:
-    """A new array of ``value``; InputError if it is not of numbers."""
-    try:
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: {field} is {' '.join(repr(value).split())}, expected numbers") from None
-
-
-def _shaped(where: str, field: str, value: object, shape: tuple[int, ...]) -> Array:
-    found = numbers(where, field, value)
-    if found.shape != shape:
-        raise InputError(f"{where}: {field} has shape {found.shape}, expected {shape}")
-    return found
-
-
-def _finite(where: str, field: str, values: Array) -> Array:
-    bad = values[~np.isfinite(values)]
-    if bad.size:
-        raise bad_field(where, field, float(bad.flat[0]), "a finite number")
-    return values
-
-
-def _check_rounds(where: str, m: RfidScan, antenna: Any, age: Any) -> None:
+def _check_rounds(where: str, m: RfidScan, antenna: Any) -> None:
     if np.any((antenna < 0) | (antenna >= len(m.antennas))):
         raise bad_field(where, "antenna", antenna.tolist(), f"places in its {len(m.antennas)} antennas, from 0")
-    if np.any(age < 0.0):
-        raise bad_field(where, "age", float(age.min()), "a read that is not after the end of its round")

@@ -42,7 +42,10 @@ BAD = [
     (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
     (IncrementOdometry(1.0, 0.0, math.inf, 0.0), r"dy is inf, expected a finite number"),
     (Twist(1.0, np.zeros(2), np.zeros(3)), r"Twist at 1.000 s: v has shape \(2,\), expected \(3,\)"),
-    (BearingRange(1.0, ("a",), -ONE, ONE), r"range is -1.0, expected more than 0, NaN where not measured"),
+    (
+        BearingRange(1.0, ("a",), -ONE, ONE),
+        r"range is -1.0, expected a finite number of m in 0.001 to 100000, or NaN where",
+    ),
     (BearingRange(1.0, ("a", "b"), ONE, ONE), r"range has shape \(1,\), expected \(2,\)"),
     (BearingRange(1.0, "ab", ONE, ONE), r"landmarks is 'ab', expected names"),
     (PixelSightings(1.0, ("a",), np.array(((math.nan, 1.0),))), r"pixels is nan, expected a finite number"),
@@ -52,7 +55,7 @@ BAD = [
     ),
     (
         RfidScan(1.0, ("a",), np.array([0]), ("e",), -ONE, ONE, ONE, ONE),
-        r"age is -1.0, expected a read that is not after",
+        r"age is -1.0, expected a finite number of seconds in 0 to 3600",
     ),
     (RfidScan(1.0, ("a",), ONE, ("e",), ONE, ONE, ONE, ONE), r"antenna is array\(\[1.\]\), expected 1 whole numbers"),
     (

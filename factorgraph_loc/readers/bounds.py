@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.columns import (
+    AGE,
     BEARING_RANGE,
-    DURATION,
     IMU,
     INCREMENTS,
     MAX_SPAN,
@@ -39,7 +39,6 @@ from factorgraph_loc.log import (
 from factors.se2 import Array
 
 ROUNDING = 1e-9  # as a share: of a value that was multiplied with its unit
-AGE = Column("age", "number", DURATION, 0.0, 3600.0, False, "how long before the end of its round a tag was read")
 COLUMNS: dict[type, tuple[Column, ...]] = {
     VelocityStream: VELOCITIES.columns[1:],
     IncrementStream: INCREMENTS.columns[1:],

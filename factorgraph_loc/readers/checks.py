@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph_loc.columns import STAMP
+from factorgraph_loc.columns import SECONDS
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.log import BearingRangeStream, Log
 from factorgraph_loc.trajectory import Integers
@@ -87,7 +87,7 @@ def sightings_in_order(
 
 def stamps(source: object, rows: Integers, t: Array, *, per_second: float = 1e9) -> Integers:
     """Stamps (N,) [s] in nanoseconds, in whole steps of which a second has ``per_second``; InputError beyond 64 bits."""
-    STAMP.in_unit("s")[0].require(source, rows, t, "time")
+    SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * per_second).astype(np.int64) * round(1e9 / per_second))
 
 
