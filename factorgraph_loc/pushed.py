@@ -117,9 +117,13 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 
 
 def _listed(where: str, field: str, values: object) -> tuple[Any, ...]:
-    if isinstance(values, str) or not isinstance(values, Iterable):
+    found = None
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        with contextlib.suppress(TypeError):  # an array without rows
+            found = tuple(values)
+    if found is None:
         raise bad_field(where, field, values, "a list of them")
-    return tuple(values)
+    return found
 
 
 def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
