@@ -21,10 +21,10 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.text import plain, quoted, told
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
-YAML = 2**20  # bytes of a YAML file, which takes a hundred times as long to read
+YAML = 2**16  # bytes of a YAML file, which takes a hundred times as long to read
 DATA = 2**30  # bytes of a table, a text or a MATLAB file, as it is and unpacked
 IMAGE = 2**28  # bytes of an image's file
-GRID = 2**28  # bytes of a grid, unpacked
+GRID = 2**26  # bytes of a grid, unpacked
 PIXELS = 2**26  # of an image; OpenCV itself would take 2^30 of them
 CELLS = 2**27  # rows times columns of a Parquet file
 RATIO = 1000  # cells that a byte of a Parquet file may stand for

@@ -6,7 +6,6 @@ CSV with any separator, with a header or without, or JSON lines. Only text is re
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from pydantic import Field
 from factorgraph_loc.columns import LATEST, Column, require_span
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, nearest, read_text
+from factorgraph_loc.files import FileModel, nearest, parse_json, read_text
 from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array
 
@@ -250,10 +249,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
 
 
 def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:
-    try:
-        content = json.loads(line)
-    except ValueError as error:
-        raise InputError(f"{path}:{row}: is not JSON, expected an object in each line: {told(error)}") from error
+    content = parse_json(line, f"{path}:{row}")
     entries = content if isinstance(content, list) else [content]
     if not all(isinstance(entry, dict) for entry in entries):
         raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)

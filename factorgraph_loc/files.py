@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.temporary import temporary_file
-from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted
+from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
 
 DEEPEST = 64  # tables or lists within each other, and parts of a key
 MANY = 1000  # names that a misspelt one is compared to: each takes its time
@@ -94,8 +94,12 @@ def read_json(path: Path) -> Any:
 
 def parse_json(text: str, source: object) -> Any:
     """The value of a text in JSON; InputError as of :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
-    with bounded.foreign(source, "is not JSON"):
+    try:  # there may be a million lines of it: bounded.foreign takes longer
         content = _JSON.decode(text)
+    except RecursionError as error:
+        raise InputError(f"{source}: is not JSON: it is nested too deep") from error
+    except ValueError as error:
+        raise InputError(f"{source}: is not JSON: {told(error)}") from error
     if text.count("[") + text.count("{") > DEEPEST:
         deque(_leaves(content, source), maxlen=0)
     return content

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from factorgraph_loc.bounded import GRID
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
+from factorgraph_loc.npz_files import read_npz
 from factors.rfid import GridModel
 
+FARTHEST = 1000.0  # m from the antenna
+FINEST = 1e-3  # m from knot to knot
 LARGEST = 20.0  # of a logit: beyond it a probability is 0 or 1 to nine digits, and nothing could ever move it
 
 
@@ -19,28 +22,27 @@ def read_grid(path: str | Path) -> GridModel:
 
     InputError names what is missing or has a wrong shape.
     """
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            found = {name: np.asarray(content[name], dtype=float) for name in content.files}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: is not a grid as calibration writes it (.npz of numbers)") from error
+    found = {name: np.asarray(values, dtype=float) for name, values in read_npz(Path(path), GRID).items()}
     for name in ("logits", "origin", "cell", "heights"):
         if name not in found:
             raise InputError(f"{path}: {name} is missing, expected logits, origin, cell, heights")
     logits, origin, heights = found["logits"], found["origin"], np.atleast_1d(found["heights"])
-    if logits.ndim != 4 or min(logits.shape[2:]) < 2 or logits.shape[0] != len(heights):
+    if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
         raise bad_field(path, "logits", f"an array of shape {logits.shape}", "(heights, facings, x, y)")
-    if origin.shape != (2,) or found["cell"].size != 1 or not np.all(np.isfinite(origin)) or not found["cell"] > 0.0:
-        raise bad_field(path, "origin, cell", "no place", "two numbers and one above 0, in metres")
+    cell = found["cell"]
+    if origin.shape != (2,) or not np.all(np.abs(origin) <= FARTHEST):
+        raise bad_field(path, "origin", origin.tolist(), f"two numbers in {-FARTHEST:g} to {FARTHEST:g} m")
+    if cell.size != 1 or not FINEST <= cell.item() <= FARTHEST:
+        raise bad_field(path, "cell", cell.tolist(), f"{FINEST:g} to {FARTHEST:g} m")
+    if heights.ndim != 1 or not np.all(np.abs(heights) <= FARTHEST):
+        raise bad_field(path, "heights", heights.tolist(), f"numbers in {-FARTHEST:g} to {FARTHEST:g} m")
     steps = np.diff(heights)
-    if not np.all(np.isfinite(heights)) or (len(steps) and not (np.all(steps > 0.0) and np.allclose(steps, steps[0]))):
-        raise bad_field(path, "heights", heights.tolist(), "finite, rising in even steps")
+    if len(steps) and not (np.all(steps >= FINEST) and np.allclose(steps, steps[0])):
+        raise bad_field(path, "heights", heights.tolist(), f"even steps upwards of {FINEST:g} m or more")
     if np.any(np.isnan(logits)):
         raise bad_field(path, "logits", "NaN", "numbers")
     bounded = np.clip(logits, -LARGEST, LARGEST)
-    return GridModel(bounded, float(origin[0]), float(origin[1]), float(found["cell"].item()), heights)
+    return GridModel(bounded, float(origin[0]), float(origin[1]), float(cell.item()), heights)
 
 
 def write_grid(grid: GridModel, path: str | Path) -> None:

@@ -8,17 +8,20 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from pydantic import BeforeValidator, Field
 
+from factorgraph_loc.bounded import IMAGE, opened
+from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model
-from factorgraph_loc.text import told
+from factorgraph_loc.image_files import pillow_image
 from factorgraph_loc.yaml_files import read_yaml
 from factors import se2
 from factors.se2 import Array
 
 Wall = tuple[float, float, float, float]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
+Yaw = Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an aslant line is half a cell off them
 MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
@@ -34,7 +37,7 @@ class MapFile(FileModel):
 
     image: str
     resolution: Annotated[float, Field(gt=0.0, le=10.0, description="m per cell")]
-    origin: tuple[float, float, float]
+    origin: tuple[Coordinate, Coordinate, Yaw]
     occupied_thresh: Share = 0.65
     free_thresh: Share = 0.196
     negate: Annotated[Literal[0, 1], BeforeValidator(_zero_or_one)] = 0
@@ -72,15 +75,9 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
 
 def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
     """Which cells (rows, columns) are occupied; a transparent one is unknown."""
-    try:
-        with Image.open(path) as image:
-            image.load()
-            # colours count by the mean of their channels, as in map_server
-            channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: is not an image that can be read: {told(error)}") from error
+    with opened(path, IMAGE) as file, pillow_image(file, path) as image:
+        # colours count by the mean of their channels, as in map_server
+        channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
     values = np.asarray(channels, dtype=np.uint8)
     grey = values[:, :, :3].mean(axis=2)
     if stated.mode == "raw":  # the occupancy in percent, 255 where it is unknown

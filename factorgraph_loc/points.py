@@ -13,9 +13,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from factorgraph_loc.camera_settings import FrontendSettings
+from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
-from factorgraph_loc.text import listed, told
+from factorgraph_loc.parquet_files import read_parquet, texts
+from factorgraph_loc.text import listed
 from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
@@ -23,6 +25,8 @@ COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
 KINDS: tuple[str, ...] = get_args(FrontendSettings.model_fields["feature"].annotation)
+LARGEST_VARIANCE = 1e8  # m^2
+LARGEST_VALUE = 1e6  # of a descriptor
 ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
 
 
@@ -115,17 +119,15 @@ def read_points(path: Path) -> PointMap:
 
     Rows of one point must agree on its place. Covariances must be positive semi-definite.
     """
-    try:
-        table = pl.read_parquet(path)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"{path}: is not a table of points: {told(error)}") from error
+    table = read_parquet(path)
     missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
     every = np.arange(len(table))
-    numbers = {name: _finite(table, name, every, path) for name in COLUMNS[1:]}
+    numbers = {name: _numbers(table, name, every, path, FARTHEST) for name in "xyz"}
+    numbers |= {name: _numbers(table, name, every, path, LARGEST_VARIANCE) for name in COLUMNS[4:]}
     rows: dict[str, int] = {}
-    labels = _texts(table, "point")
+    labels = texts(table, "point", path)
     if "" in labels:
         raise bad_field(path, "point", "", "the name of a point", row=labels.index("") + 1)
     owner = np.array([rows.setdefault(name, len(rows)) for name in labels], dtype=np.int64)
@@ -141,7 +143,7 @@ def read_points(path: Path) -> PointMap:
     for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
         covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
     _check_covariances(covariances, tuple(rows), first, path)
-    features = _texts(table, "feature")
+    features = texts(table, "feature", path)
     kinds = sorted({name for name in features if name})
     if unknown := [name for name in kinds if name not in KINDS]:
         raise bad_field(path, "feature", unknown[0], " or ".join(KINDS), row=features.index(unknown[0]) + 1)
@@ -150,7 +152,7 @@ def read_points(path: Path) -> PointMap:
     if not kinds:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])
-    columns = [_finite(table, name, shown, path) for name in VIEW]
+    columns = [_numbers(table, name, shown, path, FARTHEST) for name in VIEW]
     if len(bad := np.flatnonzero(columns[3] <= 0.0)):
         raise bad_field(path, "size", float(columns[3][bad[0]]), "a number above 0", row=int(shown[bad[0]]) + 1)
     return PointMap(
@@ -165,18 +167,14 @@ def read_points(path: Path) -> PointMap:
     )
 
 
-def _texts(table: pl.DataFrame, name: str) -> list[str]:
-    """A column as text, empty where nothing stands in it."""
-    return ["" if cell is None else str(cell) for cell in table[name].to_list()]
-
-
-def _finite(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
-    """The numbers (R,) of a column in ``rows`` (R,)."""
+def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path, most: float) -> Array:
+    """The numbers (R,) of a column in ``rows`` (R,), of which none is beyond ``most``."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
     values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
-    if len(bad := np.flatnonzero(~np.isfinite(values))):
-        raise bad_field(path, name, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]) + 1)
+    if len(bad := np.flatnonzero(~(np.abs(values) <= most))):
+        expected = f"a finite number in {-most:g} to {most:g}"
+        raise bad_field(path, name, float(values[bad[0]]), expected, row=int(rows[bad[0]]) + 1)
     return values
 
 
@@ -202,4 +200,7 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
     chosen = [content[i] or b"" for i in rows.tolist()]
     if len({len(row) for row in chosen}) != 1 or not chosen[0] or len(chosen[0]) % np.dtype(kind).itemsize:
         raise InputError(f"{path}: descriptors differ in their length, expected one length for feature {feature}")
-    return np.frombuffer(b"".join(chosen), dtype=kind).reshape(len(chosen), -1).copy()
+    values = np.frombuffer(b"".join(chosen), dtype=kind).reshape(len(chosen), -1).copy()
+    if len(bad := np.flatnonzero(~(np.abs(values) <= LARGEST_VALUE).all(axis=1))):
+        raise bad_field(path, "descriptor", "values that are none", "finite numbers", row=int(rows[bad[0]]) + 1)
+    return values

@@ -12,9 +12,10 @@ from typing import Any
 
 import yaml
 
+from factorgraph_loc.bounded import YAML, foreign
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import read_text
-from factorgraph_loc.text import told
+from factorgraph_loc.text import quoted
 
 DEEPEST = 20  # blocks within blocks
 _DIRECTIVE = re.compile(r"\A(\s*)%YAML[: ][^\n]*")  # OpenCV writes %YAML:1.0, which is none
@@ -27,7 +28,7 @@ class _Loader(yaml.SafeLoader):
     """Composes the nodes of a file; aliases and blocks that are too deep are an InputError."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(_DIRECTIVE.sub(r"\1", read_text(path)))
+        super().__init__(_DIRECTIVE.sub(r"\1", read_text(path, YAML)))
         self.path, self.depth = path, 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -48,14 +49,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
     InputError names file and row of what is not YAML.
     """
-    try:
-        node = _Loader(path).get_single_node()
-    except yaml.MarkedYAMLError as error:
-        mark = error.context_mark or error.problem_mark
-        what = ", ".join(part for part in (error.context, error.problem) if part)
-        raise InputError(f"{path}:{mark.line + 1 if mark else 1}: is not YAML that can be read: {what}") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: is not YAML that can be read: {told(error)}") from error
+    with foreign(path, "is not YAML that can be read"):
+        try:
+            node = _Loader(path).get_single_node()
+        except yaml.MarkedYAMLError as error:
+            mark = error.context_mark or error.problem_mark
+            what = ", ".join(part for part in (error.context, error.problem) if part)
+            raise InputError(f"{path}:{mark.line + 1 if mark else 1}: is not YAML that can be read: {what}") from error
     if node is None:
         return {}
     if not isinstance(node, yaml.MappingNode):
@@ -65,10 +65,15 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def _value(node: yaml.Node, path: Path) -> Any:
     if isinstance(node, yaml.MappingNode):
-        for key, _ in node.value:
+        found: dict[str, Any] = {}
+        for key, value in node.value:
+            where = f"{path}:{key.start_mark.line + 1}"
             if not isinstance(key, yaml.ScalarNode):
-                raise InputError(f"{path}:{key.start_mark.line + 1}: a key is no text, expected key: value")
-        return {key.value: _value(value, path) for key, value in node.value}
+                raise InputError(f"{where}: a key is no text, expected key: value")
+            if key.value in found:
+                raise InputError(f"{where}: the key {quoted(key.value)} is there twice")
+            found[key.value] = _value(value, path)
+        return found
     if isinstance(node, yaml.SequenceNode):
         return [_value(value, path) for value in node.value]
     assert isinstance(node, yaml.ScalarNode)

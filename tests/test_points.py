@@ -130,9 +130,9 @@ def test_damaged_tables(written, change, message):
 
 def test_files_that_are_no_tables(tmp_path):
     path = tmp_path / "a.points.parquet"
-    with pytest.raises(InputError, match="is not a table of points"):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
         read_points(path)
     write_points(a_map(3, [0, 1]), path)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match="is not a table of points"):
+    with pytest.raises(InputError, match="is not a Parquet file that can be read"):
         read_points(path)

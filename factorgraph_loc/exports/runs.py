@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,9 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.experiments.output import FILES
 from factorgraph_loc.experiments.stored_run import trajectory_of
-from factorgraph_loc.files import read_text, read_toml
+from factorgraph_loc.files import FileModel, parse_model, read_json, read_toml
 from factorgraph_loc.log import Log
+from factorgraph_loc.parquet_files import read_parquet
 from factorgraph_loc.text import quoted, told
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
@@ -24,6 +24,18 @@ from factors.se2 import Array
 COMPLETE = FILES[-1]  # written last: where it is, the others are
 OUTSIDE = 60.0  # s that an estimate may lie outside of its log
 SERIES = ("error_position", "error_heading", "nees")
+
+
+class _Landmark(FileModel, extra="ignore"):
+    x: float | None
+    y: float | None
+    covariance: tuple[float | None, float | None, float | None]
+
+
+class _Learnt(FileModel, extra="ignore"):
+    """What is read of ``learnt.json``."""
+
+    landmarks: dict[str, _Landmark]
 
 
 @dataclass(frozen=True)
@@ -100,7 +112,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
     path = folder.path / "estimates.parquet"
     try:
-        table = pl.read_parquet(path)
+        table = read_parquet(path)
         table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)
         causal = table.filter(pl.col("kind") == "causal")
         localized = causal.filter(pl.col("status") == "localized")["t"].min()
@@ -148,9 +160,9 @@ def _series(table: pl.DataFrame, key: str, t0_ns: int) -> tuple[Array, Array]:
 
 def _landmarks(path: Path) -> dict[str, LearntPoint]:
     found = {}
-    for name, entry in json.loads(read_text(path))["landmarks"].items():
-        xx, xy, yy = (np.nan if value is None else value for value in entry["covariance"])
-        found[name] = LearntPoint(np.array((entry["x"], entry["y"]), dtype=float), np.array(((xx, xy), (xy, yy))))
+    for name, entry in parse_model(_Learnt, read_json(path), path).landmarks.items():
+        xx, xy, yy = (np.nan if value is None else value for value in entry.covariance)
+        found[name] = LearntPoint(np.array((entry.x, entry.y), dtype=float), np.array(((xx, xy), (xy, yy))))
     return found
 
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.bounded import IMAGE, read_bytes
 from factorgraph_loc.evaluation import figures
 from factorgraph_loc.log import BearingRangeStream, ImageStream, Log, RfidStream, SightingStream
 from factorgraph_loc.measurements import PixelSightings
 from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.vision.images import decoded
 from factors.se2 import Array
 
 LIT_FOR = 0.5  # s that a tag or landmark stays lit after it was read or seen
@@ -113,15 +114,10 @@ def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
 
 
 def _jpeg(file: Path) -> bytes:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    content = read_bytes(file, IMAGE)
     if content.startswith(b"\xff\xd8"):
         return content
-    picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR) if content else None
-    if picture is None:
-        raise InputError(f"{file}: is no image that can be read")
+    picture = decoded(content, file, cv2.IMREAD_COLOR)
     return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 

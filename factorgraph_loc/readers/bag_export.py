@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from factorgraph_loc.bounded import IMAGE, read_bytes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import (
     BearingRangeStream,
@@ -221,10 +222,7 @@ def _imu(stream: YawRateStream, build: _Builder) -> Iterator[dict[str, Any]]:
 
 def _images(stream: ImageStream) -> Iterator[dict[str, Any]]:
     for file in stream.file:
-        try:
-            content = file.read_bytes()
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+        content = read_bytes(file, IMAGE)
         kind = PNG_OR_JPEG.get(file.suffix.lower(), file.suffix.lstrip("."))
         yield {"format": kind, "data": np.frombuffer(content, dtype=np.uint8)}
 

@@ -15,9 +15,10 @@ from pydantic import Field
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_text
+from factorgraph_loc.image_files import size_of_file
 from factorgraph_loc.log import Log
 from factorgraph_loc.readers.native_camera import make_images
-from factorgraph_loc.readers.space_poses import image_size, later, read_kitti, read_times
+from factorgraph_loc.readers.space_poses import later, read_kitti, read_times
 from factorgraph_loc.readers.tables import Table
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.world import World
@@ -50,7 +51,7 @@ def read(path: Path | None, options: Options) -> Log:
     if not len(stream.t):
         raise InputError(f"{images}: holds none of the {len(t_ns)} images of times.txt, 000000.png and on")
     _, poses_ns, poses = read_kitti(poses_file, times)
-    camera = _camera(calib, options.camera, image_size(stream.file[0]))
+    camera = _camera(calib, options.camera, size_of_file(stream.file[0]))
     return Log(
         name=f"kitti-{name}",
         rig=Rig(name=f"kitti-{name}-camera{options.camera}", sensors=("camera",), camera=camera),

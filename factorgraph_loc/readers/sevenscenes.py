@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 from pydantic import Field
 
+from factorgraph_loc.bounded import IMAGE, opened
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, read_text
+from factorgraph_loc.image_files import size_of_file
 from factorgraph_loc.log import ImageStream, Log
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.trajectory3 import Trajectory3
@@ -108,14 +109,10 @@ def _check_image(path: Path) -> None:
     """InputError for an image of another size than the camera's, or that ends too early; its pixels are not decoded."""
     camera = RIG.camera
     assert camera is not None
-    try:
-        with Image.open(path) as image:
-            size = image.size
-        with path.open("rb") as file:
-            file.seek(-min(path.stat().st_size, 16), 2)
-            end = file.read()
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: is not an image that can be read") from error
+    size = size_of_file(path)
+    with opened(path, IMAGE) as file:
+        file.seek(-min(path.stat().st_size, 16), 2)
+        end = file.read()
     if size != (camera.width, camera.height):
         raise bad_field(path, "size", f"{size[0]} x {size[1]}", f"{camera.width} x {camera.height} px")
     if (b"\xff\xd9" if path.suffix == ".jpg" else b"IEND") not in end:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from factorgraph_loc.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.columns import POSES
@@ -93,12 +92,3 @@ def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> T
 def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:
     """The same with seconds after ``t0_ns``; its stamps are ``t_ns`` (N,)."""
     return replace(trajectory, t=checks.seconds(t_ns, t0_ns))
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height [px]; InputError if that is no image."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: is not an image that can be read") from error

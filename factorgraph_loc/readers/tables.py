@@ -12,6 +12,7 @@ import polars as pl
 from factorgraph_loc.columns import LATEST, STAMP, TABLES, Column
 from factorgraph_loc.csv_cells import Shape, read_cells, shape_of
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.parquet_files import read_parquet, texts
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
@@ -99,10 +100,7 @@ def _texts(path: Path, rows: Sequence[int], name: str, cells: Sequence[str | Non
 
 
 def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
-    try:
-        frame = pl.read_parquet(path)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"{path}: is not a Parquet file that can be read") from error
+    frame = read_parquet(path)
     shape = shape_of(path, frame.columns, shapes)
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
     if not frame[STAMP.name].dtype.is_integer():
@@ -126,10 +124,5 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
             i = int(infinite[0])
             raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
         numbers[name] = column.cast(pl.Float64).to_numpy().copy()
-        columns[name].require(path, rows, numbers[name])
-    names = {
-        name: _texts(path, rows.tolist(), name, frame[name].cast(pl.String).to_list())
-        for name in shape
-        if name in NAMES
-    }
-    return Table(path, rows, t_ns, numbers, names)
+def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
+    frame = read_parquet(path)

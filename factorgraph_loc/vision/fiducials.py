@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from factorgraph_loc.bounded import IMAGE, read_bytes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.log import ImageStream, Log, SightingStream
 from factorgraph_loc.markers import MarkerFamily, corner_names
@@ -85,10 +86,7 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
 
 
 def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    content = read_bytes(file, IMAGE)
     about = f"markers {family} {code_version(CODE)} "
     key = hashlib.sha256(about.encode() + content).hexdigest()
     stored = kept.read(key)

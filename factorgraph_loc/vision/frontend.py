@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from factorgraph_loc.bounded import IMAGE, read_bytes
 from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.log import FeatureStream, ImageStream, Log
@@ -124,9 +125,9 @@ def _features(
 
 def _looked_up(file: Path, about: str, kept: FeatureCache) -> _Image:
     try:
-        content = file.read_bytes()
-    except OSError as error:
-        return _Image(file, fault=f"{file}: cannot be read: {error.strerror}")
+        content = read_bytes(file, IMAGE)
+    except InputError as error:
+        return _Image(file, fault=str(error))
     key = hashlib.sha256(about.encode() + content).hexdigest()
     stored = kept.read(key)
     return _Image(file, key, None if stored is None else decode(stored))
@@ -163,8 +164,6 @@ def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _Image:
         image = read_image(file)
     except InputError as error:
         return _Image(file, fault=str(error))
-    except cv2.error as error:  # more pixels than OpenCV allows
-        return _Image(file, fault=f"{file}: cannot be decoded: {error.err}")
     height, width = image.shape[:2]
     if (width, height) != size:
         fault = f"{file}: has {width} x {height} px, expected {size[0]} x {size[1]}"

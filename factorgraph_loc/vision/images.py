@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.bounded import IMAGE, foreign, read_bytes
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.image_files import NO_IMAGE, image_size
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]
@@ -33,7 +36,10 @@ def as_image(array: object, source: object = "image") -> Image:
     if array.dtype == np.uint8:
         return np.ascontiguousarray(array)
     if array.dtype == np.uint16:
-        return np.ascontiguousarray((array.astype(np.uint32) + 128) // 257, dtype=np.uint8)
+        scaled = array.astype(np.uint32)  # in place, for a large image takes gigabytes otherwise
+        scaled += 128
+        scaled //= 257
+        return np.ascontiguousarray(scaled, dtype=np.uint8)
     if array.dtype.kind != "f":
         raise InputError(f"{source}: has pixels of type {array.dtype}, expected uint8, uint16 or floating point")
     if not np.isfinite(array).all():
@@ -64,12 +70,16 @@ def is_blank(image: Image) -> bool:
 
 
 def read_image(path: Path) -> Image:
-    """The image in a file, (H, W) or (H, W, 3) BGR; InputError if it is missing or does not decode."""
-    try:
-        content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    """The image in a file, (H, W) or (H, W, 3) BGR; InputError if it is missing, does not decode or has too many pixels."""
+    return as_image(decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED), path)
+
+
+def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
+    """The pixels of an image's file as OpenCV gives them with ``flags``; InputError if it is none, or one of more than
+    :data:`~factorgraph_loc.bounded.PIXELS` pixels, before memory is taken for them. OpenCV itself would take 2^30."""
+    image_size(content, source)
+    with foreign(source, NO_IMAGE):
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if image is None:
-        raise InputError(f"{path}: is not an image that can be decoded, expected PNG, JPEG, PPM or the like")
-    return as_image(image, path)
+        raise InputError(f"{source}: {NO_IMAGE}, expected PNG, JPEG, PPM or the like")
+    return np.asarray(image)

@@ -66,7 +66,7 @@ def test_pictures_become_jpegs(log):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(None, "cannot be read"), (b"no picture", "is no image"), (b"", "is no image")]
+    ("content", "message"), [(None, "cannot be read"), (b"no picture", "is not an image"), (b"", "is not an image")]
 )
 def test_a_picture_that_cannot_be_read_is_named(log, tmp_path, content, message):
     if content is not None:

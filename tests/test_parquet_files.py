@@ -1,0 +1,99 @@
+import io
+
+import numpy as np
+import polars as pl
+import pytest
+
+from factorgraph_loc import parquet_pages
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.parquet_files import parse_parquet, texts
+
+
+def table(rows: int = 2000) -> pl.DataFrame:
+    rng = np.random.default_rng(1)
+    return pl.DataFrame(
+        {
+            "t_ns": 10**18 + np.arange(rows) * 10**7,
+            "v": rng.normal(size=rows),
+            "name": [f"tag-{i % 7}" for i in range(rows)],
+            "seldom": [None if i % 3 else float(i) for i in range(rows)],
+            "several": [[1, 2]] * rows,
+        }
+    )
+
+
+def content(frame: pl.DataFrame, **options) -> bytes:
+    stream = io.BytesIO()
+    frame.write_parquet(stream, **options)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": "uncompressed"},
+        {"compression": "snappy"},
+        {"compression": "gzip"},
+        {"compression": "lz4"},
+        {"row_group_size": 100},
+        {"data_page_size": 500},
+        {"statistics": "full"},
+    ],
+)
+@pytest.mark.parametrize("rows", [0, 1, 2000])
+def test_whole_files_pass(rows, options):
+    frame = table(rows)
+    assert parse_parquet(content(frame, **options), "a.parquet").equals(frame)
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    value = value << 1
+    while value > 127:
+        out += bytes((value & 127 | 128,))
+        value >>= 7
+    return out + bytes((value,))
+
+
+def test_rows_that_no_file_of_that_size_could_hold_are_refused():
+    whole = content(pl.DataFrame({"v": np.zeros(20_000_000, dtype=np.int8)}), row_group_size=20_000_000)
+    assert len(whole) < 15_000
+    with pytest.raises(InputError, match=r"a.parquet: its number of values is 20,000,000, expected at most"):
+        parse_parquet(whole, "a.parquet")
+
+
+def test_a_number_of_rows_that_is_not_that_of_its_pages_is_refused():
+    whole = content(table(8000))
+    with pytest.raises(InputError, match=r"a.parquet: is not a Parquet file"):
+        parse_parquet(whole.replace(varint(8000), varint(8001), 1), "a.parquet")
+
+
+@pytest.mark.parametrize("cut", [0, 3, 4, 8, 11, 12, 100, -1, -4, -8, -9, -100])
+def test_a_cut_file_is_one_line(cut):
+    with pytest.raises(InputError, match=r"a.parquet: is not a Parquet file that can be read: "):
+        parse_parquet(content(table(100))[:cut], "a.parquet")
+
+
+def test_structures_within_structures_do_not_end():
+    deep = b"\x1c" * 10_000
+    file = parquet_pages.MARK + deep + len(deep).to_bytes(4, "little") + parquet_pages.MARK
+    with pytest.raises(InputError, match=r"nested too deep"):
+        parse_parquet(file, "a.parquet")
+
+
+def test_texts_may_be_numbers_and_categories_but_no_lists():
+    frame = pl.DataFrame({"a": [1, None], "b": pl.Series(["x", "y"], dtype=pl.Categorical), "c": [None, None]})
+    assert texts(frame, "a", "log") == ["1", ""]
+    assert texts(frame, "b", "log") == ["x", "y"]
+    assert texts(frame, "c", "log") == ["", ""]
+    for column in ([["a"], ["b"]], [{"a": 1}, {"a": 2}], [b"a", b"b"], [0.5, 1.5], [True, False]):
+        with pytest.raises(InputError, match=r"log: x is of type .*, expected texts"):
+            texts(pl.DataFrame({"x": column}), "x", "log")
+
+
+def test_a_long_text_that_is_referred_to_very_often_is_refused():
+    whole = content(pl.DataFrame({"x": pl.Series(["a" * 100_000]).repeat_by(20_000).explode()}))
+    assert len(whole) < 200_000
+    with pytest.raises(InputError, match=r"the length of all texts of x is 2,000,000,000, expected at most"):
+        texts(parse_parquet(whole, "log"), "x", "log")
