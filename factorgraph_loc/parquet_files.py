@@ -25,7 +25,7 @@ def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None 
         return pl.read_parquet(io.BytesIO(content), columns=None if columns is None else list(columns))
 
 
-def texts(table: pl.DataFrame, name: str, source: object) -> list[str]:
+def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
     """A column of texts or whole numbers as texts, empty where nothing stands in it; InputError if it holds anything else."""
     column = table[name]
     kind = column.dtype

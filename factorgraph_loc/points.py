@@ -16,7 +16,7 @@ from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
-from factorgraph_loc.parquet_files import read_parquet, texts
+from factorgraph_loc.parquet_files import read_parquet, text_column
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
@@ -127,7 +127,7 @@ def read_points(path: Path) -> PointMap:
     numbers = {name: _numbers(table, name, every, path, FARTHEST) for name in "xyz"}
     numbers |= {name: _numbers(table, name, every, path, LARGEST_VARIANCE) for name in COLUMNS[4:]}
     rows: dict[str, int] = {}
-    labels = texts(table, "point", path)
+    labels = text_column(table, "point", path)
     if "" in labels:
         raise bad_field(path, "point", "", "the name of a point", row=labels.index("") + 1)
     owner = np.array([rows.setdefault(name, len(rows)) for name in labels], dtype=np.int64)
@@ -143,7 +143,7 @@ def read_points(path: Path) -> PointMap:
     for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
         covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
     _check_covariances(covariances, tuple(rows), first, path)
-    features = texts(table, "feature", path)
+    features = text_column(table, "feature", path)
     kinds = sorted({name for name in features if name})
     if unknown := [name for name in kinds if name not in KINDS]:
         raise bad_field(path, "feature", unknown[0], " or ".join(KINDS), row=features.index(unknown[0]) + 1)

@@ -6,7 +6,7 @@ import pytest
 
 from factorgraph_loc import parquet_pages
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.parquet_files import parse_parquet, texts
+from factorgraph_loc.parquet_files import parse_parquet, text_column
 
 
 def table(rows: int = 2000) -> pl.DataFrame:
@@ -84,16 +84,16 @@ def test_structures_within_structures_do_not_end():
 
 def test_texts_may_be_numbers_and_categories_but_no_lists():
     frame = pl.DataFrame({"a": [1, None], "b": pl.Series(["x", "y"], dtype=pl.Categorical), "c": [None, None]})
-    assert texts(frame, "a", "log") == ["1", ""]
-    assert texts(frame, "b", "log") == ["x", "y"]
-    assert texts(frame, "c", "log") == ["", ""]
+    assert text_column(frame, "a", "log") == ["1", ""]
+    assert text_column(frame, "b", "log") == ["x", "y"]
+    assert text_column(frame, "c", "log") == ["", ""]
     for column in ([["a"], ["b"]], [{"a": 1}, {"a": 2}], [b"a", b"b"], [0.5, 1.5], [True, False]):
         with pytest.raises(InputError, match=r"log: x is of type .*, expected texts"):
-            texts(pl.DataFrame({"x": column}), "x", "log")
+            text_column(pl.DataFrame({"x": column}), "x", "log")
 
 
 def test_a_long_text_that_is_referred_to_very_often_is_refused():
     whole = content(pl.DataFrame({"x": pl.Series(["a" * 100_000]).repeat_by(20_000).explode()}))
     assert len(whole) < 200_000
     with pytest.raises(InputError, match=r"the length of all texts of x is 2,000,000,000, expected at most"):
-        texts(parse_parquet(whole, "log"), "x", "log")
+        text_column(parse_parquet(whole, "log"), "x", "log")

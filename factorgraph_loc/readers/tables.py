@@ -12,7 +12,7 @@ import polars as pl
 from factorgraph_loc.columns import LATEST, STAMP, TABLES, Column
 from factorgraph_loc.csv_cells import Shape, read_cells, shape_of
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.parquet_files import read_parquet, texts
+from factorgraph_loc.parquet_files import read_parquet, text_column
 from factorgraph_loc.trajectory import Integers
 from factors.se2 import Array
 
@@ -124,5 +124,6 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
             i = int(infinite[0])
             raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
         numbers[name] = column.cast(pl.Float64).to_numpy().copy()
-def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
-    frame = read_parquet(path)
+        columns[name].require(path, rows, numbers[name])
+    names = {name: _texts(path, rows.tolist(), name, text_column(frame, name, path)) for name in shape if name in NAMES}
+    return Table(path, rows, t_ns, numbers, names)
