@@ -21,6 +21,7 @@ from factorgraph_loc.readers.bounds import require_bounds
 from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
 from factorgraph_loc.shipped import manifests
+from factorgraph_loc.text import one_line
 from factorgraph_loc.text import listed
 from factorgraph_loc.world import World, read_world
 
@@ -189,4 +190,4 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
             warnings.append("the gyro is used only where sensors name imu: those of the rig do not")
     if log.rig.name == readers.DEFAULT_RIG.name:
         warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
-    return replace(log, warnings=(*warnings, *checks.look_over(log)))
+    return replace(log, warnings=tuple(map(one_line, (*warnings, *checks.look_over(log)))))

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, inside
+from factorgraph_loc.files import FileModel, parse_model, inside
 from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns
@@ -75,7 +75,8 @@ def read_landmarks(file: Path) -> World:
             raise bad_field(file, "subject", name, "each subject once", row=int(row))
         if not 0.0 <= max(sigma_x, sigma_y) <= 100.0:
             raise bad_field(file, "std-dev", float(max(sigma_x, sigma_y)), "0 to 100 m", row=int(row))
-        landmarks[name] = Landmark(x=x, y=y, sigma=max(sigma_x, sigma_y))
+        told = {"x": x, "y": y, "sigma": max(sigma_x, sigma_y)}
+        landmarks[name] = parse_model(Landmark, told, f"{file}:{row}")
     return World(name="mrclam", landmarks=landmarks)
 
 

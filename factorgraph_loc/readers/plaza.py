@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, parse_model
 from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.matlab import read_matlab
@@ -89,7 +89,7 @@ def beacons(source: str, table: Array) -> World:
     for row, (number, x, y) in enumerate(table, start=1):
         if not np.all(np.isfinite((number, x, y))):
             raise bad_field(source, "row", [float(number), float(x), float(y)], "finite numbers", row=row)
-        landmarks[beacon_name(number)] = Landmark(x=x, y=y)
+        landmarks[beacon_name(number)] = parse_model(Landmark, {"x": x, "y": y}, f"{source}:{row}")
     return World(name="plaza", landmarks=landmarks)
 
 

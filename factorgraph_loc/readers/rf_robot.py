@@ -17,7 +17,7 @@ from pydantic import Field
 from factorgraph_loc.columns import TAGS
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, inside, read_text
+from factorgraph_loc.files import FileModel, parse_model, inside, read_text
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.readers import checks, simulated_odometry
 from factorgraph_loc.readers.columns import read_columns
@@ -86,7 +86,7 @@ def read_tags(path: Path) -> dict[str, Tag]:
             if math.isnan(value):
                 raise bad_field(path, name, "", "a number", row=row)
         rows[epc] = row
-        tags[epc] = Tag(x=x, y=y, z=z, facing=facing)
+        tags[epc] = parse_model(Tag, {"x": x, "y": y, "z": z, "facing": facing}, f"{path}:{row}")
     if not tags:
         raise InputError(f"{path}: holds no tags, expected at least one row")
     return tags

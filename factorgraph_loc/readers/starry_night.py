@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, parse_model
 from factorgraph_loc.log import Log, RightSightingStream, SightingStream, TwistStream
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.readers import checks
@@ -132,12 +132,12 @@ def _rig(path: Path, fields: dict[str, Array], t: Array) -> Rig:
         sigma = float(np.sqrt(fields["y_var"].mean()))
         lens = {"width": SIZE[0], "height": SIZE[1], "fx": fu, "fy": fv, "cx": cu, "cy": cv}
         place = {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
-        return CameraSettings.model_validate({**lens, **place, "pixel_sigma": sigma, "robust": ROBUST})
+        return parse_model(CameraSettings, {**lens, **place, "pixel_sigma": sigma, "robust": ROBUST}, path)
 
     return Rig(
         name="starry_night",
         sensors=("twist", "sightings", "sightings_right"),
-        twist=TwistSettings(shift=tuple(shift), turn=tuple(turns)),
+        twist=parse_model(TwistSettings, {"shift": shift, "turn": turns}, path),
         camera=camera(0.0),
         camera_right=camera(b),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import FileModel, parse_model
 from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.matlab import read_matlab
@@ -68,9 +68,11 @@ def read(path: Path | None, options: Options) -> Log:
 def read_landmarks(path: Path, table: Array) -> World:
     if len(table) != LANDMARKS or not np.all(np.isfinite(table)):
         raise bad_field(path, "l", f"{len(table)} rows", f"{LANDMARKS} rows of finite x and y")
-    return World(
-        name="woods", landmarks={str(i): Landmark(x=float(x), y=float(y)) for i, (x, y) in enumerate(table, start=1)}
-    )
+    landmarks = {
+        str(i): parse_model(Landmark, {"x": x, "y": y}, f"{path}: l:{i}")
+        for i, (x, y) in enumerate(table.tolist(), start=1)
+    }
+    return World(name="woods", landmarks=landmarks)
 
 
 def read_sightings(path: Path, r: Array, b: Array, t: Array, rows: Integers, max_range: float) -> BearingRangeStream:

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.readers import load
+from factorgraph_loc.readers.matlab import read_arrays
 
 
 def plaza(**changes):
@@ -109,6 +111,41 @@ def test_bad_plaza(tmp_path, refused, changes, fragment):
 def test_what_is_no_matlab_file(tmp_path, refused, content):
     (tmp_path / "x.mat").write_bytes(content)
     refused(tmp_path / "x.mat", "x.mat: is not a MATLAB file", reader="plaza", options={"run": 1})
+
+
+def test_what_is_no_array_of_real_numbers(tmp_path, refused):
+    for value in (np.array([[1j]]), "text", {"a": 1.0}, np.array([[1, "x"]], dtype=object)):
+        savemat(tmp_path / "small.mat", plaza(DR=value))
+        refused(tmp_path / "small.mat", "DR is no array of real numbers", reader="plaza", options={"run": 1})
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_values_and_their_order_are_as_scipy_reads_them(tmp_path, compressed):
+    rng = np.random.default_rng(1)
+    kinds = {f"a{kind}": rng.integers(0, 100, (2, 3, 4)).astype(kind) for kind in ("i1", "u2", "i4", "f4", "f8", "u8")}
+    savemat(tmp_path / "all.mat", {**kinds, "one": 3.0, "none": np.zeros((0, 3))}, do_compression=compressed)
+    found = read_arrays(tmp_path / "all.mat", {**dict.fromkeys(kinds, (2, 3, 4)), "one": (1, 1), "none": (None, 3)})
+    for name, array in loadmat(tmp_path / "all.mat", variable_names=list(found)).items():
+        if name in found:
+            np.testing.assert_array_equal(found[name], array)
+            assert found[name].flags.f_contiguous
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_damage_at_any_place_is_refused_or_read(tmp_path, compressed):
+    """A compiled reader may end the process here."""
+    savemat(tmp_path / "whole.mat", plaza(), do_compression=compressed)
+    whole = (tmp_path / "whole.mat").read_bytes()
+    rng = np.random.default_rng(3)
+    refusals = 0
+    for at in range(100, len(whole), 3):
+        for damaged in (whole[:at], whole[:at] + bytes([int(rng.integers(256))]) + whole[at + 1 :]):
+            (tmp_path / "small.mat").write_bytes(damaged)
+            try:
+                load(str(tmp_path / "small.mat"), reader="plaza", options={"run": 1})
+            except InputError:
+                refusals += 1
+    assert refusals > len(whole) // 4
 
 
 @pytest.mark.parametrize(("run", "rows", "ranges"), [(1, 9658, 3527), (2, 4091, 1816)])
