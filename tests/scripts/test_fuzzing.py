@@ -13,7 +13,7 @@ from fuzzing.workers import Worker
 
 from factorgraph_loc.errors import InputError
 
-CLEAN = ("mrclam", "woods")
+CLEAN = ("mrclam", "woods", "plaza", "starry_night")
 FILES = {
     "run.toml": b'name = "x"\n[start]\nx = 1.0\n',
     "a.csv": b"t_ns,v,w\n0,1.0,0.0\n1000,2.0,0.5\n",
