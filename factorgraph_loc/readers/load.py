@@ -21,8 +21,7 @@ from factorgraph_loc.readers.bounds import require_bounds
 from factorgraph_loc.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.rig import Rig, read_rig
 from factorgraph_loc.shipped import manifests
-from factorgraph_loc.text import one_line
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import listed, one_line
 from factorgraph_loc.world import World, read_world
 
 RUN_FILE = "run.toml"

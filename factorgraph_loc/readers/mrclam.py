@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, parse_model, inside
+from factorgraph_loc.files import FileModel, inside, parse_model
 from factorgraph_loc.log import BearingRangeStream, Log, Stream, VelocityStream
 from factorgraph_loc.readers import checks
 from factorgraph_loc.readers.columns import read_columns

@@ -17,7 +17,7 @@ from pydantic import Field
 from factorgraph_loc.columns import TAGS
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, parse_model, inside, read_text
+from factorgraph_loc.files import FileModel, inside, parse_model, read_text
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.readers import checks, simulated_odometry
 from factorgraph_loc.readers.columns import read_columns

@@ -45,7 +45,7 @@ OTHERS = """
 file = "imu.csv"
 columns = { t = "t", wx = "wx", wy = "wy", wz = "wz" }
 units = { t = "us", wx = "deg/s", wy = "deg/s", wz = "deg/s" }
-axes = ["forward", "left", "up"]
+axes = "body"
 [options.bearing_range]
 file = "seen.jsonl"
 columns = { t = "t", landmark = "id", range = "at.r", bearing = "at.b" }
