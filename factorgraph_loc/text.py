@@ -22,7 +22,7 @@ def plain(text: object, limit: int | None = NAME) -> str:
     if limit is not None:
         whole = shortened(whole, limit)  # before it is escaped: of megabytes little is looked at
     if not whole.isprintable():
-        whole = "".join(c if c.isprintable() else repr(c)[1:-1] for c in whole)
+        whole = "".join(c if c.isprintable() else _escape(c) for c in whole)
     return whole if limit is None else shortened(whole, limit)
 
 
@@ -56,6 +56,12 @@ def shortened(text: str, limit: int) -> str:
         return text
     end = (limit - len(CUT)) * 2 // 5
     return f"{text[: limit - len(CUT) - end]}{CUT}{text[len(text) - end :]}"
+
+
+def _escape(character: str) -> str:
+    """As in Python, but beyond ASCII always in the way that JSON and TOML know too."""
+    code = ord(character)
+    return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def _written(value: object, limit: int, depth: int) -> str:

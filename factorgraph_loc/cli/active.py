@@ -75,9 +75,10 @@ def active(
         show.table(*summary_cells(results.rows))
         header, lines = difference_cells(results.rows)
         if lines:
-            typer.echo()
+            show.line()
             show.table(header, lines)
-        typer.echo(f"\nresults are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/")
+        show.line()
+        show.line(f"results are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/")
     if results.failures:
         raise typer.Exit(1)
 

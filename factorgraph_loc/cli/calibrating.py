@@ -50,12 +50,13 @@ def calibrate(
         show.document(report.document(found) | {"files": {"rig": str(out), "report": str(page)}})
         return
     show.table(*report.constants_table(found.knowledge.constants))
-    typer.echo()
+    show.line()
     if found.knowledge.rfid is not None:
         for table in report.rfid_tables(found):
             show.table(*table)
-            typer.echo()
+            show.line()
     show.table(*report.judgements_table(found))
-    typer.echo()
+    show.line()
     show.table(*report.accuracy_table(found))
-    typer.echo(f"\nthe rig is in {out}, the report in {page}")
+    show.line()
+    show.line(f"the rig is in {out}, the report in {page}")

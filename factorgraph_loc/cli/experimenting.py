@@ -93,7 +93,8 @@ def run(
     else:
         header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
         show.table(header, lines)
-        typer.echo(f"\nresults are in {prepared.folder}: results.parquet, store/")
+        show.line()
+        show.line(f"results are in {prepared.folder}: results.parquet, store/")
     if done.failures:
         raise typer.Exit(1)
 
@@ -130,7 +131,7 @@ def status(
     show.table(["label", *states], rows)
     _print_damaged([run.shown for run in prepared.damaged()], file)
     for one in reasons:
-        typer.echo(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
+        show.line(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
 
 
 @app.command()
@@ -151,7 +152,7 @@ def report(
     if json:
         show.document({"page": str(written.page), "damaged": written.damaged})
         return
-    typer.echo(f"the report is {written.page}")
+    show.line(f"the report is {written.page}")
     _print_damaged(written.damaged, file, "left out")
 
 
@@ -200,18 +201,16 @@ def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -
             for run in prepared.runs
         ],
     )
-    typer.echo(
-        f"\n{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes"
-    )
+    show.line(f"\n{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes")
 
 
 def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
     for run in runs[:SHOWN]:
-        typer.echo(f"damaged{what and f', {what}'}: {run}")
+        show.line(f"damaged{what and f', {what}'}: {run}")
     if len(runs) > SHOWN:
-        typer.echo(f"damaged: {len(runs) - SHOWN} more")
+        show.line(f"damaged: {len(runs) - SHOWN} more")
     if runs:
-        typer.echo(f"`fgloc experiment run {file} --verify` makes them again")
+        show.line(f"`fgloc experiment run {file} --verify` makes them again")
 
 
 def _span(seconds: float) -> str:

@@ -66,7 +66,7 @@ def export(
     if json:
         show.document(shown(log, runs) | {"files": [str(file) for file in files]})
     else:
-        typer.echo(f"wrote {' and '.join(map(str, files))}")
+        show.line(f"wrote {' and '.join(map(str, files))}")
 
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:

@@ -49,4 +49,5 @@ def evaluate(
         show.document(scores.rows)
         return
     show.table(*evaluation.summary(scores))
-    typer.echo(f"\nresults are in {out}: {', '.join(evaluation.FILES)}")
+    show.line()
+    show.line(f"results are in {out}: {', '.join(evaluation.FILES)}")

@@ -75,7 +75,8 @@ def images(
         show.document({"maps": {name: asdict(made) for name, made in results.maps.items()}, "outcomes": outcomes})
         return
     show.table(*evaluation.table(results))
-    typer.echo(f"\nresults are in {out}: {', '.join(evaluation.FILES)}")
+    show.line()
+    show.line(f"results are in {out}: {', '.join(evaluation.FILES)}")
 
 
 def parse_range(text: str, option: str) -> range:

@@ -77,7 +77,7 @@ def info(
         return
     for i, (loaded, found) in enumerate(zip(logs, inspections, strict=True)):
         if i:
-            typer.echo()
+            show.line()
         _print(loaded, found)
 
 
@@ -105,7 +105,7 @@ def convert(
         names = sorted(path.name for path in files)
         show.document({"log": loaded.name, "folder": str(files[0].parent), "files": names})
     else:
-        typer.echo(f"wrote {out}")
+        show.line(f"wrote {out}")
 
 
 def _print(log: Log, found: Inspection) -> None:
@@ -124,13 +124,13 @@ def _print(log: Log, found: Inspection) -> None:
     elif not log.reference.has_heading:
         about["reference"] = "positions only, headings are not scored"
     show.fields(about | dict(log.metadata))
-    typer.echo()
+    show.line()
     streams = dict(found.streams)
     if found.reference is not None:
         streams["reference"] = found.reference
     header = ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps")
     show.table(header, [_row(name, stream) for name, stream in streams.items()])
-    typer.echo()
+    show.line()
     if found.rfid is not None:
         _print_rfid(found.rfid)
     if found.images is not None:
@@ -138,39 +138,39 @@ def _print(log: Log, found: Inspection) -> None:
     if found.pixels is not None:
         _print_pixels(found.pixels)
     if not found.problems:
-        typer.echo("nothing looks wrong")
+        show.line("nothing looks wrong")
     for problem in found.problems:
-        typer.echo(f"! {problem}")
+        show.line(f"! {problem}")
 
 
 def _print_rfid(found: RfidSummary) -> None:
     known = f"{found.known} tags of the map"
     unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
-    typer.echo(f"RFID: {found.reads} reads of {known} and of {unknown}, in {found.rounds} rounds, {found.scans} scans")
+    show.line(f"RFID: {found.reads} reads of {known} and of {unknown}, in {found.rounds} rounds, {found.scans} scans")
     header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
     rows = [
         (name, str(a.reads), str(a.rounds), show.number(a.rate, 2), str(a.silent), show.number(a.last, 1))
         for name, a in found.antennas.items()
     ]
     show.table(header, rows)
-    typer.echo()
+    show.line()
 
 
 def _print_images(found: ImageSummary) -> None:
     sizes = ", ".join(found.sizes) or "unknown"
-    typer.echo(
+    show.line(
         f"images: {found.images}, of {sizes} px; {found.readable} of the {found.looked_at} looked at can be read, "
         f"with {found.features:.0f} {found.feature} features (median)"
     )
-    typer.echo()
+    show.line()
 
 
 def _print_pixels(found: PixelSummary) -> None:
     unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
-    typer.echo(
+    show.line(
         f"identified pixels: {found.rows} in {found.frames} images, of {found.known} points of the map and {unknown}"
     )
-    typer.echo()
+    show.line()
 
 
 def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:

@@ -22,10 +22,12 @@ from factorgraph_loc.cli import (
     manifest,
     mapping,
     running,
+    show,
     simulating,
     viewing,
 )
-from factorgraph_loc.errors import FglocError
+from factorgraph_loc.cli.streams import OutputError, standard_streams
+from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.experiments.threads import use_one_thread
 
 DEBUG = "--debug"
@@ -53,10 +55,15 @@ class Commands(TyperGroup):
         except FglocError as error:
             if ctx.params.get("debug"):
                 raise
-            typer.echo(f"error: {error}", err=True)
+            show.note(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
+        except OSError as error:
+            if ctx.params.get("debug"):
+                raise
+            show.note(f"error: {unusable(error)}")
+            raise typer.Exit(FglocError.exit_code) from error
         except KeyboardInterrupt as stop:
-            typer.echo("interrupted", err=True)
+            show.note("interrupted")
             raise typer.Exit(INTERRUPTED) from stop
 
 
@@ -65,8 +72,8 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, 70 a fault of the program, "
-    "130 interrupted.",
+    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, or a file or standard output "
+    "that cannot be written, 70 a fault of the program, 130 interrupted, 141 who reads the output has ended.",
 )
 app.command()(inspecting.datasets)
 app.command()(inspecting.info)
@@ -87,7 +94,7 @@ app.add_typer(features.app, name="features")
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"fgloc {__version__}")
+        show.line(f"fgloc {__version__}")
         raise typer.Exit
 
 
@@ -107,7 +114,12 @@ def main() -> None:
     """The entry point of ``fgloc``."""
     use_one_thread()
     try:
-        app()
+        with standard_streams():
+            app()
+    except OutputError as error:  # of --help and --version too
+        show.note(f"error: {error}")
+        sys.exit(error.exit_code)
     except Exception as error:
-        traceback.print_exc()
+        for line in traceback.format_exc().splitlines():
+            show.note(line)
         sys.exit(error.exit_code if isinstance(error, FglocError) else UNFORESEEN)

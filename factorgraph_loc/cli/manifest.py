@@ -36,7 +36,7 @@ def manifest(bag: BagPath, json: Json = False) -> None:
     if json:
         show.document({"manifest": content, "remarks": told})
     else:
-        typer.echo(manifest_text(content, told), nl=False)
+        show.lines(manifest_text(content, told).rstrip("\n"))
 
 
 def info_of_bag(bag: Path, json: Json) -> None:
@@ -57,11 +57,11 @@ def info_of_bag(bag: Path, json: Json) -> None:
         show.document({"bag": str(bag), "duration": duration, "topics": rows})
         return
     show.fields({"bag": str(bag), "duration": f"{duration:.1f} s"})
-    typer.echo()
+    show.line()
     header = ("topic", "type", "messages", "rate [Hz]", "looks like")
     show.table(header, [_row(t.name, t.type, t.count, rates[t.name], uses.get(t.name, "")) for t in topics])
-    typer.echo()
-    typer.echo(
+    show.line()
+    show.line(
         f"`fgloc manifest {bag} > run.toml` proposes how to read it; then `fgloc info run.toml` shows what it holds"
     )
 

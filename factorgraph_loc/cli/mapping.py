@@ -101,8 +101,9 @@ def map_(
         )
         return
     for line in (*_tell(made.details), f"the frame of the new map is {made.frame}"):
-        typer.echo(line)
-    typer.echo(f"\nthe map is in {out}, a picture of it in {picture}")
+        show.line(line)
+    show.line()
+    show.line(f"the map is in {out}, a picture of it in {picture}")
 
 
 def _tell(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> tuple[str, ...]:
@@ -115,11 +116,11 @@ def _tell(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> tuple[st
         return mapping_tags.tell_dropped(found)
     if isinstance(found, LandmarkMap):
         show.table(HEADER, _rows(found))
-        typer.echo()
+        show.line()
         return (found.summary(), *found.notes)
     if isinstance(found, MadeTags):
         show.table(mapping_tags.HEADER, mapping_tags.rows(found))
-        typer.echo()
+        show.line()
         return (found.made.summary("tags"), *mapping_tags.notes(found))
     return (
         f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes",

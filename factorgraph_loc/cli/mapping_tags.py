@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from factorgraph_loc.cli import show
 
 if TYPE_CHECKING:
@@ -52,7 +50,7 @@ def tell_dropped(found: DroppedTags) -> tuple[str, ...]:
     """Print the tags that are dropped, and return what there is to say of them."""
     if found.dropped:
         show.table(("dropped tag", "P(dead)"), [(name, f"{dead:.4f}") for name, dead in found.dropped.items()])
-        typer.echo()
+        show.line()
     count = len(found.dropped)
     return (f"believed dead and not in the new map: {count} of {count + found.kept} tags",)
 

@@ -102,7 +102,8 @@ def run(
     _print_learnt(result)
     _print_events(result)
     _print_effort(scores)
-    typer.echo(f"\nresults are in {out}")
+    show.line()
+    show.line(f"results are in {out}")
 
 
 def compare(
@@ -150,8 +151,8 @@ def compare(
     else:
         show.rich_table(comparison_table(comparison.rows))
         for line in verdict(comparison.rows):
-            typer.echo(line)
-        typer.echo(
+            show.line(line)
+        show.line(
             f"\nresults are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/"
         )
     if comparison.failures:
@@ -182,17 +183,17 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         show.table(("", *COLUMNS), rows)
     elif not _print_space(scores):
         hardly = f", or hardly any: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
-        typer.echo(f"there is no reference to score against{hardly}")
+        show.line(f"there is no reference to score against{hardly}")
     if scores["aligned.position_rmse"] is not None:
         position, heading = (
             show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))
         )
-        typer.echo(f"final, aligned as the map was free: position RMSE {position} m, heading RMSE {heading} rad")
+        show.line(f"final, aligned as the map was free: position RMSE {position} m, heading RMSE {heading} rad")
     if scores["landmarks.count"]:
         error, anees = (show.number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
-        typer.echo(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideally 2")
+        show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideally 2")
     if scores["time_to_localized"]:
-        typer.echo(f"localized after {scores['time_to_localized']:.1f} s")
+        show.line(f"localized after {scores['time_to_localized']:.1f} s")
 
 
 def _print_consistency(scores: Mapping[str, Any]) -> None:
@@ -201,7 +202,7 @@ def _print_consistency(scores: Mapping[str, Any]) -> None:
             sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
             # a few gross outliers make a mean of anything
             share = 100.0 * scores[f"nis.{sensor}.beyond_95"]
-            typer.echo(
+            show.line(
                 f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1; "
                 f"{share:.1f} % beyond the 95 % bound, ideally 5"
             )
@@ -210,33 +211,33 @@ def _print_consistency(scores: Mapping[str, Any]) -> None:
 def _print_learnt(result: RunResult) -> None:
     constants = result.learnt.values
     for name, (value, sigma) in islice(constants.items(), SHOWN_CONSTANTS):
-        typer.echo(f"learnt: {name} {value:.5g} ± {sigma:.2g}")
+        show.line(f"learnt: {name} {value:.5g} ± {sigma:.2g}")
     if len(constants) > SHOWN_CONSTANTS:
-        typer.echo(f"learnt: {len(constants) - SHOWN_CONSTANTS} more in learnt.json")
+        show.line(f"learnt: {len(constants) - SHOWN_CONSTANTS} more in learnt.json")
 
 
 def _print_events(result: RunResult) -> None:
     events = result.diagnostics.events
     if events:
         more = f", of which the first {SHOWN_EVENTS}; all are in events.csv" if len(events) > SHOWN_EVENTS else ""
-        typer.echo(f"events: {len(events)}{more}")
+        show.line(f"events: {len(events)}{more}")
     for t, text in events[:SHOWN_EVENTS]:
-        typer.echo(f"  at {t:.1f} s: {text}")
+        show.line(f"  at {t:.1f} s: {text}")
 
 
 def _print_effort(scores: Mapping[str, Any]) -> None:
     counts = ", ".join(f"{scores[f'{kind}.total']} {kind}" for kind in ("ignored", "rejected", "late"))
-    typer.echo(f"measurements: {counts}")
+    show.line(f"measurements: {counts}")
     if images := scores["timing.images"]:
         seconds = scores["timing.frontend_seconds"]
-        typer.echo(
+        show.line(
             f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} a second, the cache included"
         )
     final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
     if scores["time_to_localized"] is None:  # it only collected what came
-        typer.echo(f"time: {final}")
+        show.line(f"time: {final}")
         return
     median, factor = (
         show.number(scores[f"timing.{name}"], n) for name, n in (("update_ms_median", 2), ("real_time_factor", 0))
     )
-    typer.echo(f"time: {median} ms per update (median), {factor} times real time, {final}")
+    show.line(f"time: {median} ms per update (median), {factor} times real time, {final}")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-import typer
+from factorgraph_loc.text import MESSAGE, one_line, plain
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,22 +18,35 @@ if TYPE_CHECKING:
 WARNINGS = 20  # that are printed
 
 
+def line(text: str = "") -> None:
+    """A line on stdout, the only way there but for tables and documents. What no terminal shows as a character is escaped."""
+    print(plain(text, None), flush=True)
+
+
+def lines(text: str) -> None:
+    """Text of several lines on stdout, such as a file."""
+    for one in text.split("\n"):
+        line(one)
+
+
 def note(text: str) -> None:
     """A line for people, on stderr: where results are, what is doubtful."""
-    typer.echo(text, err=True)
+    print(plain(text, None), file=sys.stderr, flush=True)
 
 
 def warnings(texts: Sequence[str]) -> None:
     """What is doubtful, a line each on stderr; of very many the first, for all stand with the results."""
     for one in texts[:WARNINGS]:
-        note(f"warning: {one}")
+        note(f"warning: {one_line(one)}")
     if len(texts) > WARNINGS:
         note(f"warning: {len(texts) - WARNINGS} more stand with the results")
 
 
 def document(content: Any) -> None:
-    """One JSON document on stdout; what JSON cannot say (NaN, infinity) is null."""
-    typer.echo(json.dumps(_plain(content), indent=2, ensure_ascii=False))
+    """One JSON document on stdout; what JSON cannot say (NaN, infinity) is null, what a terminal does not show is escaped."""
+    unicode = sys.stdout.encoding.lower().startswith("utf")
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=not unicode)
+    print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -43,9 +56,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     out = Table(box=None, pad_edge=False, header_style="bold")
     for i, name in enumerate(header):
         numeric = i > 0 and all(_is_number(row[i]) for row in rows)
-        out.add_column(name, justify="right" if numeric else "left", no_wrap=True)
+        out.add_column(plain(name), justify="right" if numeric else "left", no_wrap=True)
     for row in rows:
-        out.add_row(*row)
+        out.add_row(*(plain(cell, MESSAGE) for cell in row))
     rich_table(out)
 
 
@@ -53,7 +66,7 @@ def rich_table(content: Table) -> None:
     """A table of rich's on stdout. In a narrow terminal its lines are broken, but nothing is cut off."""
     from rich.console import Console
 
-    console = Console(markup=False, highlight=False, width=1000)
+    console = Console(markup=False, emoji=False, highlight=False, width=1000)
     if sys.stdout.isatty():
         console.width = max(shutil.get_terminal_size().columns, console.measure(content).maximum)
     console.print(content)
@@ -78,17 +91,18 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
 
     console = Console(stderr=True)
     amount = MofNCompleteColumn() if counted else TaskProgressColumn()
-    columns = (TextColumn(what), BarColumn(), amount, TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
+    title, remarks = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[remark]}", markup=False)
+    columns = (title, BarColumn(), amount, TimeRemainingColumn(), remarks)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None, remark="")
-        yield lambda done, total, remark="": bar.update(task, completed=done, total=total, remark=remark)
+        task = bar.add_task(plain(what), total=None, remark="")
+        yield lambda done, total, remark="": bar.update(task, completed=done, total=total, remark=plain(remark))
 
 
 def fields(content: Mapping[str, str]) -> None:
     """Names and values, one pair a line."""
     width = max(map(len, content))
     for name, value in content.items():
-        typer.echo(f"{name:<{width}}  {value}")
+        line(f"{name:<{width}}  {value}")
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -85,7 +85,7 @@ def simulate(
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         if not json:
-            typer.echo(f"wrote {folder}")
+            show.line(f"wrote {folder}")
         first, last = log.span()
         written.append({"log": log.name, "seed": number, "span": last - first, "folder": str(folder)})
     if json:

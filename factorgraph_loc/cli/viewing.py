@@ -57,7 +57,7 @@ def view(
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
-        typer.echo(f"wrote {rrd}: rerun {rrd} shows it")
+        show.line(f"wrote {rrd}: rerun {rrd} shows it")
 
 
 def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:

@@ -1,0 +1,89 @@
+"""The command with standard output and standard error of all kinds. Each case is a process, as the interpreter's own end counts."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.log import IncrementStream, Log
+from factorgraph_loc.readers import write_native
+from factorgraph_loc.rig import Rig
+from factorgraph_loc.world import World
+
+NAME = "Gärtnerstraße ± 廊下 🤖"
+FGLOC = f"{sys.executable} -c 'from factorgraph_loc.cli.main import main; main()'"
+REFUSED = "error: standard output: cannot be written: "
+BUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
+
+
+def shell(line: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """What a shell makes of ``fgloc`` with ``line``."""
+    command = f"set -o pipefail; {FGLOC} {line}"
+    environment = {**os.environ, **environment}
+    return subprocess.run(["bash", "-c", command], capture_output=True, check=False, env=environment, timeout=60)
+
+
+@pytest.fixture(scope="module")
+def named_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a log with a name that ASCII does not have."""
+    t = np.arange(20) * 0.1
+    odometry = IncrementStream(t, np.full(20, 0.05), np.zeros(20), np.zeros(20))
+    folder = tmp_path_factory.mktemp("logs") / "named"
+    write_native(Log(NAME, Rig(sensors=("odometry",)), World(), {"odometry": odometry}, None), folder)
+    return folder
+
+
+@BUFFERED
+@pytest.mark.parametrize("arguments", ["datasets --json", "--help"])
+@pytest.mark.parametrize(("to", "why"), [(">/dev/full", "No space left on device"), (">&-", "Bad file descriptor")])
+def test_output_that_cannot_be_written_is_one_line(arguments: str, to: str, why: str, unbuffered: str) -> None:
+    done = shell(f"{arguments} {to}", PYTHONUNBUFFERED=unbuffered)
+    assert done.stderr.decode() == f"{REFUSED}{why}\n"
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize("to", ["2>/dev/full", "2>&-", "2>&- <&- >&-"])
+def test_messages_that_cannot_be_written_change_no_exit_code(to: str) -> None:
+    done = shell(f"info nowhere {to}", PYTHONUNBUFFERED="")
+    assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
+
+
+def test_who_reads_no_further_ends_the_command_quietly() -> None:
+    done = shell("--help | (exec <&-)")
+    assert done.stderr == b""
+    assert done.returncode == 141
+
+
+def test_a_closed_descriptor_is_not_taken_by_a_file(tmp_path: Path) -> None:
+    program = (
+        "import os, sys\n"
+        "from factorgraph_loc.cli.streams import standard_streams\n"
+        "with standard_streams(), open(sys.argv[1], 'w') as file:\n"
+        "    print(file.fileno(), file=file, flush=True)\n"
+    )
+    command = f'{sys.executable} -c "$1" {tmp_path}/number <&- >&- 2>&-'
+    subprocess.run(["bash", "-c", command, "-", program], check=True, timeout=60)
+    assert int((tmp_path / "number").read_text()) > 2
+
+
+def test_characters_that_the_terminal_lacks_are_replaced(named_log: Path) -> None:
+    ascii_only = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
+    done = shell(f"info {named_log}", **ascii_only)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert "G?rtnerstra?e ? ?? ?" in done.stdout.decode("ascii")
+    done = shell(f"info {named_log} --json", **ascii_only)
+    assert NAME in json.loads(done.stdout.decode("ascii")).values()
+
+
+def test_file_names_of_all_kinds_are_told(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"caf\xe9 \x1b[31mred \xe2\x80\xae")
+    command = ["bash", "-c", f'{FGLOC} info "$1"', "-", str(path)]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=60)
+    assert done.returncode == 2
+    told = done.stderr.decode()
+    assert "caf\\udce9 \\x1b[31mred \\u202e" in told
+    assert told.removesuffix("\n").isprintable()
