@@ -23,6 +23,14 @@ def nearest(covariances: Array) -> Array:
     return np.asarray(shares * sigmas[..., :, None] * sigmas[..., None, :])
 
 
+def sound(covariance: Array) -> Array:
+    """The covariance (D, D) itself where it can be inverted, else the :func:`nearest` that can."""
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if np.all(sigmas > 0.0) and np.linalg.eigvalsh(covariance / sigmas[:, None] / sigmas)[0] > LEAST:
+        return covariance
+    return nearest(covariance)
+
+
 def whitener(covariances: Array) -> Array:
     """The inverses of the lower roots of covariances (..., D, D); of other roots, which whiten as well, where there are none."""
     try:

@@ -342,7 +342,8 @@ class KeyframeGraph(ABC):
             return f"the constants of the {names[key]}"
         if is_point(key):
             return f"point {index_of(key)}"
-        return f"the landmark {list(self._places)[index_of(key)]}"
+        names_of = {number: name for name, number in self._places.items()}
+        return f"the landmark {names_of[index_of(key)]}"
 
     def _between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""

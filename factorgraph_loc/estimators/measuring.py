@@ -345,7 +345,7 @@ class MeasuringGraph(KeyframeGraph):
         self._new_landmarks, earlier = self._new_landmarks.propose(name, point, covariance, sighting)
         if earlier is None:
             return
-        self._places[name] = len(self._places)
+        self._places[name] = 1 + max(self._places.values(), default=-1)
         key = landmark_key(self._places[name])
         self._constants[key], self._spreads[key] = point, covariance
         addition.values[key] = point

@@ -13,6 +13,7 @@ import bisect
 import math
 from abc import abstractmethod
 from collections import Counter, deque
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstim
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
+from factorgraph_loc.estimators.mapping import NewLandmarks
 from factorgraph_loc.estimators.measuring import MeasuringGraph
 from factorgraph_loc.estimators.new_points import FEWEST
 from factorgraph_loc.estimators.pixel_finder import MISSED, PixelFinder
@@ -31,7 +33,7 @@ from factorgraph_loc.estimators.scan_monitor import ScanMonitor
 from factorgraph_loc.estimators.seen_points import Pixels
 from factorgraph_loc.estimators.tags import TagUpdate
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.estimators.variables import is_point
+from factorgraph_loc.estimators.variables import is_point, landmark_key
 from factorgraph_loc.measurements import Exteroceptive, Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.tag_map import extent
 from factors import se2
@@ -277,6 +279,15 @@ class RelocatingGraph(MeasuringGraph):
         for key in [key for key in self._constants if is_point(key) and key not in kept]:
             del self._constants[key], self._spreads[key]
         self._unknown.keep_only(kept)
+
+    def _forget_landmarks(self, known: Collection[int]) -> None:
+        """Give up the landmarks that neither the keyframes that are left tell, nor a summary of what has left the graph, whose
+        variables are ``known``; and sightings that wait for another."""
+        self._new_landmarks = NewLandmarks()
+        told = {key for k in self._keyframes for node in k.nodes for key in node.keys}
+        for name, key in [(name, landmark_key(i)) for name, i in self._places.items()]:
+            if key not in told and key not in known:
+                del self._places[name], self._constants[key], self._spreads[key]
 
     def _placed(self, t: float) -> Array:
         """Where the robot was at ``t``, from the place that was found and the odometry since."""

@@ -23,10 +23,20 @@ from factorgraph_loc.estimators.marginals import IndeterminateError, covariances
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.estimators.relocating import RelocatingGraph
 from factorgraph_loc.estimators.solvers import MARGIN, FullHistory, Solver, Window, read_all
-from factorgraph_loc.estimators.summary import Summary
+from factorgraph_loc.estimators.stalled import Stalled
+from factorgraph_loc.estimators.summary import Summary, is_missing
 from factorgraph_loc.estimators.unknown_points import HORIZON
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, SENSOR_KEY, Node, Values, is_point, is_pose
-from factors import se2
+from factorgraph_loc.estimators.variables import (
+    ODOMETRY_KEY,
+    SENSOR_KEY,
+    Node,
+    Values,
+    gtsam_errors,
+    index_of,
+    is_point,
+    is_pose,
+)
+from factors import positive, se2
 from factors.odometry import between_factor
 from factors.se2 import Array
 
@@ -59,7 +69,10 @@ class Smoother(RelocatingGraph):
         super().__init__(setup, settings)
         self._settings = settings
         self._failed: list[str] = []
+        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
+        self._factorization = "QR" if self._unknown is None else "CHOLESKY"
         self._solver = self._new_solver()
+        self._stalled: Stalled | None = None  # the last one
         self._last = gtsam.Values()  # all estimates after the last update, where landmarks are estimated
         # where landmarks are estimated an update takes long: what is seen between keyframes waits for the next one
         self._waits = settings.landmarks != "known"
@@ -90,15 +103,17 @@ class Smoother(RelocatingGraph):
         waiting = self._waiting.values
         if not self._settings.smooth:
             estimates = list(self._filtered)
-        elif isinstance(self._solver, FullHistory):
+        elif self._settings.lag is None:
             keys = [*(k.key for k in self._keyframes), *self._constants]
             return self._optimum(waiting | {key: self._solver.value(key) for key in keys if key not in waiting})
         else:
+            stalled, open_ones = isinstance(self._solver, Stalled), self._keyframes[len(self._left) :]
             try:
-                for key in self._constants.keys() - waiting.keys():
+                for key in () if stalled else self._constants.keys() - waiting.keys():
                     self._constants[key], self._spreads[key] = self._marginal(key)
-                open_ones = self._keyframes[len(self._left) :]
-                now = [self._filtered[k.index] if k.key in waiting else self._marginal(k.key) for k in open_ones]
+                now = [
+                    self._filtered[k.index] if stalled or k.key in waiting else self._marginal(k.key) for k in open_ones
+                ]
             except RuntimeError as error:
                 raise self._unsolved(error) from error
             estimates = [*self._left, *now]
@@ -118,12 +133,18 @@ class Smoother(RelocatingGraph):
 
     def _begin_again(self, newest: Keyframe) -> None:
         del self._filtered[newest.index :]
-        self._filtered.append((self._pose, self._covariance))
+        guess = self._pose, self._covariance
+        self._filtered.append(guess)
         summary = self._solver.summary(failed=False)
         try:
-            self._start_again(newest, None if summary is None else summary.before(newest.index))
+            with gtsam_errors():
+                summary = None if summary is None else summary.before(newest.index)
+                self._forget_landmarks(frozenset() if summary is None else summary.keys)
+                self._start_again(newest, summary)
         except RuntimeError as error:
-            raise self._unsolved(error) from error
+            if newest.index == 0:
+                raise self._unsolved(error) from error
+            self._stall(newest, guess, summary, error)
 
     def _guess_of(self, keyframe: int) -> Guess:
         return self._filtered[keyframe]
@@ -161,11 +182,15 @@ class Smoother(RelocatingGraph):
         newest = self._keyframes[-1]
         nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
         self._solved, guess = newest.t, self._filtered[newest.index]
+        if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
+            self._pose, self._covariance = guess  # the next try takes in what keyframes and constants hold
+            return
         self._leave(newest.t, [k for k in self._constants if k not in values and not is_point(k)])
         try:
-            self._solver.update(nodes, values, newest.t)
-            self._check_jump(newest, guess)
-            self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
+            with gtsam_errors():
+                self._solver.update(nodes, values, newest.t)
+                self._check_jump(newest, guess)
+                self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
         except RuntimeError as error:
             self.diagnostics.events.append((newest.t, f"solver rebuilt: {self._reason(error)}"))
             self._rebuild(newest, guess)
@@ -178,7 +203,7 @@ class Smoother(RelocatingGraph):
             return
         pose, spread = guess
         off = se2.log(se2.between(pose, self._solver.value(newest.key)))
-        if not off @ np.linalg.solve(spread, off) < JUMPED:
+        if not positive.squared(off, spread) < JUMPED:
             raise RuntimeError("the estimate jumped")
         self._last = self._solver.estimates()
 
@@ -205,12 +230,12 @@ class Smoother(RelocatingGraph):
         try:
             covariance = self._solver.covariance(key)
         except RuntimeError:
-            covariance = np.full(1, np.nan)
-        if not np.all(np.isfinite(covariance)):
+            covariance = np.full((1, 1), np.nan)
+        if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
             found = covariances(*self._solver.linear(), (key,))
             self._report_damping(found.damping)
             covariance = found.by_key[key]
-        return value, covariance
+        return value, positive.sound(covariance)
 
     def _leave(self, now: float, constants: Iterable[int]) -> None:
         """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
@@ -246,29 +271,57 @@ class Smoother(RelocatingGraph):
             del self._constants[key], self._spreads[key]
 
     def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
-        """A new solver after the old one failed, from what that told before; then without what may throw. RunFailedError where
-        nothing helps."""
+        """A new solver after the old one failed, from what that told before; then without what may throw, then with QR, which
+        keeps more digits, then without what the newest keyframe tells. Where nothing helps there is none for a while."""
         failure = RuntimeError()
         summary = self._solver.summary(failed=True)
         near = read_all(self._last, [*(k.key for k in self._keyframes), *self._constants])
-        for throws in (True, False, False):
+        tries = [(True, self._factorization), (False, self._factorization), (False, "QR"), (False, "QR")]
+        for i, (throws, factorization) in enumerate(tries):
+            if i == len(tries) - 1:
+                self._drop_newest(newest)
+            elif tries[i - 1] == (throws, factorization):
+                continue
             self._filtered[newest.index] = guess
             try:
-                self._start_again(newest, summary, near, throws=throws)
-                if summary is not None and any(_has_pose(node) for node in newest.nodes):
-                    self._check_jump(newest, guess)
+                with gtsam_errors():
+                    self._start_again(newest, summary, near, throws, factorization)
+                    if summary is not None and any(node.has_pose for node in newest.nodes):
+                        self._check_jump(newest, guess)
             except RuntimeError as error:
                 failure = error
             else:
                 return
-            count = sum(_has_pose(node) for node in newest.nodes)
-            if not throws and count:
-                self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
-                newest.nodes[:] = [node for node in newest.nodes if not _has_pose(node)]  # priors of points
-        raise self._unsolved(failure) from failure
+        self._stall(newest, guess, summary, failure)
+
+    def _drop_newest(self, newest: Keyframe) -> None:
+        """Drop what the newest keyframe tells of poses; priors of points stay."""
+        if count := sum(node.has_pose for node in newest.nodes):
+            self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
+            newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]
+
+    def _stall(self, newest: Keyframe, guess: Guess, summary: Summary | None, error: RuntimeError) -> None:
+        """Go on as a filter where the graph cannot be solved."""
+        self._filtered[newest.index] = self._pose, self._covariance = guess
+        self._waiting = Addition()
+        self._solver = self._stalled = Stalled(newest.t, self._known, summary, self._stalled)
+        self.diagnostics.events.append(
+            (newest.t, f"goes on without a solver until {self._solver.until:.1f} s: {self._reason(error)}")
+        )
+
+    def _known(self, key: int) -> Array:
+        """What is known of a variable without the solver."""
+        if is_pose(key):
+            return self._filtered[index_of(key)][0]
+        return self._constants[key] if key in self._constants else self._departed[0][key]
 
     def _start_again(
-        self, newest: Keyframe, summary: Summary | None, near: Mapping[int, Array] = NOWHERE, throws: bool = False
+        self,
+        newest: Keyframe,
+        summary: Summary | None,
+        near: Mapping[int, Array] = NOWHERE,
+        throws: bool = False,
+        factorization: str | None = None,
     ) -> None:
         """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
         throw where a point gets behind a camera, at a tenth of the time.
@@ -276,7 +329,7 @@ class Smoother(RelocatingGraph):
         A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
         begins with the priors.
         """
-        self._solver, self._waiting, self._solved = self._new_solver(), Addition(), newest.t
+        self._solver, self._waiting, self._solved = self._new_solver(factorization), Addition(), newest.t
         keyframes = self._keyframes[0 if summary is None else summary.oldest :]
         guesses = {k.key: self._filtered[k.index][0] for k in keyframes} | self._constants
         known: Collection[int] = () if summary is None else summary.keys
@@ -286,11 +339,11 @@ class Smoother(RelocatingGraph):
         if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
             guesses |= read_all(summary.at, guesses)
         factors = self._priors() if summary is None else summary.on(guesses)
-        nodes = [n for k in keyframes for n in k.nodes if _is_missing(n, guesses, known)]
+        nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
         if near and isinstance(self._solver, FullHistory):
             guesses = self._problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
         if not throws:
-            nodes = [n if n.factor is None or not _has_pose(n) else replace(n, native=None) for n in nodes]
+            nodes = [n if n.factor is None or not n.has_pose else replace(n, native=None) for n in nodes]
         nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
         self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
         self._read(newest, self._constants)
@@ -323,10 +376,9 @@ class Smoother(RelocatingGraph):
         assert keyframe.from_previous is not None
         return Node(keys, native=between_factor(keys[0], keys[1], keyframe.from_previous))
 
-    def _new_solver(self) -> Solver:
+    def _new_solver(self, factorization: str | None = None) -> Solver:
         parameters = gtsam.ISAM2Params()
-        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
-        parameters.setFactorization("QR" if self._unknown is None else "CHOLESKY")
+        parameters.setFactorization(factorization or self._factorization)
         # far from where a point was first taken to be its factors mean nothing
         parameters.relinearizeSkip = self._settings.relinearize_skip if self._unknown is None else 1
         if self._settings.lag is None:
@@ -335,15 +387,3 @@ class Smoother(RelocatingGraph):
         parameters.setRelinearizeThreshold(threshold if self._unknown is None else min(threshold, NEAR_POINTS))
         parameters.findUnusedFactorSlots = True
         return Window(parameters, self._settings.lag, self._failed.append)
-
-
-def _is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
-    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
-    it holds the priors of points, and what hangs on a pose that is gone."""
-    if any(key not in present for key in node.keys):
-        return False
-    return _has_pose(node) or node.keys[0] not in known
-
-
-def _has_pose(node: Node) -> bool:
-    return any(is_pose(key) for key in node.keys)

@@ -10,15 +10,14 @@ Research 29(5), 2010). In a window there are few variables, and callbacks are ch
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.estimators.summary import Summary, oldest_pose
-from factorgraph_loc.estimators.variables import Node, Values, gather, is_point, is_pose, read, to_gtsam
+from factorgraph_loc.estimators.variables import Node, Values, gather, gtsam_errors, is_point, is_pose, read, to_gtsam
 from factors.graph import custom_factor, jacobian_factor, pose_array, read_pose, read_vector
 from factors.se2 import Array
 
@@ -75,7 +74,7 @@ class FullHistory:
         self._linear: defaultdict[int, list[_Linear]] = defaultdict(list)  # our factors on each variable
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        with _gtsam():
+        with gtsam_errors():
             self._update(nodes, values)
 
     def _update(self, nodes: Sequence[Node], values: Values) -> None:
@@ -122,11 +121,11 @@ class FullHistory:
         return None
 
     def value(self, key: int) -> Array:
-        with _gtsam():
+        with gtsam_errors():
             return read(self._isam, key)
 
     def covariance(self, key: int) -> Array:
-        with _gtsam():
+        with gtsam_errors():
             return np.asarray(self._isam.marginalCovariance(key))
 
     def estimates(self) -> gtsam.Values:
@@ -179,15 +178,15 @@ class Window:
         for node in nodes:
             graph.add(node.native if node.native is not None else self._custom(node))
         self._before = self._smoother.getFactors(), self._smoother.getLinearizationPoint()
-        with _gtsam():
+        with gtsam_errors():
             self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
 
     def value(self, key: int) -> Array:
-        with _gtsam():
+        with gtsam_errors():
             return read(self._smoother, key)
 
     def covariance(self, key: int) -> Array:
-        with _gtsam():
+        with gtsam_errors():
             return np.asarray(self._smoother.marginalCovariance(key))
 
     def estimates(self) -> gtsam.Values:
@@ -206,7 +205,7 @@ class Window:
 
     def covariances(self, keys: Sequence[int]) -> list[Array]:
         """Marginal covariances of neighbouring poses, together: they share most of the work."""
-        with _gtsam():
+        with gtsam_errors():
             joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
             return [np.asarray(joint.at(key, key)) for key in keys]
 
@@ -230,15 +229,6 @@ class _Linear:
         point = gather(values, self.node.keys)
         here = to_gtsam(dict(zip(self.node.keys, point, strict=True)))
         return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, point), here)
-
-
-@contextmanager
-def _gtsam() -> Iterator[None]:
-    """Whatever GTSAM throws as RuntimeError."""
-    try:
-        yield
-    except (IndexError, ValueError) as error:
-        raise RuntimeError(str(error)) from error
 
 
 def _linear(isam: gtsam.ISAM2) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import gtsam
 
-from factorgraph_loc.estimators.variables import index_of, is_pose
+from factorgraph_loc.estimators.variables import Node, index_of, is_pose
 
 KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
 
@@ -72,3 +72,11 @@ class Summary:
             _, rest = linear.eliminatePartialMultifrontal(order)
             kept += [gtsam.LinearContainerFactor(rest.at(i), self.at) for i in range(rest.size())]
         return kept
+
+
+def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
+    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
+    it holds the priors of points, and what hangs on a pose that is gone."""
+    if any(key not in present for key in node.keys):
+        return False
+    return node.has_pose or node.keys[0] not in known

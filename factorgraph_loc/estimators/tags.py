@@ -15,6 +15,7 @@ from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.tag_map import TagMap, tag_map
 from factors import rfid_kernels, se2, se2_kernels
+from factors.odometry_kernels import FAR, ROUNDING
 from factors.rfid import Packed
 from factors.rfid_factor import RfidFactor, TagScore
 from factors.rfid_likelihood import Looks, RfidLikelihood, Score
@@ -286,5 +287,11 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
     spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(3)
+    if (
+        covariance[0, 0] + covariance[1, 1] > FAR
+    ):  # of one direction so much more than of the others that these would be lost
+        units = np.sqrt(np.diag(spread))
+        gradient = gradient / units
+        spread = spread / units.reshape(3, 1) / units + ROUNDING * np.eye(3)
     nis = float(gradient @ np.linalg.solve(spread, gradient))
     return nis, int(np.sum(np.linalg.eigvalsh(information) > TELLING)) if nis > 0.0 else 0

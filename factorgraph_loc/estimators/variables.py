@@ -5,7 +5,8 @@ A variable is a pose (3,), or a vector: constants of a sensor that are estimated
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import gtsam
@@ -63,6 +64,20 @@ class Node:
     factor: Factor | None = None
     rows: int = 0
     native: gtsam.NonlinearFactor | None = None
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether it is on a pose."""
+        return any(is_pose(key) for key in self.keys)
+
+
+@contextmanager
+def gtsam_errors() -> Iterator[None]:
+    """Whatever GTSAM throws, and what cannot be linearised for it, as RuntimeError."""
+    try:
+        yield
+    except (IndexError, ValueError) as error:
+        raise RuntimeError(str(error)) from error
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
