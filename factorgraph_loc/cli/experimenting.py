@@ -79,8 +79,8 @@ def run(
                 executor=None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed),
                 progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
             )
-    except KeyboardInterrupt:
-        show.note(f"stopped; what is done is in {prepared.folder}, the same command goes on")
+    except KeyboardInterrupt as stop:
+        stop.add_note(f"what is done is in {prepared.folder}, the same command goes on")
         raise
     show.warnings(done.warnings)
     for failure in done.failures[:SHOWN]:

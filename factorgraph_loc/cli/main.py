@@ -26,6 +26,7 @@ from factorgraph_loc.cli import (
     simulating,
     viewing,
 )
+from factorgraph_loc.cli.stopping import end, stoppable
 from factorgraph_loc.cli.streams import OutputError, standard_streams
 from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.experiments.threads import use_one_thread
@@ -33,7 +34,6 @@ from factorgraph_loc.experiments.threads import use_one_thread
 DEBUG = "--debug"
 COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
 SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
-INTERRUPTED = 130  # as shells count it: 128 and the number of the signal
 UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
 
 
@@ -63,8 +63,7 @@ class Commands(TyperGroup):
             show.note(f"error: {unusable(error)}")
             raise typer.Exit(FglocError.exit_code) from error
         except KeyboardInterrupt as stop:
-            show.note("interrupted")
-            raise typer.Exit(INTERRUPTED) from stop
+            raise typer.Exit(end(stop)) from stop
 
 
 app = typer.Typer(
@@ -73,7 +72,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, or a file or standard output "
-    "that cannot be written, 70 a fault of the program, 130 interrupted, 141 who reads the output has ended.",
+    "that cannot be written, 70 a fault of the program, 129, 130 and 143 hung up, interrupted and terminated, 141 who reads the "
+    "output has ended.",
 )
 app.command()(inspecting.datasets)
 app.command()(inspecting.info)
@@ -114,8 +114,10 @@ def main() -> None:
     """The entry point of ``fgloc``."""
     use_one_thread()
     try:
-        with standard_streams():
+        with standard_streams(), stoppable():
             app()
+    except KeyboardInterrupt as stop:  # before or after the command itself
+        sys.exit(end(stop))
     except OutputError as error:  # of --help and --version too
         show.note(f"error: {error}")
         sys.exit(error.exit_code)

@@ -152,7 +152,8 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, proc
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
     stderr = process.communicate(timeout=processes.PATIENCE)[1]
     assert process.returncode == 130
-    assert "the same command goes on" in stderr
+    assert stderr.endswith("the same command goes on\n")
+    assert stderr.count("\n") == 1
     assert "Traceback" not in stderr
     assert len(pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")) == 1
     status = fgloc("experiment", "status", "slow.toml", "--verify")

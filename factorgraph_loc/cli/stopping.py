@@ -1,0 +1,71 @@
+"""Signals that end the command, as an interrupt from the keyboard does: what was begun is cleared away first."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from factorgraph_loc.cli import show
+
+AGAIN = 0.05  # s
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+
+
+class Stop(KeyboardInterrupt):
+    """A signal came that ends the command."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = signal.Signals(number)
+
+
+def end(stop: KeyboardInterrupt) -> int:
+    """Remove what is temporary and say in one line on stderr what ended the command, with the notes of the exception; the exit code
+    that is due, 128 and the number of the signal."""
+    from factorgraph_loc.temporary import remove_own
+
+    remove_own()
+    number = stop.number if isinstance(stop, Stop) else signal.SIGINT
+    show.note("; ".join([WORDS[number], *getattr(stop, "__notes__", ())]))
+    return 128 + number
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """The signals of :data:`WORDS` are raised as a :class:`Stop` here, but for those that were ignored before.
+
+    A second one ends the process as it would have without this. Where the exception is lost, as Python cannot let it pass through
+    a destructor or a callback, the signal comes again.
+    """
+    before: dict[signal.Signals, Any] = {}
+    hook = sys.unraisablehook
+
+    def stop(number: int, _: FrameType | None) -> None:
+        for one in before:
+            signal.signal(one, signal.SIG_DFL)
+        raise Stop(number)
+
+    def lost(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, Stop):
+            number = unraisable.exc_value.number
+            signal.signal(number, stop)
+            threading.Timer(AGAIN, os.kill, (os.getpid(), number)).start()
+        else:
+            hook(unraisable)
+
+    for one in WORDS:
+        if signal.getsignal(one) not in (signal.SIG_IGN, None):
+            before[one] = signal.signal(one, stop)
+    sys.unraisablehook = lost
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for one, handler in before.items():
+            signal.signal(one, handler)

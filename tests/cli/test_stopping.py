@@ -1,0 +1,86 @@
+"""Commands that a signal ends: with one line, an exit code, and nothing left behind; after `kill -9` the same command goes on."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factorgraph_loc.cli.stopping import Stop, stoppable
+
+COMMAND = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+LINES = {signal.SIGINT: "interrupted\n", signal.SIGTERM: "terminated\n", signal.SIGHUP: "hung up\n"}
+
+
+def compare(processes, out, short_log, **options):
+    """A comparison of two processes, of which the first is soon done and the second never."""
+    endless = ("--set", "particle_filter.particles=1000000")
+    line = ("compare", short_log, "-e", "dead_reckoning,particle_filter", "-o", out, "--jobs", 2, *endless)
+    running = processes.start(*COMMAND, *line, **options)
+    processes.wait_until(lambda: list(out.glob("runs/*/dead_reckoning/seed0")) and children(running.pid))
+    return running
+
+
+def children(pid):
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(path.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        if parent == pid:
+            found.append(int(path.parent.name))
+    return found
+
+
+def temporary(folder):
+    return [path for path in folder.rglob(".*") if ".fgloc-" in path.name]
+
+
+@pytest.mark.parametrize(("how", "whole"), [(signal.SIGTERM, False), (signal.SIGHUP, True)])
+def test_a_signal_ends_a_comparison_with_its_processes(how, whole, processes, short_log, tmp_path):
+    running = compare(processes, tmp_path / "out", short_log, stderr=subprocess.PIPE)
+    (os.killpg if whole else os.kill)(running.pid, how)
+    said = running.communicate(timeout=processes.PATIENCE)[1]
+    assert (running.returncode, said) == (128 + how, LINES[how])
+    processes.wait_until(lambda: not processes.of_group(running.pid))
+    assert temporary(tmp_path) == []
+
+
+def test_a_killed_comparison_leaves_no_process_and_can_be_made_again(processes, short_log, tmp_path, fgloc):
+    running = compare(processes, tmp_path / "out", short_log)
+    os.kill(running.pid, signal.SIGKILL)
+    running.wait()
+    processes.wait_until(lambda: not processes.of_group(running.pid))
+    other = fgloc("compare", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    assert other.exit_code == 2
+    assert "holds results already" in other.stderr
+
+
+def test_a_signal_that_is_ignored_from_the_start_stays_so(processes, short_log, tmp_path):
+    def nohup():
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    running = compare(processes, tmp_path / "out", short_log, preexec_fn=nohup, stderr=subprocess.PIPE)
+    os.kill(running.pid, signal.SIGHUP)
+    os.kill(running.pid, signal.SIGTERM)
+    assert running.communicate(timeout=processes.PATIENCE)[1] == "terminated\n"
+
+
+def test_a_signal_is_not_lost_in_a_destructor():
+    class Slow:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+            print("goes on")
+
+    def end_slowly():
+        slow = Slow()
+        del slow
+        signal.pause()
+
+    with pytest.raises(Stop) as stopped, stoppable():
+        end_slowly()
+    assert stopped.value.number == signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
