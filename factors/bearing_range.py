@@ -347,7 +347,8 @@ def _squared(
                 rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
                 rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
                 bb = 1.0 + bx * (xx * bx + xy * by) + by * (xy * bx + yy * by)
-                determinant = rr * bb - rb * rb
+                # rounding may take all of the difference, which is never less than that
+                determinant = max(rr * bb - rb * rb, 0.5 * (rr + bb))
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
                 squared[i, k] = mixed / determinant
                 widths[i, k] = 0.5 * math.log(determinant)

@@ -23,6 +23,8 @@ from factors.bearing_range import (
 from factors.displaced import carried, common_error, delayed, displaced
 from factors.se2 import Array
 
+LEAST_TOLD = 1e-6  # of a landmark's place, in standard deviations per metre, and as a share of what is told best
+
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
@@ -129,5 +131,15 @@ class BearingRangeFactor:
         point = se2.transform_from(at, located(here.model, self.ranges, self.bearings))[0]
         _, blocks = replace(self, free=True).whitened([*values, point])
         # the whitened residual stays zero: by_value dv + by_point dp = noise
-        to_point = np.linalg.inv(blocks[-1][0])
+        to_point = _inverse(blocks[-1][0])
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
+
+
+def _inverse(by_point: Array) -> Array:
+    """The inverse of a whitened Jacobian (2, 2) by a landmark; in a direction of which it tells nothing, as of a landmark where the
+    sensor is, that of one that hardly does."""
+    rows, values, columns = np.linalg.svd(by_point)
+    if values[1] > LEAST_TOLD * values[0]:
+        return np.asarray(np.linalg.inv(by_point))
+    values = np.maximum(values, max(LEAST_TOLD * values[0], LEAST_TOLD))
+    return np.asarray(columns.T / values @ rows.T)

@@ -92,9 +92,9 @@ def whitener(covariance: Array) -> Array:
     """The inverse of the lower root of a covariance (3, 3)."""
     a = math.sqrt(covariance[0, 0])
     b, c = covariance[1, 0] / a, covariance[2, 0] / a
-    d = math.sqrt(covariance[1, 1] - b * b)
+    d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
     e = (covariance[2, 1] - b * c) / d
-    f = math.sqrt(covariance[2, 2] - c * c - e * e)
+    f = math.sqrt(max(covariance[2, 2] - c * c - e * e, ROUNDING * covariance[2, 2]))
     return np.array(
         (
             (1.0 / a, 0.0, 0.0),

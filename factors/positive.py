@@ -39,6 +39,23 @@ def whitener(covariances: Array) -> Array:
         return _whitener(covariances)
 
 
+def root(covariances: Array) -> Array:
+    """The lower roots of covariances (..., D, D)."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariances))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.cholesky(nearest(covariances)))
+
+
+def solve(covariances: Array, right: Array) -> Array:
+    """What covariances (..., D, D) must be multiplied with to give ``right`` (..., D, N)."""
+    try:
+        return np.asarray(np.linalg.solve(covariances, right))
+    except np.linalg.LinAlgError:
+        whitened = _whitener(covariances)
+        return np.asarray(np.swapaxes(whitened, -1, -2) @ (whitened @ right))
+
+
 def inverse(covariances: Array) -> Array:
     """The inverses of covariances (..., D, D)."""
     try:

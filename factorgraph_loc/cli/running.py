@@ -198,7 +198,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
 
 def _print_consistency(scores: Mapping[str, Any]) -> None:
     for name, value in scores.items():
-        if name.startswith("nis.") and name.endswith(".mean_per_dof"):
+        if name.startswith("nis.") and name.endswith(".mean_per_dof") and value is not None:
             sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
             # a few gross outliers make a mean of anything
             share = 100.0 * scores[f"nis.{sensor}.beyond_95"]

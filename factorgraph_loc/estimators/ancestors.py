@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import positive
 from factors.se2 import Array
 
 Indices = NDArray[np.int64]
@@ -30,7 +31,7 @@ def draw_ancestors(
     """
     size = constants.shape[1]
     order = [*range(3, 3 + size), 0, 1, 2]  # of the constants first: what they whiten to is known before the loop
-    whitener = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    whitener = np.linalg.inv(positive.root(covariance[np.ix_(order, order)]))
     by_constants = np.ascontiguousarray(whitener[:, :size].T)
     return np.asarray(
         _draw(
@@ -53,7 +54,7 @@ def transition_log_density(
     The body-frame error is taken to first order: log(p^-1 * a) is the difference, turned into the frame of p. This is the plain
     twin of what the compiled kernel computes.
     """
-    whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitener = np.linalg.inv(positive.root(covariance))
     c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
     dx = after[:, None, 0] - predicted[:, 0]
     dy = after[:, None, 1] - predicted[:, 1]
@@ -98,6 +99,9 @@ def _draw(
                 squared += (whitened_after[j, p] - whitened[i, p]) ** 2
             density[i] = log_weights[i] - 0.5 * squared
             highest = max(highest, density[i])
+        if not highest > -np.inf:  # so far away that no density is left: by the weights alone
+            highest = np.max(log_weights)
+            density[:] = log_weights
         total = 0.0
         for i in range(count):
             # far below the highest nothing is drawn, and exp is what takes time

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.estimators.base import Mode
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 # of a cloud that has collapsed to one point: its covariance must still be one
@@ -68,7 +68,7 @@ class Cloud:
         covariance[range(3), range(3)] += MINIMUM_VARIANCE
         renewed = silverman(*errors.shape) ** 2
         # regression (3, 3+P) on the pose, of itself and of the constants; and what it explains of the covariance
-        by_pose = np.linalg.solve(covariance[:3, :3], covariance[:3])
+        by_pose = positive.solve(covariance[:3, :3], covariance[:3])
         explained = covariance[:, :3] @ by_pose
         shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
         cloud = replace(self, poses=se2.compose(middle, se2.exp(shrunk[:, :3])), constants=shrunk[:, 3:])
@@ -136,15 +136,16 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
     return max(low, SMALLEST * left, min(left, LEAST))
 
 
-def weighable(likelihood: Array, t: float) -> Array:
-    """A log-likelihood (N,) of time ``t`` by which particles can be weighed: one for which it is no number is impossible.
+def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
+    """A log-likelihood (N,) of time ``t`` by which particles of these ``log_weights`` (N,) can be weighed: one for which it is no
+    number is impossible.
 
     RunFailedError if none is possible.
     """
     possible = np.isfinite(likelihood)
     if possible.all():
         return likelihood
-    if not possible.any():
+    if not np.isfinite(log_weights[possible]).any():
         raise RunFailedError(
             f"at {t:.3f} s the likelihood of a measurement is a finite number for none of the particles"
         )

@@ -27,12 +27,14 @@ from factorgraph_loc.estimators.seen_points import ITERATIONS, SETTLED, KnownPoi
 from factorgraph_loc.measurements import BearingRange, CameraFrame, Exteroceptive, PixelSightings, Tick
 from factorgraph_loc.rig import NOTHING
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
+from factors import positive, se2
 from factors.bearing_range import TIME_OFFSET
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import PARAMETERS, Increment, recalibrated
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
+
+SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
 
 class EkfSettings(FilterSettings):
@@ -181,9 +183,18 @@ class Ekf(Filter):
         predicted = step.covariance(here.covariance)
         carried = here.covariance.copy()  # transition times covariance
         carried[:3] = step.transition @ here.covariance
-        gain = np.linalg.solve(predicted, carried).T
+        gain = positive.solve(predicted, carried).T
         change = np.concatenate((se2.log(se2.between(step.pose, after.pose)), after.rest - here.rest))
-        return here.plus(gain @ change, here.covariance + gain @ (after.covariance - predicted) @ gain.T)
+        covariance = here.covariance + gain @ (after.covariance - predicted) @ gain.T
+        if not _is_sound(covariance):
+            # a sum that is as positive as its parts, whatever the gain
+            gain = positive.solve(positive.nearest(predicted), carried).T
+            transition = np.eye(len(carried))
+            transition[:3] = step.transition
+            left, later = np.eye(len(carried)) - gain @ transition, after.covariance.copy()
+            later[:3, :3] += step.noise
+            covariance = positive.nearest(left @ here.covariance @ left.T + gain @ later @ gain.T)
+        return here.plus(gain @ change, covariance)
 
     def _start(self, prior: PosePrior) -> _State:
         constants = (self._odometry_constants, self._sensor_constants, self._camera_constants)
@@ -367,3 +378,15 @@ class Ekf(Filter):
     def _standstill(self) -> _Step:
         """The step to a second measurement of the same time."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
+
+
+def _is_sound(covariance: Array) -> bool:
+    """Whether rounding left a covariance symmetric and positive."""
+    variances = np.diag(covariance)
+    if np.any((covariance - covariance.T) ** 2 > SKEW**2 * np.outer(variances, variances)):
+        return False
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return False
+    return True

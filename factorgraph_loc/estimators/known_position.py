@@ -14,7 +14,7 @@ import numpy as np
 from factorgraph_loc.estimators.base import Mode, PosePrior
 from factorgraph_loc.estimators.cloud import gaussian
 from factorgraph_loc.estimators.motion import Motion
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState
 from factors.se2 import Array
 
@@ -74,7 +74,7 @@ class KnownPosition:
         """Half the squared Mahalanobis distance (N,) of present poses (N, 3) from it. ``spread`` (3, 3): body-frame covariance by
         which these poses may be off themselves."""
         error, _, covariance = self._linearized(poses, now, spread)
-        return np.asarray(0.5 * np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
+        return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
     def log_density(self, poses: Array, now: ChainState) -> Array:
         """Log of the density (N,) of present poses (N, 3)."""
@@ -85,14 +85,14 @@ class KnownPosition:
     def normal_equations(self, poses: Array, now: ChainState, spread: Array | None = None) -> tuple[Array, Array]:
         """Information (N, 3, 3) and gradient (N, 3) of the loss, by the body-frame perturbation of present poses (N, 3)."""
         error, jacobian, covariance = self._linearized(poses, now, spread)
-        weighted = np.linalg.solve(covariance, jacobian).transpose(0, 2, 1)
+        weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
     def whitened(self, pose: Array, now: ChainState) -> tuple[Array, Array, Array]:
         """Residual (2,) of a present pose (3,) in standard deviations of the position, its Jacobian (2, 3) by the body-frame
         perturbation, and the covariance (3, 3) of the odometry since, which is not in them."""
         error, jacobian, _ = self._linearized(pose[None], now, None)
-        root = np.linalg.cholesky(self.prior.covariance[:2, :2])
+        root = positive.root(self.prior.covariance[:2, :2])
         moved = self.motion.relative(self.odometry, now)
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 

@@ -23,7 +23,7 @@ from factorgraph_loc.estimators.robust_update import robust_update
 from factorgraph_loc.estimators.track_monitor import TrackMonitor
 from factorgraph_loc.measurements import BearingRange
 from factorgraph_loc.rig import Estimated
-from factors import bearing_range, se2
+from factors import bearing_range, positive, se2
 from factors.bearing_range_factor import BearingRangeFactor
 from factors.odometry import ChainState
 from factors.se2 import Array
@@ -99,7 +99,7 @@ class LandmarkTracker:
     def injected(self, cloud: Cloud) -> Cloud:
         """Particles of equal weight, some drawn anew from the last sightings: the more, the less likely they are than they used to
         be."""
-        share = max(INJECTED, 1.0 - cloud.fast / cloud.slow)
+        share = max(INJECTED, 1.0 - cloud.fast / cloud.slow if cloud.slow > 0.0 else 0.0)
         chosen = self._rng.choice(len(cloud.poses), int(share * len(cloud.poses)), replace=False)
         poses = cloud.poses.copy()
         poses[chosen] = self.sample(len(chosen))
@@ -116,7 +116,7 @@ class LandmarkTracker:
             return False
         error = cloud.poses - best.pose
         error[:, 2] = se2.wrap(error[:, 2])
-        squared = np.sum(error * np.linalg.solve(best.covariance, error.T).T, axis=1)
+        squared = np.sum(error * positive.solve(best.covariance, error.T).T, axis=1)
         if cloud.weights[squared < REACH**2].sum() < ONE_PLACE:
             return False
         self._monitor.clear()

@@ -39,7 +39,7 @@ from factorgraph_loc.estimators.seen_points import Pixels
 from factorgraph_loc.measurements import BearingRange, Exteroceptive, RfidScan, Tick
 from factorgraph_loc.rig import NOTHING, Estimated
 from factorgraph_loc.trajectory import Trajectory
-from factors import bearing_range, odometry, se2
+from factors import bearing_range, odometry, positive, se2
 from factors.bearing_range import TIME_OFFSET
 from factors.odometry import Increment, recalibrated
 from factors.se2 import Array
@@ -179,7 +179,7 @@ class ParticleFilter(Filter):
         return Cloud(poses, self._rng.standard_normal((count, len(sigmas))) * sigmas, np.full(count, -np.log(count)))
 
     def _predict(self, increment: Increment) -> None:
-        noise = self._rng.standard_normal((len(self._state.poses), 3)) @ np.linalg.cholesky(increment.covariance).T
+        noise = self._rng.standard_normal((len(self._state.poses), 3)) @ positive.root(increment.covariance).T
         poses, _ = self._moved(self._state, increment, noise)
         self._state = replace(self._state, poses=poses)
 
@@ -292,7 +292,7 @@ class ParticleFilter(Filter):
         mean, left = 0.0, 1.0
         while True:
             cloud = self._state
-            likelihood = weighable(log_likelihood(cloud), self._t)
+            likelihood = weighable(log_likelihood(cloud), cloud.log_weights, self._t)
             share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
             weighed = cloud.log_weights + share * likelihood
             log_weights = normalised(weighed)

@@ -19,7 +19,7 @@ import numpy as np
 
 from factorgraph_loc.estimators.ancestors import draw_ancestors
 from factorgraph_loc.estimators.cloud import Cloud, gaussian, pose_moments, systematic
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState, Increment
 from factors.se2 import Array
 
@@ -103,11 +103,11 @@ class BackwardSimulation:
         error = np.concatenate(
             (se2.log(se2.between(predicted[rows], after.poses)), after.constants - here.constants[rows]), axis=1
         )
-        gain = np.linalg.solve(covariance, carried).T
+        gain = positive.solve(covariance, carried).T
         step = error @ gain.T + gaussian(kernel - gain @ carried, len(rows), self._rng)
         constants = here.constants[rows] + step[:, 3:]
         poses = se2.compose(here.poses[rows], se2.exp(step[:, :3]))
-        jumped = np.sum(error[:, :3] * np.linalg.solve(covariance[:3, :3], error[:, :3].T).T, axis=1) > BREAK
+        jumped = np.sum(error[:, :3] * positive.solve(covariance[:3, :3], error[:, :3].T).T, axis=1) > BREAK
         if jumped.any() and cloud.localized:
             poses[jumped] = cloud.poses[systematic(cloud.weights, self._rng, int(jumped.sum()))]
         elif jumped.any():

@@ -16,7 +16,7 @@ from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion, propagate
 from factorgraph_loc.estimators.seen_points import KnownPoints, Pixels
 from factorgraph_loc.vision.relocalization import FoundOnFloor
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState
 from factors.se2 import Array
 
@@ -151,4 +151,4 @@ class PixelFinder:
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
     """Squared Mahalanobis distance of a fix from a pose (3,) with body-frame covariance (3, 3)."""
     error = se2.log(se2.between(pose, fix.pose))
-    return float(error @ np.linalg.solve(covariance + fix.covariance + LEAST, error))
+    return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

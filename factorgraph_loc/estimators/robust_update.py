@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from factors import pixel_kernels, se2
+from factors import pixel_kernels, positive, se2
 from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
@@ -56,8 +56,12 @@ def robust_update(
     """
     if isinstance(factor, ReprojectionFactor) and factor.of_pose_alone:
         arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
-        found = pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE)
-        return Update(*found, factor.dof())
+        try:
+            found = Update(*pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof())
+            _require_sound(found.delta, found.covariance)
+        except np.linalg.LinAlgError:
+            return linearized_update(factor, pose, covariance, iterations, converged)
+        return found
     return linearized_update(factor, pose, covariance, iterations, converged)
 
 
@@ -81,7 +85,7 @@ def update_state(
     dof: int,
     converged: float = CONVERGED,
 ) -> Update:
-    """Kalman update, robust and iterated, in information form.
+    """Kalman update, robust and iterated, in information form; by square roots where that has not the digits for it.
 
     ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the
     first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the weight (K,) of squared
@@ -90,18 +94,40 @@ def update_state(
     pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
     weight at the updated state (iteratively reweighted least squares), until a step is below ``converged``.
     """
-    prior = np.asarray(np.linalg.inv(covariance), dtype=float)
+    iterated = iterations, dof, converged
+    try:
+        found = _iterated(_informed(np.asarray(np.linalg.inv(covariance))), linearize, covariance, weight, *iterated)
+        _require_sound(found.delta, found.covariance)
+    except np.linalg.LinAlgError:
+        return _iterated(_rooted(positive.root(covariance)), linearize, covariance, weight, *iterated)
+    return found
+
+
+# Correction (S,) and covariance (S, S) from a Jacobian (K, 2, D) and residuals (K, 2), their weights (K,), and the correction (D,)
+# at which they are linearised.
+_Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+
+
+def _iterated(
+    solve: _Solver,
+    linearize: Callable[[Array], tuple[Array, Array]],
+    covariance: Array,
+    weight: Callable[[Array], Array],
+    iterations: int,
+    dof: int,
+    converged: float,
+) -> Update:
     zero = np.zeros(len(covariance))
     residual, blocks = linearize(zero)
     size = blocks.shape[2]
     widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATE)
-    delta, updated = _solve(prior, blocks, residual, np.ones(len(residual)), zero[:size])
+    delta, updated = solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
-    nis = float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull)
+    nis = max(0.0, float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull))
     tempering = weight(np.zeros(1))[0]
     if widening.max() > 1.0 or tempering < 1.0:
-        delta, updated = _solve(prior, blocks, residual, tempering * widening**-2, zero[:size])
+        delta, updated = solve(blocks, residual, tempering * widening**-2, zero[:size])
     first, before = residual, zero
     for _ in range(iterations - 1):
         if np.abs(delta - before).max() < converged:
@@ -109,19 +135,46 @@ def update_state(
         before = delta
         residual, blocks = linearize(delta)
         weights = weight(np.einsum("ki,ki->k", residual, residual))
-        delta, updated = _solve(prior, blocks, residual, weights, delta[:size])
+        delta, updated = solve(blocks, residual, weights, delta[:size])
     return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
 
 
-def _solve(prior: Array, blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
-    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (D,)."""
-    size = len(at)
-    jacobian = blocks.reshape(-1, size)
-    weighted = jacobian.T * np.repeat(weight, 2)
-    information = prior.copy()
-    information[:size, :size] += weighted @ jacobian
-    updated = np.asarray(np.linalg.inv(information), dtype=float)
-    return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
+def _informed(prior: Array) -> _Solver:
+    """By the information ``prior`` (S, S) before."""
+
+    def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
+        size = len(at)
+        jacobian = blocks.reshape(-1, size)
+        weighted = jacobian.T * np.repeat(weight, 2)
+        information = prior.copy()
+        information[:size, :size] += weighted @ jacobian
+        updated = np.asarray(np.linalg.inv(information), dtype=float)
+        return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
+
+    return solve
+
+
+def _rooted(root: Array) -> _Solver:
+    """By the lower ``root`` (S, S) of the covariance before: what comes out is positive however far the numbers are apart."""
+
+    def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
+        size, scale = len(at), np.sqrt(np.repeat(weight, 2))
+        jacobian = scale[:, None] * blocks.reshape(-1, size)
+        upper = np.asarray(
+            np.linalg.qr(np.concatenate((jacobian @ root[:size], np.eye(len(root)))), mode="r"), dtype=float
+        )
+        half = np.linalg.solve(upper.T, root.T).T
+        wanted = jacobian @ at - scale * residual.ravel()
+        return half @ ((jacobian @ half[:size]).T @ wanted), half @ half.T
+
+    return solve
+
+
+def _require_sound(delta: Array, covariance: Array) -> None:
+    """LinAlgError if that is no update: rounding has taken more than there was."""
+    np.linalg.cholesky(covariance)
+    if not np.all(np.isfinite(delta)):
+        raise np.linalg.LinAlgError("an update is not finite")
 
 
 def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
@@ -129,4 +182,6 @@ def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
     s = blocks @ covariance @ blocks.transpose(0, 2, 1)
     a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
     x, y = residual[:, 0], residual[:, 1]
-    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
+    # rounding may take all of the difference, which is never less than that
+    determinant = np.maximum(a * c - b * b, 0.5 * (a + c))
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)

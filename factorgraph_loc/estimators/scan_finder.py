@@ -15,7 +15,7 @@ from factorgraph_loc.estimators.base import Mode, PosePrior
 from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.estimators.seeker import Seeker
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState
 from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
@@ -108,7 +108,7 @@ class ScanFinder:
     def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
         error = se2.log(se2.between(pose, best.pose))
         spread = covariance + se2.world_to_body(best.pose, best.covariance)
-        return float(error @ np.linalg.solve(spread, error)) > APART
+        return float(error @ positive.solve(spread, error[:, None])[:, 0]) > APART
 
     def _new_seeker(self, start: KnownPosition | None = None) -> Seeker:
         return Seeker(self._likelihood, self._motion, self._bounds, self._rng, start)

@@ -20,7 +20,7 @@ from factorgraph_loc.estimators.base import Mode, PosePrior
 from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
 from factorgraph_loc.estimators.known_position import KnownPosition
 from factorgraph_loc.estimators.motion import Motion
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState
 from factors.rfid_likelihood import Looks, RfidLikelihood
 from factors.se2 import Array
@@ -126,7 +126,7 @@ class Seeker:
         mode = self.hypotheses[0]
         error = self._cloud.poses - mode.pose
         error[:, 2] = se2.wrap(error[:, 2])
-        near = np.sum(error * np.linalg.solve(mode.covariance, error.T).T, axis=1) < REACH**2
+        near = np.sum(error * positive.solve(mode.covariance, error.T).T, axis=1) < REACH**2
         return bool(self._cloud.weights[near].sum() >= CLEAR_WEIGHT and self._width(mode) <= 1.0)
 
     @staticmethod
@@ -137,7 +137,7 @@ class Seeker:
 
     def _predict(self, cloud: Cloud, start: ChainState, end: ChainState) -> None:
         increment = self._motion.relative(start, end)
-        root = np.linalg.cholesky(NOISE * increment.covariance)
+        root = positive.root(NOISE * increment.covariance)
         noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
         self._cloud = replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
 
@@ -146,7 +146,7 @@ class Seeker:
         while left > 0.0:
             cloud = self._cloud
             assert cloud is not None
-            likelihood = weighable(self._likelihood.log_likelihood(cloud.poses, looks), t)
+            likelihood = weighable(self._likelihood.log_likelihood(cloud.poses, looks), cloud.log_weights, t)
             share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
             weighed = cloud.log_weights + share * likelihood
             highest = float(weighed.max())

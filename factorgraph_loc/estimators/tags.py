@@ -14,7 +14,7 @@ from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import RfidScan
 from factorgraph_loc.tag_map import TagMap, tag_map
-from factors import rfid_kernels, se2, se2_kernels
+from factors import positive, rfid_kernels, se2, se2_kernels
 from factors.odometry_kernels import FAR, ROUNDING
 from factors.rfid import Packed
 from factors.rfid_factor import RfidFactor, TagScore
@@ -154,12 +154,15 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
         return scored_update(factors, pose, covariance, iterations)
     tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
-    return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
+    try:
+        return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
+    except np.linalg.LinAlgError:  # rounding made it singular
+        return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations))
 
 
 def scored_update(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int) -> TagUpdate:
     """:func:`updated` by factors of any kind and number."""
-    prior_information: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
+    prior_information: Array = positive.inverse(covariance)
     sigmas = np.sqrt(np.diag(covariance))
     scores = [factor.score(pose) for factor in factors]
     first = scores[0]

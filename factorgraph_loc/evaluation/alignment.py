@@ -16,7 +16,7 @@ from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 FIGURES = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
@@ -88,5 +88,5 @@ def _anees(errors: Array, covariances: Array) -> float | None:
     good[good] = np.linalg.eigvalsh(covariances[good])[:, 0] > 0.0
     if not good.any():
         return None
-    whitened = np.linalg.solve(covariances[good], errors[good, :, None])[..., 0]
+    whitened = positive.solve(covariances[good], errors[good, :, None])[..., 0]
     return float(np.mean(np.sum(errors[good] * whitened, axis=1)))

@@ -38,7 +38,9 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
     None if there is neither.
     """
-    sensors = sorted(sensor for sensor, values in track.nis.items() if len(values))
+    # innovations that tell of nothing have no degrees of freedom
+    told = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
+    sensors = sorted(sensor for sensor, values in told.items() if len(values))
     rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
     rows += [[f"nis.{sensor}"] * 2 for sensor in sensors]
     if not rows:
@@ -53,7 +55,7 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
         for kind in ("causal", "final"):
             axes[kind].set_ylim(limits[:, 0].min(), limits[:, 1].max())
     for sensor in sensors:
-        _nis(axes[f"nis.{sensor}"], sensor, track.nis[sensor])
+        _nis(axes[f"nis.{sensor}"], sensor, told[sensor])
     start, end = track.final.t[0], track.final.t[-1]
     for axis in axes.values():
         mark_events(axis, track.events)

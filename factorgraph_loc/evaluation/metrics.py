@@ -26,7 +26,7 @@ from factorgraph_loc.evaluation.scoring import MAX_GAP, RULE
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.log import Log
 from factorgraph_loc.trajectory import Integers, Trajectory
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 FEWEST_SCORED = 10  # poses: figures of fewer tell nothing of a run
@@ -219,7 +219,7 @@ def _positive_definite(covariances: Array) -> NDArray[np.bool_]:
 
 
 def _squared(difference: Array, covariances: Array) -> Array:
-    whitened = np.linalg.solve(covariances, difference[..., None])[..., 0]
+    whitened = positive.solve(covariances, difference[..., None])[..., 0]
     return np.asarray(np.sum(difference * whitened, axis=1))
 
 
@@ -249,13 +249,16 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
             _, nis, dof = np.array(rows, dtype=float).T
-            figures[f"nis.{sensor}.mean_per_dof"] = float(nis.sum() / dof.sum())
-            figures[f"nis.{sensor}.beyond_95"] = float(np.mean(nis > chi2.ppf(CONFIDENCE, dof)))
+            told = (dof > 0.0) & np.isfinite(nis)
+            nis, dof = nis[told], dof[told]
+            figures[f"nis.{sensor}.mean_per_dof"] = float(nis.sum() / dof.sum()) if len(nis) else None
+            figures[f"nis.{sensor}.beyond_95"] = float(np.mean(nis > chi2.ppf(CONFIDENCE, dof))) if len(nis) else None
         figures[f"nis.{sensor}.count"] = len(rows)
     for name, errors in sorted(diagnostics.residuals.items()):
         if errors:
-            figures[f"residual.{name}.rms"] = rms(np.array(errors))
-            figures[f"residual.{name}.median_abs"] = float(np.median(np.abs(errors)))
+            known = np.array(errors)[np.isfinite(errors)]
+            figures[f"residual.{name}.rms"] = rms(known)
+            figures[f"residual.{name}.median_abs"] = float(np.median(np.abs(known))) if len(known) else None
     for kind in ("ignored", "rejected", "late"):
         counts: dict[str, int] = getattr(diagnostics, kind)
         figures[f"{kind}.total"] = sum(counts.values())

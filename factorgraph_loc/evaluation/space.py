@@ -13,6 +13,7 @@ from factorgraph_loc.evaluation.pairing import pairs_in_space
 from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.log import Log, SightingStream
 from factorgraph_loc.trajectory3 import Trajectory3
+from factors import positive
 from factors.reprojection import linearize_in_space, mounted
 from factors.se2 import Array
 
@@ -52,7 +53,7 @@ def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: 
         spread = estimates.covariances
         good = np.linalg.eigvalsh(spread)[:, 0] > 0.0
         if good.any():
-            nees = np.einsum("ni,ni->n", errors[good], np.linalg.solve(spread[good], errors[good, :, None])[..., 0])
+            nees = np.einsum("ni,ni->n", errors[good], positive.solve(spread[good], errors[good, :, None])[..., 0])
             figures["space_anees"] = float(nees.mean())
             figures["space_coverage_95"] = float(np.mean(nees < chi2.ppf(CONFIDENCE, DOF)))
     return figures

@@ -142,7 +142,7 @@ class ActiveMcl(Filter):
         """Weighed by a likelihood, a share at a time."""
         left = 1.0
         while left > 0.0:
-            found = weighable(log_likelihood(cloud.poses), self._t)
+            found = weighable(log_likelihood(cloud.poses), cloud.log_weights, self._t)
             enough = ENOUGH * effective_size(cloud.log_weights)
             share = largest_share(cloud.log_weights, found, left, enough)
             cloud = replace(cloud, log_weights=normalised(cloud.log_weights + share * found))

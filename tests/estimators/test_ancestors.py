@@ -23,3 +23,14 @@ def test_each_draw_is_the_one_that_its_uniform_number_names(size):
 
     drawn = draw_ancestors(predicted, constants, log_weights, after, constants_after, covariance, uniform)
     assert drawn.tolist() == expected
+
+
+def test_a_state_that_no_particle_explains_has_an_ancestor_by_the_weights():
+    predicted, after = np.zeros((3, 3)), np.array(((1e200, 0.0, 0.0),) * 200)
+    log_weights = np.log((0.5, 1e-9, 0.5))
+    uniform = np.random.default_rng(1).random(200)
+    # singular as numbers go
+    covariance = np.outer((1e-3, 1e3, 1.0), (1e-3, 1e3, 1.0))
+    none = np.empty((3, 0)), np.empty((200, 0))
+    drawn = draw_ancestors(predicted, none[0], log_weights, after, none[1], covariance, uniform)
+    assert drawn.tolist() == np.where(uniform < 0.5, 0, 2).tolist()

@@ -5,9 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.estimators import robust_update as robust_update_module
 from factorgraph_loc.estimators import tags
 from factorgraph_loc.estimators.robust_update import linearized_update, robust_update
 from factors import rfid_kernels, se2
+from factors.bearing_range import BearingRangeModel
+from factors.bearing_range import predict as predict_landmarks
+from factors.bearing_range_factor import BearingRangeFactor
 from factors.reprojection import CameraModel, camera_pose, predict
 from factors.reprojection_factor import ReprojectionFactor
 from factors.rfid import Antenna, BeamModel, RfidModel
@@ -99,3 +103,35 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
 def test_offsets_of_looks_are_moved_as_poses_are(rng):
     offset, offsets = rng.standard_normal(3), rng.standard_normal((4, 3))
     np.testing.assert_allclose(rfid_kernels.moved(offset, offsets), se2.compose(offset, offsets), atol=1e-12)
+
+
+def seen(covariance, sigma, iterations=3):
+    """An update by three landmarks of which range and bearing are known to ``sigma``."""
+    model = BearingRangeModel(range_sigma=sigma, bearing_sigma=sigma, robust=100.0)
+    points = np.array(((4.0, 1.0), (-2.0, 5.0), (1.0, -3.0)))
+    ranges, bearings = predict_landmarks(model, np.array((0.1, -0.1, 0.02)), points)
+    factor = BearingRangeFactor(model, points, ranges, bearings)
+    return linearized_update(factor, np.zeros(3), covariance, iterations)
+
+
+def test_an_update_by_roots_is_the_one_by_information(rng, monkeypatch):
+    covariance = spread(rng, 5, 0.1)
+    plain = seen(covariance, 0.05)
+    rooted = robust_update_module._rooted(np.linalg.cholesky(covariance))
+    monkeypatch.setattr(robust_update_module, "_informed", lambda _: rooted)
+    rooted = seen(covariance, 0.05)
+    np.testing.assert_allclose(rooted.delta, plain.delta, atol=1e-9)
+    np.testing.assert_allclose(rooted.covariance, plain.covariance, atol=1e-12)
+    assert rooted.nis == pytest.approx(plain.nis)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e6, 1e12])
+@pytest.mark.parametrize("sigma", [1e-6, 1.0])
+def test_an_update_of_what_is_singular_as_numbers_go_is_positive(scale, sigma):
+    way = np.array((1.0, 2.0, 0.5))
+    update = seen(scale * np.outer(way, way) + 1e-20 * np.eye(3), sigma)
+    assert np.all(np.isfinite(update.delta))
+    assert update.nis >= 0.0
+    assert np.all(np.diag(update.covariance) > 0.0)
+    sigmas = np.sqrt(np.diag(update.covariance))
+    assert np.linalg.eigvalsh(update.covariance / np.outer(sigmas, sigmas))[0] > -1e-9

@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2
 
 from factorgraph_loc.estimators.base import Diagnostics, Learnt
 from factorgraph_loc.evaluation.alignment import FIGURES
-from factorgraph_loc.evaluation.metrics import accuracy, relative_errors, score
+from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
 from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.log import Log
 from factorgraph_loc.rig import Rig
@@ -213,3 +213,27 @@ def test_aligned_figures_only_where_the_map_was_free(landmarks):
         assert scores["landmarks.count"] == 0
     else:
         assert all(scores[name] is None for name in FIGURES)
+
+
+def test_innovations_without_degrees_of_freedom_say_nothing():
+    diagnostics = Diagnostics()
+    for nis, dof in ((0.0, 0), (np.nan, 0), (np.inf, 2), (3.0, 2)):
+        diagnostics.innovation("rfid", 0.0, nis, dof)
+    diagnostics.innovation("phase", 0.0, 0.0, 0)
+    diagnostics.residuals = {"bearing_range.range": [np.nan, 3.0], "bearing_range.bearing": [np.nan]}
+    t = np.arange(5) * 0.1
+    scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, diagnostics=diagnostics), log_of(t, None))
+    assert (scores["nis.rfid.mean_per_dof"], scores["nis.rfid.beyond_95"], scores["nis.rfid.count"]) == (1.5, 0.0, 4)
+    assert (scores["nis.phase.mean_per_dof"], scores["nis.phase.beyond_95"]) == (None, None)
+    assert (scores["residual.bearing_range.range.rms"], scores["residual.bearing_range.range.median_abs"]) == (3.0, 3.0)
+    assert (scores["residual.bearing_range.bearing.rms"], scores["residual.bearing_range.bearing.median_abs"]) == (
+        None,
+        None,
+    )
+
+
+def test_a_covariance_that_is_hardly_positive_is_scored():
+    poses = np.zeros((3, 3))
+    covariances = np.tile(np.diag((1e-300, 1.0, 1.0)), (3, 1, 1))
+    e = errors(Trajectory(np.arange(3.0), poses, covariances), Trajectory(np.arange(3.0), poses))
+    assert np.all(np.isfinite(e.nees))

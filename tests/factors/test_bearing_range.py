@@ -322,3 +322,13 @@ def test_custom_and_linear_factor_are_the_same():
     theirs = custom_factor(factor, (0,), (read_pose,), (3,), 2, lambda _: None).linearize(values)
     ours = jacobian_factor(factor, (0,), [np.array((0.1, 0.2, 0.3))])
     np.testing.assert_allclose(theirs.augmentedJacobian(), ours.augmentedJacobian(), atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-12, 1e-3])
+def test_a_landmark_where_the_sensor_is_has_a_place_and_a_spread(distance):
+    model = BearingRangeModel(bearing_sigma=0.02)
+    factor = BearingRangeFactor(model, np.zeros((1, 2)), np.array([distance]), np.zeros(1))
+    point, blocks, spread = factor.locate([np.zeros(3)])
+    assert np.hypot(*point) == pytest.approx(distance)
+    assert np.all(np.isfinite(blocks[0]))
+    assert np.all(np.linalg.eigvalsh(spread) > 0.0)

@@ -37,3 +37,15 @@ def test_other_covariances_are_taken_as_they_are():
 def test_what_is_no_covariance_is_refused(bad):
     with pytest.raises(np.linalg.LinAlgError):
         positive.nearest(np.diag((1.0, bad)))
+
+
+def test_roots_and_solutions_are_those_of_the_nearest_one_too():
+    line, right = np.array((1.0, 2.0)), np.ones((2, 3))
+    covariance = np.outer(line, line)
+    near = positive.nearest(covariance)
+    root = positive.root(covariance)
+    assert np.allclose(root @ root.T, near, rtol=1e-6)
+    assert np.allclose(positive.solve(covariance, near @ right), right, rtol=1e-2)
+    sound, right = flat(0.5), np.ones((3, 2))
+    assert np.array_equal(positive.root(sound), np.linalg.cholesky(sound))
+    assert np.array_equal(positive.solve(sound, right), np.linalg.solve(sound, right))

@@ -1,0 +1,72 @@
+"""Whatever a log holds, a run of it ends: in finite poses with positive covariances, or in one line that says why not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from absurd_logs import FAULTS, require_sound, verdict, whole
+
+from factorgraph_loc.localizer import Localizer
+
+# fewer particles than anybody takes, and so less to go on
+SMALL = {"particles": 60, "smoothing_trajectories": 15, "min_particles": 20}
+CONFIGS = {
+    "dead_reckoning": ("dead_reckoning", {}),
+    "ekf": ("ekf", {}),
+    "ekf_unknown": ("ekf", {"landmarks": "unknown", "iterations": 5}),
+    "particle_filter": ("particle_filter", SMALL),
+    "particle_filter_kld": ("particle_filter", SMALL | {"kld": True}),
+}
+# what no reader and no Localizer lets in may be more than the filters can compute
+MAY_FAIL = ("glitch_beyond_bounds",)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_log_with_a_fault_is_survived(fault, config):
+    rng = np.random.default_rng(sum(map(ord, fault + config)))
+    name, settings = CONFIGS[config]
+    # of some faults no sighting tells where a landmark is
+    if config == "ekf_unknown" and fault in ("ranges_or_bearings_alone", "one_row_in_all"):
+        settings = {}
+    told = verdict(FAULTS[fault](whole(), rng), name, settings)
+    assert told == "ok" or fault in MAY_FAIL, told
+
+
+@pytest.mark.parametrize("config", ["ekf", "particle_filter"])
+@pytest.mark.parametrize("sensors", [("odometry", "bearing_range"), ("odometry", "rfid")])
+def test_faults_come_together(config, sensors):
+    name, settings = CONFIGS[config]
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        log = whole()
+        for fault in rng.choice([f for f in FAULTS if f not in ("one_row_in_all", *MAY_FAIL)], 3, replace=False):
+            if len(log.streams["odometry"].t) > 5 and len(log.streams["bearing_range"].t):
+                log = FAULTS[str(fault)](log, rng)
+        assert verdict(log, name, settings, sensors) == "ok"
+
+
+@pytest.mark.parametrize("config", ["dead_reckoning", "ekf", "particle_filter"])
+@pytest.mark.parametrize("fault", ["glitch_within_bounds", "many_glitches", "coincident_landmarks", "tiny_sigmas"])
+def test_a_robot_that_drives_survives_them_too(fault, config):
+    log = FAULTS[fault](whole(), np.random.default_rng(5))
+    name, settings = CONFIGS[config]
+    localizer = Localizer(log.rig, log.world, name, settings=settings)
+    localizer.initialize(log.start.pose, np.diag(log.start.sigmas**2), log.start.t)
+    for i, m in enumerate(log.measurements(("odometry", "bearing_range", "rfid"))):
+        localizer.push(m)
+        if i % 10 == 0:
+            estimate = localizer.estimate()
+            require_sound(estimate.pose[None], estimate.covariance[None])
+    trajectory = localizer.trajectory()
+    require_sound(trajectory.poses, trajectory.covariances)
+
+
+def test_what_cannot_be_computed_names_the_measurement():
+    log = whole()
+    broken = log.streams["odometry"].dx.copy()
+    broken[20] = np.nan
+    log = replace(log, streams={**log.streams, "odometry": replace(log.streams["odometry"], dx=broken)})
+    told = verdict(log, "ekf", {})
+    assert told.startswith("ekf on office-3: ")
+    assert "at 2.000 s" in told
