@@ -1,6 +1,7 @@
 """Reading what people write, and writing so that nothing is half-written."""
 
 import difflib
+import hashlib
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
 
+LONGEST_FILE = 100  # bytes of a file's name that is made from another
 DEEPEST = 64  # tables or lists within each other, and parts of a key
 MANY = 1000  # names that a misspelt one is compared to: each takes its time
 MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
@@ -170,6 +172,16 @@ def inside(root: Path, name: str, source: object) -> Path:
     if kind not in ("", "a file", "a folder"):
         raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")
     return path
+
+
+def file_name(name: str) -> str:
+    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore. Of more than 100 bytes
+    the first stay, with a digest of the whole name, so that long names that differ go on doing so."""
+    safe = re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
+    if len(safe.encode()) <= LONGEST_FILE:
+        return safe
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return f"{safe.encode()[: LONGEST_FILE - 9].decode(errors='ignore')}-{digest}"
 
 
 @contextmanager

@@ -11,7 +11,8 @@ import numpy as np
 from factorgraph_loc.calibration.learn import Knowledge
 from factorgraph_loc.calibration.noise import BLACKOUT, LENGTHS
 from factorgraph_loc.calibration.windows import cut
-from factorgraph_loc.evaluation.figures import COLOURS
+from factorgraph_loc.evaluation.figures import COLOURS, drawing
+from factorgraph_loc.text import plain
 from factors import bearing_range
 from factors.se2 import Array
 
@@ -67,7 +68,13 @@ def correlation_figure(knowledge: Knowledge) -> bytes:
         for i, (one, seen) in enumerate(zip(knowledge.correlations, knowledge.seen, strict=True)):
             known = np.isfinite(one.function[:, column])
             colour = COLOURS[i % len(COLOURS)]
-            axis.plot(one.lags[known], one.function[known, column], "o-", color=colour, label=seen.log.name)
+            axis.plot(
+                one.lags[known],
+                one.function[known, column],
+                "o-",
+                color=colour,
+                label=plain(seen.log.name.lstrip("_"), 40) or "log",
+            )
         axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.set_xscale("log")
@@ -149,5 +156,6 @@ def legend(figure: Figure, axes: Any) -> None:
 def png(figure: Figure) -> bytes:
     """The figure as a PNG image."""
     out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=80)
+    with drawing(figure):
+        figure.savefig(out, format="png", dpi=80)
     return out.getvalue()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from factorgraph_loc.calibration.rfid_tags import TagDoubt, misplaced
 from factorgraph_loc.calibration.rfid_tempering import independent_share, tempered
 from factorgraph_loc.calibration.rssi import fit_rssi
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import file_name
 from factorgraph_loc.grids import write_grid
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.rfid_settings import (
@@ -224,5 +226,6 @@ def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings 
 
 
 def _safe(name: str) -> str:
-    """A name that is a file's on every system."""
-    return "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
+    """A name that is a file's on every system, and of two antennas never the same."""
+    safe = file_name("".join(c if c.isalnum() or c in "-_" else "-" for c in name))
+    return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"

@@ -67,6 +67,7 @@ def simulate(
     """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc import api
+    from factorgraph_loc.files import file_name
     from factorgraph_loc.simulation import recorded_looks
 
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
@@ -79,7 +80,7 @@ def simulate(
         looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
     written = []
     for number in chosen:
-        folder = out if seeds is None else out / f"{settings.name}-{number}"
+        folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")
         with show.progress(folder.name, counted=True) as tell:
             log = api.simulate(settings, number, recorded=looks, images=images, out=folder, progress=tell)
         for warning in log.warnings:

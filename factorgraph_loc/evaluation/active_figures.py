@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.evaluation.active import Row, cases, metres, policies, runs_of
-from factorgraph_loc.evaluation.figures import COLOURS, dress, empty, grid, legend, styles
+from factorgraph_loc.evaluation.figures import COLOURS, dress, empty, grid, lay_out, legend, styles
 from factorgraph_loc.world import World
 from factors.se2 import Array
 
@@ -87,7 +87,7 @@ def run_picture(track: SeekingTrack) -> Figure:
     axes["belief"].set_xlabel("metres driven")
     axes["belief"].set_ylabel("spread of the belief [m]")
     legend(figure, axes.values())
-    figure.draw_without_rendering()  # with a fixed aspect the layout needs a second pass
+    lay_out(figure)
     return figure
 
 

@@ -6,7 +6,9 @@ Colours: Okabe and Ito, "Color Universal Design", 2008, which colour-blind reade
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +18,7 @@ import numpy as np
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.evaluation.scoring import MAX_GAP
+from factorgraph_loc.text import plain
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
 _WIDTH, _DPI = 16.0, 100
+_TITLE, _LINES = 80, 3  # characters and lines of a text at most
+_LABEL, _LEGEND = 40, 160  # characters of a label, and of a line of the legend
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,28 @@ def legend(figure: Figure, axes: Iterable[Axes]) -> None:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), fontsize=13)
+        labels = [plain(label, _LABEL) for label in entries]
+        columns = min(len(labels), max(1, _LEGEND // max(map(len, labels))))
+        figure.legend(entries.values(), labels, loc="outside lower center", ncols=columns, fontsize=13)
+
+
+@contextmanager
+def drawing(figure: Figure) -> Iterator[None]:
+    """While a figure is drawn: names in it are shown as they are written, a ``$`` as one, on a line of bounded length; and of
+    characters that the font lacks, or of names that leave no room, nobody is warned."""
+    named = [text for axis in figure.axes for text in (axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts)]
+    for text in (*figure.texts, *named, *(text for legend in figure.legends for text in legend.get_texts())):
+        text.set_parse_math(False)
+        text.set_text("\n".join(plain(line, _TITLE) for line in text.get_text().split("\n")[:_LINES]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def lay_out(figure: Figure) -> None:
+    """Lay a figure out once before it is saved: with a fixed aspect the layout needs a second pass."""
+    with drawing(figure):
+        figure.draw_without_rendering()
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -126,7 +152,8 @@ def save(figure: Figure, path: Path) -> None:
     from PIL import Image  # noqa: PLC0415
 
     full = io.BytesIO()
-    figure.savefig(full, format="png", dpi=_DPI)
+    with drawing(figure):
+        figure.savefig(full, format="png", dpi=_DPI)
     with Image.open(full) as image:
         image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
             path, format="PNG", optimize=True

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, styles, with_pauses
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, lay_out, legend, styles, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.log import Log
 from factorgraph_loc.tag_map import tag_map
@@ -38,7 +38,7 @@ def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
         axes[what].set_ylim(bottom=0.0)
     axes[DEVIATIONS[-1][0]].set_xlabel("time [s]")
     legend(figure, [axes["map"]])
-    figure.draw_without_rendering()
+    lay_out(figure)
     return figure
 
 
@@ -64,7 +64,7 @@ def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
     axes["errors"].set_xlabel("time [s]")
     axes["errors"].set_ylabel("position error [m]")
     legend(figure, [axes["map"]])
-    figure.draw_without_rendering()
+    lay_out(figure)
     return figure
 
 

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.evaluation.consistency import consistency
-from factorgraph_loc.evaluation.figures import COLOURS, Track, grid, legend, mark_events, save, styles, with_pauses
+from factorgraph_loc.evaluation.figures import (
+    COLOURS,
+    Track,
+    grid,
+    lay_out,
+    legend,
+    mark_events,
+    save,
+    styles,
+    with_pauses,
+)
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files import replacing
 from factorgraph_loc.log import Log
@@ -117,8 +127,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
             axis.set_xlim(view[0, 0], view[1, 0])
             axis.set_ylim(view[0, 1], view[1, 1])
     legend(figure, axes[0])
-    # with a fixed aspect the layout needs a second pass: after the first the axes change, and their labels reach below the legend
-    figure.draw_without_rendering()
+    lay_out(figure)  # after the first pass the axes change, and their labels reach below the legend
     return figure
 
 

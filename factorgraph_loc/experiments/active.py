@@ -24,8 +24,7 @@ from factorgraph_loc.evaluation.active import DIFFERENCES, difference_cells, dif
 from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
 from factorgraph_loc.evaluation.figures import save
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.experiments.output import file_name
-from factorgraph_loc.files import nearest, replacing, write_text, write_toml
+from factorgraph_loc.files import file_name, nearest, replacing, write_text, write_toml
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES

@@ -25,10 +25,10 @@ from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
-from factorgraph_loc.experiments.output import FILES, file_name, remove_run, write_run
+from factorgraph_loc.experiments.output import FILES, remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
-from factorgraph_loc.files import nearest, replacing, write_text
+from factorgraph_loc.files import file_name, nearest, replacing, write_text
 from factorgraph_loc.log import Log
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.temporary import sweep

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import re
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +19,7 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.evaluation.result import RunResult
-from factorgraph_loc.files import write_text, write_toml
+from factorgraph_loc.files import file_name, write_text, write_toml
 from factorgraph_loc.log import Log
 from factorgraph_loc.temporary import sweep, temporary_folder
 from factorgraph_loc.text import quoted
@@ -98,11 +97,6 @@ def write_plots(result: RunResult, log: Log, out: Path) -> None:
     folder = out / "plots"
     remove_plots(folder)
     plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
-
-
-def file_name(text: str) -> str:
-    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore."""
-    return re.sub(r"[^\w.-]", "_", text).lstrip(".") or "_"
 
 
 def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from factorgraph_loc.columns import BEARING_RANGE, NEAREST, require_span
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_toml
+from factorgraph_loc.files import FileModel, file_name, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.log import (
     BearingRangeStream,
     FeatureStream,
@@ -229,7 +229,7 @@ def require_new(folder: Path) -> None:
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:
-    base = re.sub(r"[^\w.-]+", "_", log.name).strip(".") or "log"
+    base = file_name(re.sub(r"[^\w.-]+", "_", log.name).strip(".") or "log")
     run: dict[str, Any] = {"name": log.name, "rig": f"{base}.rig.toml", "world": f"{base}.world.toml"}
     write_rig(log.rig, folder / run["rig"])
     write_world(log.world, folder / run["world"])
