@@ -16,6 +16,7 @@ Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
 Focal = Annotated[float, Field(gt=1.0, le=1e5, description="px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5, description="px")]
+Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Side = Annotated[int, Field(ge=16, le=100_000, description="px")]
 Metres = Annotated[float, Field(ge=0.0, le=10.0, description="m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0, description="rad")]
@@ -62,7 +63,7 @@ class CameraSettings(FileModel):
     fy: Focal
     cx: Pixel
     cy: Pixel
-    distortion: Annotated[tuple[float, float, float, float], Field(description="k1, k2, p1, p2 as OpenCV has them")] = (
+    distortion: Annotated[tuple[Lens, Lens, Lens, Lens], Field(description="k1, k2, p1, p2 as OpenCV has them")] = (
         0.0,
         0.0,
         0.0,
@@ -74,9 +75,9 @@ class CameraSettings(FileModel):
     roll: Angle = 0.0
     pitch: Angle = 0.0
     yaw: Angle = 0.0
-    pixel_sigma: Annotated[float, Field(gt=0.0, le=100.0, description="px")] = 1.0
-    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
-    tempering: Annotated[float, Field(gt=0.0, le=1.0, description="exponent of the likelihood")] = 0.03
+    pixel_sigma: Annotated[float, Field(ge=0.01, le=100.0, description="px")] = 1.0
+    robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0, description="exponent of the likelihood")] = 0.03
     frontend: FrontendSettings = FrontendSettings()
     uncertainty: CameraUncertainty = CameraUncertainty()
 

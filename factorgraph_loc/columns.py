@@ -252,6 +252,17 @@ TAGS = Table(
     ),
     "one each",
 )
+POINTS = Table(
+    "points",
+    (
+        _name("point", "the name of a point"),
+        *(_within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
+        *(_within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
+        *(_within(f"from_{name}", LENGTH, FARTHEST, "where the camera of a view was") for name in "xyz"),
+        _number("size", PIXELS, 1e-3, LARGEST_PIXEL, "of the feature in that view"),
+    ),
+    "one each",
+)
 TABLES = (
     VELOCITIES,
     INCREMENTS,
@@ -266,4 +277,5 @@ TABLES = (
     WAYS,
     POSES,
     TAGS,
+    POINTS,
 )

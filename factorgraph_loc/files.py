@@ -3,20 +3,22 @@
 import difflib
 import hashlib
 import json
+import math
 import os
 import re
 import tomllib
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import date, time
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factorgraph_loc import bounded
+from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
@@ -34,8 +36,38 @@ class FileModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with other values, numbers beyond the bounds of their field at the bound: what is computed cannot make settings
+        that could not be read again."""
+        return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
+
+    @classmethod
+    def bounded(cls, **values: Any) -> Self:
+        """One of computed values, numbers beyond the bounds of their field at the bound."""
+        return cls(**{key: _within(cls, key, value) for key, value in values.items()})
+
 
 Model = TypeVar("Model", bound=BaseModel)
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
+
+
+def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
+    """The least and the largest number that pydantic's ``metadata`` of a field allow; infinite where there is no bound."""
+    low, high = -math.inf, math.inf
+    for entry in metadata:
+        for part in getattr(entry, "metadata", (entry,)):
+            low = max(low, getattr(part, "ge", low), math.nextafter(getattr(part, "gt", -math.inf), math.inf))
+            high = min(high, getattr(part, "le", high), math.nextafter(getattr(part, "lt", math.inf), -math.inf))
+    return low, high
+
+
+def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
+    """``value`` of a field, a number at the nearest bound if it lies beyond; NaN stays."""
+    field = kind.model_fields.get(name)
+    if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    low, high = bounds(field.metadata)
+    return low if value < low else high if value > high else value
 
 
 def read_text(path: Path, limit: int = bounded.DATA) -> str:

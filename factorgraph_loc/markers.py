@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files import Coordinate, FileModel
 from factorgraph_loc.points import PointMap
 from factors.se2 import Array
 
@@ -52,10 +52,10 @@ class Marker(FileModel):
     turned counter-clockwise, seen from the front. ``sigma`` [m]: standard deviation of each coordinate of a corner.
     """
 
-    x: float
-    y: float
-    z: float
-    size: Annotated[float, Field(gt=0.0, le=10.0, description="m")]
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+    size: Annotated[float, Field(ge=1e-3, le=10.0, description="m")]
     facing: Turn
     pitch: Annotated[float, Field(ge=-1.6, le=1.6, description="rad, not degrees")] = 0.0
     roll: Turn = 0.0

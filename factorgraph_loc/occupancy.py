@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from factorgraph_loc.bounded import IMAGE, opened
-from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, inside, parse_model
+from factorgraph_loc.files import Coordinate, FileModel, inside, parse_model
 from factorgraph_loc.image_files import pillow_image
 from factorgraph_loc.yaml_files import read_yaml
 from factors import se2
 from factors.se2 import Array
 
 Wall = tuple[float, float, float, float]
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an aslant line is half a cell off them
@@ -36,7 +34,7 @@ class MapFile(FileModel):
     """What map_server of ROS or of Nav2 writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
 
     image: str
-    resolution: Annotated[float, Field(gt=0.0, le=10.0, description="m per cell")]
+    resolution: Annotated[float, Field(ge=1e-4, le=10.0, description="m per cell")]
     origin: tuple[Coordinate, Coordinate, Yaw]
     occupied_thresh: Share = 0.65
     free_thresh: Share = 0.196

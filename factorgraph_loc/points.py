@@ -13,7 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from factorgraph_loc.camera_settings import FrontendSettings
-from factorgraph_loc.columns import FARTHEST
+from factorgraph_loc.columns import POINTS
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import replacing
 from factorgraph_loc.parquet_files import read_parquet, text_column
@@ -25,7 +25,6 @@ COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
 KINDS: tuple[str, ...] = get_args(FrontendSettings.model_fields["feature"].annotation)
-LARGEST_VARIANCE = 1e8  # m^2
 LARGEST_VALUE = 1e6  # of a descriptor
 ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
 
@@ -124,8 +123,7 @@ def read_points(path: Path) -> PointMap:
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
     every = np.arange(len(table))
-    numbers = {name: _numbers(table, name, every, path, FARTHEST) for name in "xyz"}
-    numbers |= {name: _numbers(table, name, every, path, LARGEST_VARIANCE) for name in COLUMNS[4:]}
+    numbers = {name: _numbers(table, name, every, path) for name in COLUMNS[1:]}
     rows: dict[str, int] = {}
     labels = text_column(table, "point", path)
     if "" in labels:
@@ -152,9 +150,7 @@ def read_points(path: Path) -> PointMap:
     if not kinds:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])
-    columns = [_numbers(table, name, shown, path, FARTHEST) for name in VIEW]
-    if len(bad := np.flatnonzero(columns[3] <= 0.0)):
-        raise bad_field(path, "size", float(columns[3][bad[0]]), "a number above 0", row=int(shown[bad[0]]) + 1)
+    columns = [_numbers(table, name, shown, path) for name in VIEW]
     return PointMap(
         tuple(rows),
         positions[first],
@@ -167,14 +163,12 @@ def read_points(path: Path) -> PointMap:
     )
 
 
-def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path, most: float) -> Array:
-    """The numbers (R,) of a column in ``rows`` (R,), of which none is beyond ``most``."""
+def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
+    """The numbers (R,) of a column in ``rows`` (R,), within its bounds."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
     values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
-    if len(bad := np.flatnonzero(~(np.abs(values) <= most))):
-        expected = f"a finite number in {-most:g} to {most:g}"
-        raise bad_field(path, name, float(values[bad[0]]), expected, row=int(rows[bad[0]]) + 1)
+    POINTS[name].require(path, rows + 1, values)
     return values
 
 

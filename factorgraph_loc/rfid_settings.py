@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from factorgraph_loc.files import FileModel, inside
+from factorgraph_loc.files import Coordinate, FileModel, inside
 from factorgraph_loc.grids import read_grid
 from factorgraph_loc.text import listed, quoted
 from factors import se2
@@ -24,6 +24,7 @@ from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
@@ -31,10 +32,10 @@ class BeamSettings(FileModel):
     """See :class:`factors.rfid.BeamModel`."""
 
     kind: Literal["beam"] = "beam"
-    p0: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.9
-    r_max: Annotated[float, Field(gt=0.0, le=50.0, description="m")] = 4.5
-    s_r: Annotated[float, Field(gt=0.0, le=10.0, description="m")] = 0.3
-    sigma_phi: Annotated[float, Field(gt=0.0, le=10.0, description="rad, not degrees")] = 0.698
+    p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
+    r_max: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 4.5
+    s_r: Annotated[float, Field(ge=1e-3, le=10.0, description="m")] = 0.3
+    sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0, description="rad, not degrees")] = 0.698
 
     def model(self) -> DetectionModel:
         return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi)
@@ -44,7 +45,7 @@ class LogisticSettings(FileModel):
     """See :class:`factors.rfid.LogisticModel`; ``coefficients`` in the order of ``factors.rfid.FEATURES``."""
 
     kind: Literal["logistic"] = "logistic"
-    coefficients: tuple[float, float, float, float, float, float, float, float, float, float, float]
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=11, max_length=11)]
 
     def model(self) -> DetectionModel:
         return LogisticModel(self.coefficients)
@@ -88,10 +89,10 @@ class AntennaSettings(FileModel):
 class RssiSettings(FileModel):
     """See :class:`factors.rfid_rssi.RssiModel`; ``coefficients`` in the order of ``factors.rfid_rssi.FEATURES``."""
 
-    coefficients: tuple[float, float, float, float, float, float]
-    sigma: Annotated[float, Field(gt=0.0, le=30.0, description="dB")]
-    dof: Annotated[float, Field(gt=0.0, le=1000.0, description="degrees of freedom of Student's density")]
-    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
+    sigma: Annotated[float, Field(ge=0.01, le=30.0, description="dB")]
+    dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of Student's density")]
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
         """The model for antennas at these places."""
@@ -102,12 +103,12 @@ class PhaseSettings(FileModel):
     """See :class:`factors.rfid_phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]: a read counts in several of
     them, in each by the share of ``step`` in ``window``."""
 
-    kappa: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
-    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
-    max_range: Annotated[float, Field(gt=0.0, le=50.0, description="m")] = 1.5
+    kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
+    max_range: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 1.5
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
-    window: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 2.0
-    step: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.0
+    window: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 2.0
+    step: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.0
 
     @model_validator(mode="after")
     def _has_no_gaps(self) -> PhaseSettings:
@@ -158,8 +159,8 @@ class RfidSettings(FileModel):
     models: dict[str, ModelSettings] = Field(default_factory=default_models)
     false_read: Share = 1e-3
     miss: Share = 0.0
-    tempering: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 1.0
+    round_gap: Annotated[float, Field(ge=1e-4, le=10.0, description="s")] = 0.05
     dead_tags: Share = 0.03
     rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None
@@ -199,8 +200,8 @@ class SurveySettings(FileModel):
     x: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
     y: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
     heading: Angle = 0.0
-    about_x: float = 0.0
-    about_y: float = 0.0
+    about_x: Coordinate = 0.0
+    about_y: Coordinate = 0.0
 
     def transform(self) -> Array:
         """The same as a pose (3,) of the survey's origin in the world."""

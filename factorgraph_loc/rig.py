@@ -30,7 +30,7 @@ Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
 Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
 Noise = Annotated[float, Field(ge=0.0, le=5.0)]
 
-PerRootSecond = Annotated[float, Field(gt=0.0, le=5.0, description="per sqrt(s)")]
+PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)")]
 
 # m, rad, s: how long the error of a constant acts before what is seen corrects it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
@@ -45,14 +45,6 @@ class GrowthSettings(FileModel):
 
     def model(self) -> Growth:
         return Growth(self.per_distance, self.per_rotation, self.per_time)
-
-    def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> GrowthSettings:
-        """The same with independent errors of these standard deviations added."""
-        return GrowthSettings(
-            per_distance=math.hypot(self.per_distance, per_distance),
-            per_rotation=math.hypot(self.per_rotation, per_rotation),
-            per_time=math.hypot(self.per_time, per_time),
-        )
 
 
 class OdometryNoise(FileModel):
@@ -89,7 +81,7 @@ class OdometrySettings(FileModel):
     delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
     lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
     turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0, description="m/rad")] = 0.0
-    max_hold: Annotated[float, Field(gt=0.0, le=60.0, description="s")] = 1.5
+    max_hold: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.5
     unknown_distance: Noise = 0.2
     unknown_rotation: Noise = 0.2
     noise: OdometryNoise = OdometryNoise()
@@ -136,10 +128,10 @@ class BearingRangeSettings(FileModel):
     range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported over true")] = 1.0
     range_kind: Annotated[Literal["distance", "depth"], Field(description="depth: along one axis only")] = "distance"
     depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor's frame")] = 0.0
-    range_sigma: Annotated[float, Field(gt=0.0, le=10.0, description="m")]
+    range_sigma: Annotated[float, Field(ge=1e-4, le=10.0, description="m")]
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
-    bearing_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad, not degrees")] = 0.05
-    robust: Annotated[float, Field(gt=0.0, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
+    bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad, not degrees")] = 0.05
+    robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
 
     def model(self) -> BearingRangeModel:
@@ -205,17 +197,14 @@ class Rig(FileModel):
         noise: as of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
         """
         s = self.odometry
-        noise = s.noise
+        along, heading = s.noise.along.model(), s.noise.heading.model()
         if constants_as_noise:
             u = s.uncertainty
-            noise = OdometryNoise(
-                along=noise.along.widened(per_distance=u.scale_distance * math.sqrt(WAY)),
-                lateral=noise.lateral,
-                heading=noise.heading.widened(
-                    per_distance=u.heading_drift * math.sqrt(WAY),
-                    per_rotation=u.scale_rotation * math.sqrt(TURN),
-                    per_time=u.heading_rate_bias * math.sqrt(TIME),
-                ),
+            along = along.widened(per_distance=u.scale_distance * math.sqrt(WAY))
+            heading = heading.widened(
+                per_distance=u.heading_drift * math.sqrt(WAY),
+                per_rotation=u.scale_rotation * math.sqrt(TURN),
+                per_time=u.heading_rate_bias * math.sqrt(TIME),
             )
         imu = self.imu or ImuSettings()
         return OdometryModel(
@@ -232,9 +221,9 @@ class Rig(FileModel):
             max_hold=s.max_hold,
             unknown_distance=s.unknown_distance,
             unknown_rotation=s.unknown_rotation,
-            along=noise.along.model(),
-            lateral=noise.lateral.model(),
-            heading=imu.heading.model() if use_gyro else noise.heading.model(),
+            along=along,
+            lateral=s.noise.lateral.model(),
+            heading=imu.heading.model() if use_gyro else heading,
         )
 
     def estimated_odometry(self) -> Estimated:

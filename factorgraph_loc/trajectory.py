@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.columns import LATEST, POSES
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import read_text, write_text
 from factorgraph_loc.planar import on_floor, rotations_of
@@ -118,7 +119,10 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
     bad = np.flatnonzero(~np.all(np.isfinite(table), axis=1))
     if len(bad):
         raise bad_field(path, "row", lines[rows[bad[0]] - 1].strip(), "8 finite numbers", row=rows[bad[0]])
-    return np.array(rows, dtype=np.int64), np.array(stamps, dtype=np.int64), table
+    numbers = np.array(rows, dtype=np.int64)
+    for column, found in zip(POSES.columns[1:8], table.T, strict=True):
+        column.require(path, numbers, found)
+    return numbers, np.array(stamps, dtype=np.int64), table
 
 
 def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
@@ -140,6 +144,6 @@ def nanoseconds(stamp: str) -> int:
         total = int(whole) * 10**9 + (-ns if whole.startswith("-") else ns)
     else:
         total = round(float(stamp) * 1e9)
-    if abs(total) >= 2**62:
+    if abs(total) > LATEST:
         raise OverflowError(f"{stamp} s is beyond 64 bits of nanoseconds")
     return total

@@ -19,7 +19,7 @@ from factorgraph_loc.column_mapping import ColumnMapping, EpcCase, in_case, read
 from factorgraph_loc.columns import TAGS
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import FileModel, inside, parse_model, read_toml, write_text, write_toml
+from factorgraph_loc.files import Coordinate, FileModel, inside, parse_model, read_toml, write_text, write_toml
 from factorgraph_loc.markers import Marker, corner_points
 from factorgraph_loc.occupancy import read_walls
 from factorgraph_loc.points import POINTS_SUFFIX, PointMap, read_points, write_points
@@ -39,7 +39,8 @@ def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, fl
     return value
 
 
-Covariance = Annotated[tuple[float, float, float], AfterValidator(_positive_semidefinite)]
+Variance = Annotated[float, Field(ge=-1e8, le=1e8, description="m^2")]
+Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_positive_semidefinite)]
 
 
 class Landmark(FileModel):
@@ -49,8 +50,8 @@ class Landmark(FileModel):
     the map was made from a log and the errors in x and y differ or go together.
     """
 
-    x: float
-    y: float
+    x: Coordinate
+    y: Coordinate
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     covariance: Covariance | None = None
 
@@ -69,9 +70,9 @@ class Tag(FileModel):
     :class:`Landmark`.
     """
 
-    x: float
-    y: float
-    z: float = 0.0
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate = 0.0
     facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")] | None = None
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     covariance: Covariance | None = None
@@ -99,7 +100,7 @@ class World(FileModel):
     landmarks: dict[str, Landmark] = Field(default_factory=dict)
     tags: dict[str, Tag] = Field(default_factory=dict)
     points: PointMap | None = None
-    walls: tuple[tuple[float, float, float, float], ...] = ()
+    walls: tuple[tuple[Coordinate, Coordinate, Coordinate, Coordinate], ...] = ()
 
     def position(self, landmark: str) -> Array | None:
         """Position (2,) of a landmark, or None if the map lacks it."""

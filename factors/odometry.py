@@ -41,6 +41,14 @@ class Growth:
     per_rotation: float = 0.0
     per_time: float = 0.0
 
+    def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
+        """The same with independent errors of these standard deviations added."""
+        return Growth(
+            math.hypot(self.per_distance, per_distance),
+            math.hypot(self.per_rotation, per_rotation),
+            math.hypot(self.per_time, per_time),
+        )
+
     def variance(self, distance: float, rotation: float, duration: float) -> float:
         """The variance after ``distance`` metres, ``rotation`` radians (both unsigned) and ``duration`` seconds."""
         return self.per_distance**2 * distance + self.per_rotation**2 * rotation + self.per_time**2 * duration

@@ -110,7 +110,7 @@ def test_a_flat_covariance_is_one(written):
         (lambda t: t.with_columns(xx=pl.lit(-5.0)), ":1: covariance (xx, xy, xz, yy, yz, zz) of point p0 is (-5.0, "),
         (lambda t: in_row(t, 3, xx=0.0, xy=1.0), ":4: covariance (xx, xy, xz, yy, yz, zz) of point p2 is (0.0, 1.0, "),
         (lambda t: in_row(t, 1, size=float("nan")), ":2: size is nan, expected a finite number"),
-        (lambda t: in_row(t, 1, size=0.0), ":2: size is 0.0, expected a number above 0"),
+        (lambda t: in_row(t, 1, size=0.0), ":2: size is 0.0, expected a finite number of px in 0.001"),
         (lambda t: in_row(t, 0, from_x=float("inf")), ":1: from_x is inf, expected a finite number"),
         (lambda t: in_row(t, 2, from_z=None), ":3: from_z is nan, expected a finite number"),
         (lambda t: t.with_columns(feature=pl.lit("surf")), ":1: feature is 'surf', expected colour or sift or orb"),

@@ -51,16 +51,16 @@ class Consistency:
 
 
 def inflated(rig: Rig, factor: float) -> Rig:
-    """The rig with the sigmas of its landmark sensor multiplied."""
+    """The rig with the sigmas of its landmark sensor multiplied, at most to their bounds."""
     assert rig.bearing_range is not None
     s = rig.bearing_range
     return rig.model_copy(
         update={
             "bearing_range": s.model_copy(
                 update={
-                    "range_sigma": min(factor * s.range_sigma, 10.0),
-                    "range_sigma_relative": min(factor * s.range_sigma_relative, 1.0),
-                    "bearing_sigma": min(factor * s.bearing_sigma, 0.5),
+                    "range_sigma": factor * s.range_sigma,
+                    "range_sigma_relative": factor * s.range_sigma_relative,
+                    "bearing_sigma": factor * s.bearing_sigma,
                 }
             )
         }

@@ -289,7 +289,7 @@ def _apart(
 
 def _with_odometry(rig: Rig, learnt: Sequence[Learnt], noise: NoiseFit) -> Rig:
     growth = {
-        error: GrowthSettings(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
+        error: GrowthSettings.bounded(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
         for error, g in noise.growth.items()
     }
     changed: dict[str, object] = {one.name: one.value for one in learnt}

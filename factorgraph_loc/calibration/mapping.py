@@ -296,7 +296,7 @@ def _assemble(
         elif point is not None:
             (xx, xy), (_, yy) = point.covariance.tolist()
             x, y = point.position.tolist()
-            landmarks[name] = Landmark(x=x, y=y, covariance=(xx, xy, yy))
+            landmarks[name] = Landmark.bounded(x=x, y=y, covariance=(xx, xy, yy))
     return LandmarkMap(World(name=f"{log.name}-map", landmarks=landmarks), tuple(entries), frame, judged, tuple(notes))
 
 

@@ -105,7 +105,7 @@ class _Focus:
 
     def survey(self, state: Array) -> SurveySettings:
         x, y, heading, px, py = map(float, (*state[:3], *self.pivot))
-        return SurveySettings(x=x, y=y, heading=heading, about_x=px, about_y=py)
+        return SurveySettings.bounded(x=x, y=y, heading=heading, about_x=px, about_y=py)
 
     def near(self, state: Array) -> _Focus:
         """The reads that are near their tags, and many enough in their windows."""

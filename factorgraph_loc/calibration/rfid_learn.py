@@ -163,7 +163,7 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
         return survey
     places = {name: point for one in rounds for name, point in zip(one.names, one.tags.points[:, :2], strict=True)}
     x, y = np.mean(list(places.values()), axis=0).round(2).tolist()
-    return SurveySettings(about_x=x, about_y=y)
+    return SurveySettings.bounded(about_x=x, about_y=y)
 
 
 def _with_models(
@@ -210,7 +210,7 @@ def _with_signals(
 
 def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
     if isinstance(model, BeamModel):
-        return BeamSettings(
+        return BeamSettings.bounded(
             p0=round(model.p0, 4),
             r_max=round(model.r_max, 3),
             s_r=round(model.s_r, 3),

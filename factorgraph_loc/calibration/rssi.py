@@ -46,7 +46,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
         raise InputError(f"{names}: hold {len(y)} reads with an RSSI, expected at least {ENOUGH_READS}")
     coefficients, sigma, dof = _fit(x, y)
     _, sigma_0, dof_0 = flat = _fit(x[:, :1], y)
-    settings = RssiSettings(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
+    settings = RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
     constant = _nll(y - x[:, :1] @ flat[0], sigma_0, dof_0)
     return RssiFit(settings, _nll(y - x @ coefficients, sigma, dof), constant, len(y))
 

@@ -145,9 +145,9 @@ def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
     tag = log.world.tags[name]
     x, y = position.tolist()
     if tag.covariance is None:
-        return Landmark(x=x, y=y, sigma=tag.sigma)
+        return Landmark.bounded(x=x, y=y, sigma=tag.sigma)
     xx, xy, yy = tag.covariance
-    return Landmark(x=x, y=y, covariance=_turned(np.array(((xx, xy), (xy, yy))), float(log.rig.survey.heading)))
+    return Landmark.bounded(x=x, y=y, covariance=_turned(np.array(((xx, xy), (xy, yy))), float(log.rig.survey.heading)))
 
 
 def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
@@ -175,7 +175,7 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
         given = log.world.tags.get(name)
         if np.isnan(direction) and given is not None and given.facing is not None and in_given_frame:
             direction = given.facing
-        tags[name] = Tag(
+        tags[name] = Tag.bounded(
             x=x,
             y=y,
             z=float(looks.heights[i]),

@@ -29,7 +29,7 @@ class GraphSettings(FileModel):
     """
 
     keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
-    keyframe_max_interval: Annotated[float, Field(gt=0.0, le=60.0)] = 1.0
+    keyframe_max_interval: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
     max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
     self_calibration: bool = True
     landmarks: MapUse = "known"

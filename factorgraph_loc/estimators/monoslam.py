@@ -72,10 +72,10 @@ class MonoslamSettings(FilterSettings):
     """
 
     planar: bool | None = None
-    acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="m/s^2")] = 4.0
-    angular_acceleration: Annotated[float, Field(gt=0.0, le=100.0, description="rad/s^2")] = 6.0
-    height_sigma: Annotated[float, Field(gt=0.0, le=1.0, description="m")] = 0.005
-    tilt_sigma: Annotated[float, Field(gt=0.0, le=0.5, description="rad")] = 0.005
+    acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="m/s^2")] = 4.0
+    angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="rad/s^2")] = 6.0
+    height_sigma: Annotated[float, Field(ge=1e-5, le=1.0, description="m")] = 0.005
+    tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad")] = 0.005
     landmarks: MapUse = "known"
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20

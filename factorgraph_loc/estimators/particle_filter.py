@@ -56,7 +56,7 @@ class ParticleFilterSettings(FilterSettings):
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     kld: bool = False
     min_particles: Annotated[int, Field(ge=10, le=1_000_000)] = 500
-    resample_below: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    resample_below: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.5
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0)] = 1.0
     self_calibration: bool = True

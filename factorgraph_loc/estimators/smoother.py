@@ -56,8 +56,8 @@ class SmootherSettings(GraphSettings):
     for the odometry's constants in their units) before its factors are linearised anew, and after how many updates that is
     checked. ``smooth`` off: the final trajectory repeats the causal one."""
 
-    lag: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
-    relinearize_threshold: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
+    lag: Annotated[float, Field(ge=0.1, le=3600.0)] | None = None
+    relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
     smooth: bool = True
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior, SpacePose
 from factorgraph_loc.estimators.space_pose import planar_estimate
@@ -108,6 +109,6 @@ def _parse(prior: str) -> list[float]:
         raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}") from None
     if len(heading) > 1:
         raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}")
-    if not all(map(math.isfinite, (x, y, *heading))) or any(abs(angle) > 2.0 * math.pi for angle in heading):
-        raise InputError(f"prior is {quoted(prior)}, expected finite metres and a heading in radians")
+    if not (max(abs(x), abs(y)) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
+        raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
     return [x, y, *heading]

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from factorgraph_loc.files import FileModel
 
-Metres = Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
+Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Dimension = Literal["x", "y", "heading"]
 
@@ -50,8 +50,8 @@ class ActiveSettings(FileModel):
 
     policy: PolicySettings = PolicySettings()
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
-    turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
+    speed: Annotated[float, Field(ge=0.01, le=3.0, description="m/s")] = 0.5
+    turn_rate: Annotated[float, Field(ge=0.01, le=6.0, description="rad/s")] = 1.0
     clearance: Annotated[float, Field(ge=0.05, le=2.0, description="m")] = 0.35
     sight: Metres = 3.0
     start: tuple[Coordinate, Coordinate, Coordinate] | None = None

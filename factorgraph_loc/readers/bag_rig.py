@@ -8,11 +8,13 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from factorgraph_loc.camera_settings import CameraSettings
+from factorgraph_loc.files import parse_model
 from factorgraph_loc.readers.bag_camera import Info
 from factorgraph_loc.readers.bag_frames import StaticFrames, angles_of_camera
 from factorgraph_loc.readers.registry import DEFAULT_RIG
 from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import plain
 from factors.se2 import Array
 
 
@@ -36,7 +38,9 @@ def antennas_of(
     for verb, told in (("tells", True), ("does not tell", False)):
         if which := [name for name, pose in poses.items() if (pose is not None) == told]:
             notes.append(f"tf_static {verb} where antennas {', '.join(which)} sit on {base}")
-    return RfidSettings(antennas={name: AntennaSettings() if p is None else _antenna(p) for name, p in poses.items()})
+    return RfidSettings(
+        antennas={name: AntennaSettings() if p is None else _antenna(name, p) for name, p in poses.items()}
+    )
 
 
 def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
@@ -44,8 +48,9 @@ def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSett
     return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
 
 
-def _antenna(pose: Array) -> AntennaSettings:
+def _antenna(name: str, pose: Array) -> AntennaSettings:
     x, y, z = pose[:3, 3].tolist()
     ahead = pose[:3, 0]
     pitch = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
-    return AntennaSettings(x=x, y=y, z=z, yaw=math.atan2(ahead[1], ahead[0]), pitch=pitch)
+    place = {"x": x, "y": y, "z": z, "yaw": math.atan2(ahead[1], ahead[0]), "pitch": pitch}
+    return parse_model(AntennaSettings, place, f"tf_static of antenna {plain(name)}")

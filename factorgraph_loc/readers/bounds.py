@@ -59,7 +59,8 @@ def require_bounds(log: Log) -> None:
         for column in COLUMNS.get(type(stream), ()):
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
     if log.reference is not None:
-        for name, values in zip(("x", "y", "heading"), log.reference.poses.T, strict=True):
+        known = ("x", "y", "heading") if log.reference.has_heading else ("x", "y")
+        for name, values in zip(known, log.reference.poses.T, strict=False):
             _require(f"{log.name}: reference", POSES[name], log.reference.t, values)
     if log.reference3 is not None:
         for name, values in zip("xyz", log.reference3.positions.T, strict=True):

@@ -12,8 +12,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.columns import LATEST
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import FileModel, inside, parse_model, read_toml
+from factorgraph_loc.files import Coordinate, FileModel, inside, parse_model, read_toml
 from factorgraph_loc.log import StartPose
 from factorgraph_loc.markers import MarkerSettings
 from factorgraph_loc.shipped import manifests
@@ -24,12 +25,12 @@ DATA_ROOT = "FGLOC_DATA"
 class StartSettings(FileModel):
     """A known start: pose, standard deviations, and absolute time (without it, t = 0 of the log)."""
 
-    x: Annotated[float, Field(description="m")]
-    y: Annotated[float, Field(description="m")]
+    x: Coordinate
+    y: Coordinate
     heading: Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
-    sigma_position: Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
-    sigma_heading: Annotated[float, Field(gt=0.0, le=10.0, description="rad")]
-    t_ns: int | None = None
+    sigma_position: Annotated[float, Field(ge=1e-6, le=1000.0, description="m")]
+    sigma_heading: Annotated[float, Field(ge=1e-6, le=10.0, description="rad")]
+    t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST, description="ns")] | None = None
 
     def pose(self, t0_ns: int) -> StartPose:
         """As a start in a log whose t = 0 is at ``t0_ns``."""

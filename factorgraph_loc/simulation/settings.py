@@ -10,12 +10,13 @@ from pydantic import ConfigDict, Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.rfid_settings import Weight
 from factorgraph_loc.rig import Rig, placed, read_rig
 from factorgraph_loc.text import listed, quoted
 
-Metres = Annotated[float, Field(gt=0.0, le=1000.0, description="m")]
+Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
 Seconds = Annotated[float, Field(ge=0.0, le=1e5, description="s")]
-Hertz = Annotated[float, Field(gt=0.0, le=100.0, description="1/s")]
+Hertz = Annotated[float, Field(ge=1e-3, le=100.0, description="1/s")]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Surface = Literal["wall", "shelf", "floor"]
 
@@ -33,7 +34,7 @@ class WorldSettings(FileModel):
     width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
     depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
     tags: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    density: Annotated[float, Field(gt=0.0, le=100.0, description="tags per m^2")] | None = None
+    density: Annotated[float, Field(ge=1e-4, le=100.0, description="tags per m^2")] | None = None
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
     tag_height: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 1.2
     even: bool = False
@@ -56,8 +57,8 @@ class DriveSettings(FileModel):
     """A drive between random places. ``rate``: of the reference. ``clearance``: from walls, for the path's points."""
 
     duration: Annotated[float, Field(ge=1.0, le=14_400.0, description="s")] = 600.0
-    speed: Annotated[float, Field(gt=0.0, le=3.0, description="m/s")] = 0.5
-    turn_rate: Annotated[float, Field(gt=0.0, le=6.0, description="rad/s")] = 1.0
+    speed: Annotated[float, Field(ge=0.01, le=3.0, description="m/s")] = 0.5
+    turn_rate: Annotated[float, Field(ge=0.01, le=6.0, description="rad/s")] = 1.0
     rate: Annotated[float, Field(ge=10.0, le=50.0, description="1/s")] = 10.0
     clearance: Annotated[float, Field(ge=0.25, le=2.0, description="m")] = 0.3
 
@@ -75,9 +76,9 @@ class RssiSettings(FileModel):
     """How strong a read is: ``coefficients`` of :data:`factors.rfid_rssi.FEATURES`, and Student's noise of scale ``sigma`` with
     ``dof`` degrees of freedom."""
 
-    coefficients: tuple[float, float, float, float, float, float] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
     sigma: Annotated[float, Field(ge=0.0, le=30.0, description="dB")] = 2.0
-    dof: Annotated[float, Field(gt=0.0, le=100.0)] = 4.0
+    dof: Annotated[float, Field(ge=0.1, le=100.0)] = 4.0
 
 
 class SightingSettings(FileModel):
@@ -86,7 +87,7 @@ class SightingSettings(FileModel):
 
     rate: Hertz = 2.0
     max_range: Metres = 6.0
-    field_of_view: Annotated[float, Field(gt=0.0, le=6.3, description="rad")] = 6.3
+    field_of_view: Annotated[float, Field(ge=0.01, le=6.3, description="rad")] = 6.3
 
 
 class PixelSettings(FileModel):
@@ -115,7 +116,7 @@ class ImageSettings(FileModel):
 class Fading(FileModel):
     """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
 
-    duration: Annotated[float, Field(gt=0.0, le=1000.0, description="s")] = 2.0
+    duration: Annotated[float, Field(ge=1e-3, le=1000.0, description="s")] = 2.0
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
 
 
@@ -165,7 +166,7 @@ class SimulationSettings(FileModel):
 
     name: str = "office"
     world: WorldSettings
-    world_seed: Annotated[int, Field(ge=0)] | None = None
+    world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
     rssi: RssiSettings | None = None

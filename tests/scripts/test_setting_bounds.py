@@ -1,0 +1,81 @@
+"""Settings keep to bounds: all numbers have them, what lies outside is refused in one line, what is computed stays inside."""
+
+import math
+from pathlib import Path
+
+import pytest
+from limits_tables import FILES, numbers_of, tables
+
+from factorgraph_loc.calibration.consistency import inflated
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.estimators import registry
+from factorgraph_loc.files import parse_model
+from factorgraph_loc.rig import (
+    BearingRangeSettings,
+    GrowthSettings,
+    OdometryNoise,
+    OdometrySettings,
+    OdometryUncertainty,
+    Rig,
+)
+from factorgraph_loc.world import World
+
+NUMBERS = [
+    pytest.param(*number, id=f"{file}-{number[0]}") for file, kind in FILES.items() for number in numbers_of(kind)
+]
+
+
+@pytest.mark.parametrize("file", list(FILES))
+def test_every_number_of_settings_has_bounds(file):
+    without = [key for key, _, low, high in numbers_of(FILES[file]) if not math.isfinite(high - low)]
+    assert not without
+
+
+def test_the_page_of_limits_is_up_to_date():
+    page = (Path(__file__).parents[2] / "docs" / "limits.md").read_text()
+    assert page.partition("<!-- tables -->")[2].strip() == "\n".join(tables()).strip(), (
+        "scripts/limits --docs docs/limits.md"
+    )
+
+
+@pytest.mark.parametrize("value", [1e-9, 1e308, -1.0, 1e-300])
+@pytest.mark.parametrize("key", ["range_sigma", "bearing_sigma", "robust"])
+def test_noise_that_is_none_is_refused(key, value):
+    with pytest.raises(InputError, match=rf"a\.rig\.toml: bearing_range\.{key} is .*: input should be"):
+        parse_model(Rig, {"bearing_range": {"range_sigma": 0.1, key: value}}, "a.rig.toml")
+
+
+@pytest.mark.parametrize("place", [1e8, -1e300])
+def test_places_beyond_the_earth_are_refused(place):
+    for content in ({"landmarks": {"a": {"x": place, "y": 0.0}}}, {"walls": [[0.0, 0.0, place, 0.0]]}):
+        with pytest.raises(InputError, match="input should be"):
+            parse_model(World, content, "a.world.toml")
+
+
+def test_uncertain_constants_beside_noise_at_its_bound_make_a_model():
+    """What is added to the noise is of the model, which has no bound."""
+    most = GrowthSettings(per_distance=5.0, per_rotation=5.0, per_time=5.0)
+    sure = OdometryUncertainty(scale_distance=1.0, scale_rotation=1.0, heading_rate_bias=1.0, heading_drift=1.0)
+    noise = OdometryNoise(along=most, lateral=most, heading=most)
+    model = Rig(odometry=OdometrySettings(noise=noise, uncertainty=sure)).odometry_model(constants_as_noise=True)
+    assert model.along.per_distance == pytest.approx(math.hypot(5.0, 2.0))
+    assert model.heading.per_distance == pytest.approx(math.hypot(5.0, 2.0))
+    assert model.heading.per_rotation == pytest.approx(math.hypot(5.0, 2.0))
+    assert model.heading.per_time == pytest.approx(math.hypot(5.0, math.sqrt(8.0)))
+    assert model.lateral == most.model()
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1e12])
+def test_computed_settings_can_be_read_again(factor):
+    rig = inflated(Rig(bearing_range=BearingRangeSettings(range_sigma=0.1, range_sigma_relative=0.1)), factor)
+    assert parse_model(Rig, rig.model_dump(exclude_none=True), "a.rig.toml") == rig
+    assert GrowthSettings.bounded(per_distance=factor, per_time=-factor).per_time == 0.0
+
+
+@pytest.mark.parametrize("name", list(registry.ESTIMATORS))
+def test_settings_of_estimators_are_refused_in_one_line(name):
+    for key, kind, low, high in numbers_of(FILES[f"settings of {name}"]):
+        for value in (low - 1.0, high + 1.0):
+            with pytest.raises(InputError, match=f"settings of {name}: {key} is ") as caught:
+                registry.settings_of(name, {key: kind(value) if kind is float else math.floor(value)})
+            assert "\n" not in str(caught.value)
