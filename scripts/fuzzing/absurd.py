@@ -5,11 +5,9 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from numpy.random import Generator
-
-T = TypeVar("T")
 
 TEXTS = (
     *(
@@ -168,14 +166,14 @@ RAW = (
 )
 
 
-def pick(rng: Generator, items: Sequence[T]) -> T:
+def pick(rng: Generator, items: Sequence[Any]) -> Any:
     """One of several."""
     return items[int(rng.integers(len(items)))]
 
 
 def text(rng: Generator) -> str:
     """What might stand in a cell or as a word."""
-    return pick(rng, TEXTS)
+    return str(pick(rng, TEXTS))
 
 
 def number(rng: Generator, value: float) -> float:
@@ -190,7 +188,7 @@ def number(rng: Generator, value: float) -> float:
     if choice == 3:
         return math.nextafter(value, math.inf)
     finite = (0.0, -0.0, -1.0, 1e308, -1e308, 1e300, 1e-300, 5e-324, 1e-9, 1e9, 1e12, 1e18, 2.0**63, 3.5e38, math.pi)
-    return pick(rng, (*finite, math.nan, math.inf, -math.inf))
+    return float(pick(rng, (*finite, math.nan, math.inf, -math.inf)))
 
 
 class Marks:

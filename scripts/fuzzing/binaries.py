@@ -26,6 +26,10 @@ WRAPPED: tuple[Callable[[Any], Any], ...] = (
     str,
     lambda v: str(v).encode(),
 )
+KINDS: tuple[Any, ...] = (
+    *(pl.Int8, pl.UInt64, pl.Int128, pl.Float32, pl.Decimal(38, 3), pl.Boolean, pl.String, pl.Categorical, pl.Binary),
+    *(pl.Date, pl.Time, pl.Duration("ns"), pl.Datetime("us"), pl.Datetime("ns", "UTC")),
+)
 INTEGERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 2**31, 2**40, 2**62, 2**63 - 1, 2**64 - 1)
 
 
@@ -33,7 +37,7 @@ def raw(content: bytes, rng: Generator) -> bytes:
     """Bytes that are flipped, cut off, taken out, put in, repeated, or taken for a length."""
     out = bytearray(content)
     choice, n = rng.integers(8), max(1, len(out))
-    at = int(rng.integers(n)) if rng.random() < 0.7 else int(min(n - 1, rng.integers(200)))
+    at = int(rng.integers(n if rng.random() < 0.7 else min(n, 200)))
     length = min(n - at, int(2 ** rng.integers(0, 12)))
     if choice == 0:
         for place in rng.integers(n, size=int(2 ** rng.integers(0, 6))).tolist():
@@ -67,19 +71,7 @@ def parquet(content: bytes, rng: Generator) -> bytes:
         made = pick(rng, WRAPPED)
         frame = frame.with_columns(pl.Series(name, [made(v) for v in column.to_list()], strict=False))
     elif choice == 3:
-        kinds = (
-            pl.Int8,
-            pl.UInt64,
-            pl.Float32,
-            pl.String,
-            pl.Boolean,
-            pl.Date,
-            pl.Datetime("us"),
-            pl.Duration("ns"),
-            pl.Time,
-        )
-        kinds = (*kinds, pl.Categorical, pl.Decimal(38, 3), pl.Int128, pl.Datetime("ns", "UTC"), pl.Binary)
-        frame = frame.with_columns(column.cast(pick(rng, kinds), strict=False))
+        frame = frame.with_columns(column.cast(pick(rng, KINDS), strict=False))
     elif choice == 4:
         frame = frame.rename({name: text(rng)[:5000]})
     elif choice == 5:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.random import Generator
@@ -22,7 +22,6 @@ from factorgraph_loc.log import Log
 from fuzzing.seeds import drive
 from fuzzing.verdicts import WrongResultError, fault_of
 
-T = TypeVar("T")
 ESTIMATORS: dict[str, tuple[dict[str, Any], ...]] = {
     "dead_reckoning": ({},),
     "ekf": ({}, {"landmarks": "unknown"}, {"iterations": 3}, {"max_delay": 0.0}),
@@ -36,7 +35,7 @@ ESTIMATORS: dict[str, tuple[dict[str, Any], ...]] = {
 CHOSEN = ("ekf", "particle_filter", "smoother", *ESTIMATORS)
 LOCALIZERS = tuple(ESTIMATORS)
 SENSORS = ("odometry", "imu", "rfid", "bearing_range", "sightings", "rssi", "phase", "camera")
-ABSURD = (
+ABSURD: tuple[Any, ...] = (
     *(
         math.nan,
         math.inf,
@@ -123,7 +122,7 @@ def measured() -> tuple[Any, ...]:
     return tuple(log().measurements(("odometry", "imu", "rfid", "bearing_range", "sightings")))
 
 
-def one_of(draw: Draw, items: Sequence[T]) -> T:
+def one_of(draw: Draw, items: Sequence[Any]) -> Any:
     return items[draw.integer(0, len(items) - 1)]
 
 
@@ -262,7 +261,7 @@ def _nothing(draw: Draw, t: Any) -> Any:
 
 
 def _count(draw: Draw) -> int:
-    return one_of(draw, (1, 1, 2, 3, 0))
+    return int(one_of(draw, (1, 1, 2, 3, 0)))
 
 
 MAKERS = (
@@ -282,7 +281,15 @@ MAKERS = (
 
 def _pixels(draw: Draw, count: int) -> Any:
     usual = np.full((count, 2), 200.0)
-    others = (np.full((count, 2), 1e300), np.full((count, 2), np.nan), -usual, usual[:, :1], None, [], "x")
+    others: tuple[Any, ...] = (
+        np.full((count, 2), 1e300),
+        np.full((count, 2), np.nan),
+        -usual,
+        usual[:, :1],
+        None,
+        [],
+        "x",
+    )
     return one_of(draw, (usual, usual + draw.number(0.0, 100.0), usual * draw.number(0.0, 2.0), *others))
 
 

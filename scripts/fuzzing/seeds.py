@@ -79,6 +79,7 @@ def drive(seconds: float = 3.0, seed: int = 3, **world: int) -> Log:
         },
     )
     moved = log.streams["odometry"]
+    assert isinstance(moved, fgloc.IncrementStream)
     gyro = fgloc.YawRateStream(moved.t[1:], moved.dtheta[1:] / np.diff(moved.t))
     return replace(log, name="sim", streams={**log.streams, "imu": gyro})
 

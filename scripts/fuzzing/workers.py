@@ -20,7 +20,7 @@ from fuzzing.verdicts import Verdict
 
 SECONDS = 8.0  # of the processor, or of waiting for something that does not come
 AT_MOST = 60.0  # s by the clock, on a machine that does other things
-STARTING = 240.0  # s, for a process that imports, compiles and makes seeds
+STARTING = 900.0  # s, for a process that imports, compiles and makes seeds
 MEMORY = 2 * 10**9  # bytes, beside what a process has when it is ready
 LIBRARIES = ("OPENBLAS", "OMP", "NUMBA", "RAYON")
 ONE_THREAD = {"POLARS_MAX_THREADS": "1"} | {f"{name}_NUM_THREADS": "1" for name in LIBRARIES}
