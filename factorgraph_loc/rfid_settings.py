@@ -112,7 +112,7 @@ class PhaseSettings(FileModel):
 
     @model_validator(mode="after")
     def _has_no_gaps(self) -> PhaseSettings:
-        if self.step > self.window:
+        if self.step > self.window * (1.0 + 1e-9):
             raise ValueError(f"step {self.step:g} s leaves gaps between windows, expected at most {self.window:g} s")
         return self
 

@@ -26,6 +26,7 @@ from factorgraph_loc.estimators.problem import Problem
 from factorgraph_loc.estimators.variables import ODOMETRY_KEY, Values, landmark_key, pose_key
 from factorgraph_loc.log import Log
 from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.ticks import TICK_GAP
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry import PARAMETERS, Increment, OdometryFactor, recalibrated
@@ -90,7 +91,7 @@ class _Way:
             if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
                 motion.add(m)
         last = max(float(looks.t[-1]), prior.t)
-        self.t: Array = np.asarray(prior.t + INTERVAL * np.arange(int((last - prior.t) / INTERVAL) + 1))
+        self.t = _keyframes(prior.t, last, np.append(looks.t, log.streams["odometry"].t))
         states = [motion.state(float(t)) for t in self.t]
         self._steps = [motion.relative(a, b) for a, b in pairwise(states)]
         self._used = looks.t >= prior.t
@@ -201,3 +202,14 @@ class _Way:
             for tag in variable[near | hits[:, variable].any(axis=0)].tolist():
                 out.append((RfidTagFactor(everything, tag, here), (pose_key(i), landmark_key(tag))))
         return out
+
+
+def _keyframes(begin: float, end: float, stamps: Array) -> Array:
+    """Times ``INTERVAL`` apart from ``begin`` to ``end`` [s], without those inside of long gaps between ``stamps``: a clock that
+    jumps makes no keyframes. Before the first stamp behind a gap there is one."""
+    measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
+    gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)
+    firsts = np.append(0, ((measured[gaps + 1] - begin) / INTERVAL).astype(np.int64))
+    lasts = ((np.append(measured[gaps], end) - begin) / INTERVAL).astype(np.int64)
+    numbers = [np.arange(first, last + 1) for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True)]
+    return np.asarray(begin + INTERVAL * np.concatenate(numbers))

@@ -29,6 +29,7 @@ from factors import se2
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
+_ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
 MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
 MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
 MIN_PASSES = 3
@@ -144,7 +145,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
         return {}
     model = log.rig.bearing_range.model()
     t = stream.t + log.rig.time_offset("bearing_range")
-    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP), np.array(model.mounting))
+    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + _ROUNDING), np.array(model.mounting))
     ranges = stream.range / model.range_scale
     bearings = stream.bearing - model.bearing_bias
     if not log.reference.has_heading:
@@ -211,7 +212,7 @@ def _summary(t: Array) -> StreamSummary:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)
     steps = np.diff(stamps)
-    gaps = tuple((float(stamps[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP))
+    gaps = tuple((float(stamps[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + _ROUNDING))
     rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
     return StreamSummary(len(t), rate, float(stamps[0]), float(stamps[-1]), gaps)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream, YawRateStream
+from factorgraph_loc.ticks import TICK_GAP
 from factors import bearing_range, se2
 from factors.odometry_chain import OdometryChain
 from factors.se2 import Array
@@ -38,12 +39,14 @@ class Match:
 
 
 def motion_problems(log: Log) -> list[str]:
-    """Lines on sensors and a reference that do not fit the odometry, and on a reference that is shorter than it."""
+    """Lines on sensors and a reference that do not fit the odometry, and on a reference that is shorter than it. Of a log with long
+    gaps the longest part between them is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
     lines = _coverage(log, stream)
-    t = np.arange(stream.t[0], stream.t[-1], STEP) + log.rig.time_offset("odometry")
+    begin, end = _longest(stream.t)
+    t = np.arange(begin, end, STEP) + log.rig.time_offset("odometry")
     states = _integrated(log, stream).states(t)
     heading, way = states[:, 3], states[:, 4]
     gyro = log.streams.get("imu")
@@ -65,6 +68,13 @@ def motion_problems(log: Log) -> list[str]:
         found = match(_rates(way, window), _speeds(poses[:, :2], window))
         lines += _compared("odometry", "the reference", found and Match(found.shift, 1.0))
     return lines + _sightings(log)
+
+
+def _longest(t: Array) -> tuple[float, float]:
+    """Begin and end of the longest time without a gap of more than :data:`~factorgraph_loc.ticks.TICK_GAP` between stamps (N,)."""
+    parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
+    longest = max(parts, key=lambda part: float(part[-1] - part[0]))
+    return float(longest[0]), float(longest[-1])
 
 
 def match(rates: Array, others: Array) -> Match | None:

@@ -15,6 +15,7 @@ from factors.se2 import Array
 
 MAX_LATE_NS = 500_000_000  # what estimators still put in at its time
 MAX_ODOMETRY_GAP = 5.0  # s
+ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
 
 
 def require_finite(source: object, rows: Integers, field: str, values: Array) -> None:
@@ -105,7 +106,7 @@ def look_over(log: Log) -> list[str]:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")
     warnings = []
     gaps = np.diff(odometry.t)
-    wide = np.flatnonzero(gaps > MAX_ODOMETRY_GAP)
+    wide = np.flatnonzero(gaps > MAX_ODOMETRY_GAP + ROUNDING)
     if len(wide):
         i = int(np.argmax(gaps))
         count = "a gap" if len(wide) == 1 else f"{len(wide)} gaps"

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from factorgraph_loc.calibration.tag_looks import tag_looks
 from factorgraph_loc.calibration.tag_mapping import map_tags
 from factorgraph_loc.calibration.tag_search import merged, search
+from factorgraph_loc.calibration.tag_slam import INTERVAL, _keyframes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.log import Log
@@ -198,3 +199,14 @@ def test_from_an_unknown_start_the_map_is_brought_onto_the_given_one_with_its_fa
         assert se2.wrap_scalar(tag.facing - room.world.tags[name].facing) == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(InputError, match="to extend its map from odometry the start has to be known"):
         map_tags(room, "odometry", None, extend=True)
+
+
+def test_a_clock_that_jumps_makes_no_keyframes():
+    stamps = np.array((0.0, 1.0, 2.5, 1.7e9, 1.7e9 + 1.0))
+    times = _keyframes(0.0, stamps[-1], stamps)
+    assert times[0] == 0.0
+    assert np.all((times <= 2.5) | (times > 1.7e9 - INTERVAL))
+    assert np.all(np.diff(times) > 0.0)
+    assert len(times) <= 2 + 3.5 / INTERVAL + 2
+    near = np.arange(0.0, 100.0, 30.0)
+    assert _keyframes(0.0, 90.0, near).tolist() == (INTERVAL * np.arange(int(90.0 / INTERVAL) + 1)).tolist()

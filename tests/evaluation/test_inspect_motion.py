@@ -8,6 +8,7 @@ import pytest
 from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.evaluation.inspect_motion import motion_problems
 from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream, YawRateStream
+from factorgraph_loc.readers.checks import look_over
 from factorgraph_loc.rig import BearingRangeSettings, OdometrySettings, Rig
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.world import Landmark, World
@@ -113,3 +114,18 @@ def test_noise_at_rest_tells_nothing(log):
     }
     poses = 0.001 * rng.standard_normal((len(t), 3))
     assert motion_problems(replace(log, streams=still, reference=Trajectory(t, poses))) == []
+
+
+def test_a_clock_that_jumps_by_years_costs_nothing(log):
+    """The first rows are from before the clock was set; the rest is compared as it is."""
+    jumped = {k: replace(s, t=np.where(s.t < 5.0, s.t, s.t + 1.7e9)) for k, s in log.streams.items()}
+    reference = replace(log.reference, t=np.where(log.reference.t < 5.0, log.reference.t, log.reference.t + 1.7e9))
+    assert motion_problems(replace(log, streams=jumped, reference=reference)) == []
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1, 1234.567])
+def test_rows_that_are_as_far_apart_as_they_may_be_are_no_gap(log, start):
+    t = start + 5.0 * np.arange(200)
+    slow = replace(log, streams={"odometry": VelocityStream(t, *np.zeros((2, len(t))))}, reference=None)
+    assert look_over(slow) == []
+    assert not any("gap" in line for line in inspect(slow).problems)
