@@ -89,12 +89,16 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 def read_bytes(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most ``limit`` bytes; InputError as of :func:`opened`."""
     with opened(path, limit) as file:
+        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # what is asked for is taken at once
         try:
-            content = file.read(limit + 1)  # a file may grow, and those of /proc say that they are empty
+            while count <= limit and (part := file.read(step)):
+                parts.append(part)
+                count += len(part)
+                step = 2**16  # the file has grown, or is one of /proc that says it is empty
         except OSError as error:
             raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
-    require_size(path, "its size in bytes", len(content), limit)
-    return content
+    require_size(path, "its size in bytes", count, limit)
+    return b"".join(parts)
 
 
 def copy_file(source: Path, target: Path) -> None:

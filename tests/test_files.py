@@ -1,6 +1,7 @@
 import os
 import socket
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -193,3 +194,17 @@ def test_what_another_library_raises_is_one_line():
         fail(Panic())
     Panic.__module__ = "pyo3_runtime"  # of libraries in Rust
     refused(lambda: fail(Panic("index out of range")), "index out of range")
+
+
+def test_a_file_without_a_size_is_read():
+    assert "processor" in read_text(Path("/proc/cpuinfo"))
+    refused(lambda: read_text(Path("/proc/cpuinfo"), 100), "its size in bytes is", "expected at most 100")
+
+
+def test_no_more_memory_is_asked_for_than_a_file_has(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    tracemalloc.start()
+    assert read_text(path) == "12345"
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()

@@ -1,4 +1,5 @@
 import io
+import os
 
 import numpy as np
 import polars as pl
@@ -97,3 +98,20 @@ def test_a_long_text_that_is_referred_to_very_often_is_refused():
     assert len(whole) < 200_000
     with pytest.raises(InputError, match=r"the length of all texts of x is 2,000,000,000, expected at most"):
         text_column(parse_parquet(whole, "log"), "x", "log")
+
+
+def test_what_polars_writes_of_a_damaged_file_stays_unseen(capfd, monkeypatch):
+    class PanicException(BaseException):
+        pass
+
+    def panic(*_, **__):
+        os.write(2, b"thread panicked, and pages more")
+        raise PanicException("assertion failed")
+
+    PanicException.__module__ = "pyo3_runtime"
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    whole = content(table(3))
+    with pytest.raises(InputError, match=r"a.parquet: is not a Parquet file that can be read: assertion failed"):
+        parse_parquet(whole, "a.parquet")
+    os.write(2, b"seen")
+    assert capfd.readouterr().err == "seen"

@@ -25,6 +25,7 @@ from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, co
 from factorgraph_loc.evaluation.figures import save
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files import file_name, nearest, replacing, write_text, write_toml
+from factorgraph_loc.parquet_files import read_parquet
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES
@@ -300,4 +301,4 @@ def _message(error: Exception) -> str:
 
 
 def _kept(job: ActiveJob) -> list[Row]:
-    return pl.read_parquet(job.part).to_dicts()
+    return read_parquet(job.part).to_dicts()

@@ -14,6 +14,7 @@ from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files import replacing
+from factorgraph_loc.parquet_files import read_parquet
 
 INDEX = "results.parquet"
 SWEEP = "sweep."
@@ -53,9 +54,9 @@ def load_results(path: str | Path) -> pl.DataFrame:
     """
     file = Path(path) / INDEX if Path(path).is_dir() else Path(path)
     try:
-        return pl.read_parquet(file)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"{file}: cannot be read: {error}; `fgloc experiment run` writes it anew") from error
+        return read_parquet(file)
+    except InputError as error:
+        raise InputError(f"{error}; `fgloc experiment run` writes it anew") from error
 
 
 def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from factorgraph_loc.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.experiments.output import FILES
@@ -167,5 +168,7 @@ def _landmarks(path: Path) -> dict[str, LearntPoint]:
 
 
 def _events(path: Path, t0_ns: int) -> tuple[tuple[float, str], ...]:
-    table = pl.read_csv(path, schema_overrides={"t_ns": pl.Int64, "event": pl.String})
+    content = read_bytes(path, DATA)
+    with foreign(path, "is not a table of events"):
+        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String})
     return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.select("t_ns", "event").iter_rows())

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import nearest
+from factorgraph_loc.files import inside, nearest
 from factorgraph_loc.text import quoted, told
 
 if TYPE_CHECKING:
@@ -135,6 +135,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not is_bag(path):
         expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
         raise InputError(f"{path}: is no ROS bag, expected {expected}")
+    for file in path.iterdir() if path.is_dir() else ():
+        inside(path, file.name, path)  # a link could lead elsewhere, and a FIFO would wait for ever
     require_rosbags()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
     from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415

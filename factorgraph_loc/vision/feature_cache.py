@@ -12,6 +12,8 @@ from pathlib import Path
 
 import platformdirs
 
+from factorgraph_loc.bounded import DATA, read_bytes
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import replacing
 
 VARIABLE = "FGLOC_CACHE"  # of the environment: another folder than the user's
@@ -40,7 +42,7 @@ class FeatureCache:
         """What was written, and a mark that it was used now; None if it is not there or not as it was written."""
         path = self._path(key)
         try:
-            stored = path.read_bytes()
+            stored = read_bytes(path, DATA)
             if len(stored) < _HEAD.size:
                 return None
             mark, check, length = _HEAD.unpack_from(stored)
@@ -48,7 +50,7 @@ class FeatureCache:
             if mark != _MARK or len(content) != length or zlib.crc32(content) != check:
                 return None
             os.utime(path)
-        except OSError:
+        except (OSError, InputError):
             return None
         return content
 
