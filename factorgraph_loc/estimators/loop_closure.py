@@ -25,7 +25,7 @@ from factorgraph_loc.vision.association import ZOOMED, Associations, Associator
 from factorgraph_loc.vision.consensus import CameraPose, Truths
 from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.relocalization import FoundOnFloor, on_floor
-from factors import se2
+from factors import positive, se2
 from factors.reprojection import CameraModel
 from factors.se2 import Array
 
@@ -145,7 +145,7 @@ def _believed(guess: Guess, pose: Array, way: float) -> bool:
     """Whether the track may have drifted to ``guess`` from a ``pose`` in a ``way`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_OF_WAY * way
-    return bool(off @ np.linalg.solve(guess[1] + np.diag(drift**2), off) < GATE)
+    return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
 
 
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.estimators.marginals import Covariances, covariances
-from factorgraph_loc.estimators.variables import Values, gather, retract, to_gtsam
+from factorgraph_loc.estimators.variables import Values, gather, gtsam_errors, retract, to_gtsam
 from factors.graph import Factor, jacobian_factor
 
 MAX_ITERATIONS = 100
@@ -52,8 +52,7 @@ class Problem:
         """The optimum found from a guess, or where ``max_iterations`` lead."""
         damping, cost = INITIAL_DAMPING, self.cost(values)
         if not math.isfinite(cost) and len(self._natives):
-            self._factors += [(factor, keys) for factor, keys, _ in self._natives]
-            self._natives, self._graph = (), gtsam.NonlinearFactorGraph()
+            self._replace_natives()
             cost = self.cost(values)
         iteration = 0
         while iteration < max_iterations and damping < MAX_DAMPING:
@@ -63,7 +62,8 @@ class Problem:
                 size = len(value)
                 graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
             try:
-                step = graph.optimize()
+                with gtsam_errors():
+                    step = graph.optimize()
             except RuntimeError:  # nearly singular
                 damping *= 10.0
                 continue
@@ -94,8 +94,17 @@ class Problem:
         for factor, keys in self._factors:
             graph.add(jacobian_factor(factor, keys, gather(values, keys)))
         if self._graph.size():
-            graph.push_back(self._graph.linearize(to_gtsam(values)))
+            try:
+                graph.push_back(self._graph.linearize(to_gtsam(values)))
+            except RuntimeError:  # one of them threw
+                self._replace_natives()
+                return self.linearize(values)
         return graph
+
+    def _replace_natives(self) -> None:
+        """From now on our own factors in place of GTSAM's."""
+        self._factors += [(factor, keys) for factor, keys, _ in self._natives]
+        self._natives, self._graph = (), gtsam.NonlinearFactorGraph()
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
         """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""

@@ -22,7 +22,7 @@ from factorgraph_loc.estimators.particle_filter import ParticleFilter, ParticleF
 from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.measurements import Measurement, Odometry, RfidScan, Tick
 from factorgraph_loc.trajectory import Trajectory
-from factors import se2
+from factors import positive, se2
 from factors.odometry import ChainState, Increment
 from factors.se2 import Array
 
@@ -159,7 +159,7 @@ def _smoothed(record: _Record, step: Increment, after: tuple[Array, Array]) -> t
     """A record given what came later: ``step`` led from it to where ``after`` is the smoothed pose with its covariance."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))
-    if error @ np.linalg.solve(predicted + after[1], error) > JUMPED:
+    if positive.squared(error, predicted + after[1]) > JUMPED:
         return record.pose, record.covariance
     gain = np.linalg.solve(predicted, se2.adjoint(se2.inverse(step.delta)) @ record.covariance).T
     covariance = record.covariance + gain @ (after[1] - predicted) @ gain.T

@@ -30,7 +30,7 @@ from factorgraph_loc.measurements import CameraFrame, PixelSightings
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.spread import spread_out
-from factors import reprojection, se2
+from factors import positive, reprojection, se2
 from factors.graph import VectorPriorFactor
 from factors.point_sighting import PointSightings
 from factors.reprojection import CameraModel, recalibrated
@@ -142,7 +142,7 @@ class UnknownPoints:
         for name, found, seen in self._new.ready(waiting, places.get, PER_KEYFRAME - len(old)):
             key = point_key(len(self._names))
             self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
-            self._points[name] = _Point(key, keyframe.t, np.asarray(np.linalg.inv(found.covariance), dtype=float))
+            self._points[name] = _Point(key, keyframe.t, positive.inverse(found.covariance))
             if isinstance(m, CameraFrame):
                 self._looks.keep(key, m, rows[names.index(name)], lifted(model, *guess).position, self._way)
             addition.values[key] = found.position
@@ -196,7 +196,7 @@ class UnknownPoints:
             return set()
         points = [self._points[name] for name in old]
         keys = [point.key for point in points]
-        covariances = np.linalg.inv(np.array([point.information for point in points]))
+        covariances = positive.inverse(np.array([point.information for point in points]))
         positions = np.array([graph.values[key] for key in keys])
         seen = self._looks.map_of([str(name) for name in old], keys, positions, covariances)
         ways = np.array([self._looks[key].way for key in keys])
@@ -266,7 +266,7 @@ class UnknownPoints:
         if not points:
             return guess, np.zeros(0, dtype=bool)
         positions = np.array([graph.current(point.key) for point in points])
-        spreads = np.linalg.inv(np.array([point.information for point in points]))
+        spreads = positive.inverse(np.array([point.information for point in points]))
         camera = lifted(model, *guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
@@ -284,7 +284,7 @@ class UnknownPoints:
                 placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
             elif np.count_nonzero(agrees) < enough and placed is not guess:
                 error = reprojection.predict(model, placed[0], positions)[0] - pixels
-                agrees &= np.einsum("ki,kij,kj->k", error, np.linalg.inv(noise), error) < GATE
+                agrees &= positive.squared(error, noise) < GATE
             elif np.count_nonzero(agrees) < enough:
                 agrees &= which & recent
             right |= agrees
