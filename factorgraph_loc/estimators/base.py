@@ -172,8 +172,8 @@ class Diagnostics:
         return Written(
             {name: rows[mark.nis.get(name, 0) :] for name, rows in self.nis.items()},
             {name: values[mark.residuals.get(name, 0) :] for name, values in self.residuals.items()},
-            {name: count - mark.ignored.get(name, 0) for name, count in self.ignored.items()},
-            {name: count - mark.rejected.get(name, 0) for name, count in self.rejected.items()},
+            _risen(self.ignored, mark.ignored),
+            _risen(self.rejected, mark.rejected),
         )
 
     def take_back(self, written: Written) -> None:
@@ -187,6 +187,12 @@ class Diagnostics:
                 totals[name] -= count
                 if not totals[name]:
                     del totals[name]
+
+
+def _risen(counts: Mapping[str, int], before: Mapping[str, int]) -> dict[str, int]:
+    """By how much each of those counts rose that did."""
+    rises = {name: count - before.get(name, 0) for name, count in counts.items()}
+    return {name: rise for name, rise in rises.items() if rise}
 
 
 _Row = TypeVar("_Row")
@@ -267,5 +273,7 @@ def finds_heading(estimator: Estimator) -> bool:
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
-    """The belief of an estimator that has one Gaussian."""
+    """The belief of an estimator that has one Gaussian; nothing is believed where the estimate is not a number."""
+    if not np.isfinite(estimate.pose).all():
+        return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))

@@ -97,7 +97,8 @@ class RfidFile(ColumnMapping):
     @classmethod
     def _of_preset(cls, content: Any) -> Any:
         """The mapping of the preset, with what is given in place of it."""
-        preset = PRESETS.get(content.get("preset", "")) if isinstance(content, dict) else None
+        name = content.get("preset") if isinstance(content, dict) else None
+        preset = PRESETS.get(name) if isinstance(name, str) else None
         if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
             return content
         columns = preset["columns"] | content.get("columns", {})

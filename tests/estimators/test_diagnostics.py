@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics
+from factorgraph_loc.estimators.base import Diagnostics, PoseEstimate, gaussian_belief
 from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -89,6 +89,23 @@ def test_what_is_taken_back_leaves_no_trace():
     diagnostics.reject("astray", 3)
     diagnostics.take_back(diagnostics.since(mark))
     assert repr(diagnostics) == before
+
+
+def test_counts_that_did_not_rise_are_not_taken_back():
+    """Images without a feature are ignored as 0 features."""
+    diagnostics, written = Diagnostics(), []
+    for _ in range(2):
+        mark = diagnostics.mark()
+        diagnostics.ignore("camera", 0)
+        written.append(diagnostics.since(mark))
+    for one in reversed(written):
+        diagnostics.take_back(one)
+    assert not any(diagnostics.ignored.values())
+
+
+def test_nothing_is_believed_where_the_estimate_is_not_a_number():
+    nowhere = PoseEstimate(0.0, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+    assert gaussian_belief(nowhere).modes == ()
 
 
 def test_rows_that_were_dropped_meanwhile_cannot_be_taken_back():

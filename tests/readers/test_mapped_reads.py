@@ -82,6 +82,11 @@ def test_wrong_json_lines(hall, with_options, refused, content, fragments):
     refused(manifest, *fragments)
 
 
+@pytest.mark.parametrize("preset", ["[]", "{}", "5", "true", '"x"', '["sllurp_log"]'])
+def test_a_preset_that_is_none(with_options, refused, preset):
+    refused(with_options(f'{WHEELS}\n[options.rfid]\nfile = "reads.csv"\npreset = {preset}\n'), "preset")
+
+
 def test_reads_in_several_files(hall, one, refused):
     folder = hall.parent / "run"
     expected = one(hall).streams["rfid"]
