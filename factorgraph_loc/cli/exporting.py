@@ -52,7 +52,7 @@ def export(
         from factorgraph_loc.exports.g2o import pose_graph, write_g2o
 
         run = _only(runs, out)
-        sensors = run.folder.config.get("sensors", log.rig.sensors)
+        sensors = run.folder.config.sensors or log.rig.sensors
         write_g2o(pose_graph(log, run.final, sensors, run.landmarks), out)
     elif out.suffix == ".kitti":
         from factorgraph_loc.exports.trajectories import write_kitti

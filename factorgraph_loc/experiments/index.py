@@ -9,6 +9,7 @@ from typing import Any
 
 import polars as pl
 
+from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
@@ -52,7 +53,7 @@ def load_results(path: str | Path) -> pl.DataFrame:
     each), and the scores of :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). InputError if there are no
     results.
     """
-    file = Path(path) / INDEX if Path(path).is_dir() else Path(path)
+    file = Path(path) / INDEX if kind(Path(path)) == "a folder" else Path(path)
     try:
         return read_parquet(file)
     except InputError as error:

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.output import COVARIANCES, FILES, write_files
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.log import Log
-from factorgraph_loc.parquet_files import parse_parquet
 from factorgraph_loc.temporary import of_system, temporary_folder
 from factorgraph_loc.trajectory import Trajectory
 
@@ -48,7 +48,7 @@ def timings_file(timings: Mapping[str, Any]) -> bytes:
 
 def read_track(estimates: bytes) -> Track:
     """The trajectories of an ``estimates.parquet``; see :meth:`~factorgraph_loc.experiments.store.Store.track`."""
-    table = parse_parquet(estimates, "estimates.parquet")
+    table = parse_estimates(estimates, NAME)
     t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
     causal = trajectory_of(table.filter((pl.col("kind") == "causal") & _from_localized(table)), t0_ns)
     final = trajectory_of(table.filter(pl.col("kind") == "final"), t0_ns)

@@ -36,12 +36,11 @@ def particles_of(run: StoredRun, log: Log, progress: Callable[[float], None] | N
     if run.folder.estimator not in OF_PARTICLES:
         return None
     kept = run.folder.config
-    try:
-        config = RunConfig(
-            run.folder.estimator, dict(kept["settings"]), tuple(kept["sensors"]), str(kept["prior"]), int(kept["seed"])
+    if kept.sensors is None or kept.prior is None:
+        raise InputError(
+            f"{run.folder.path}: config.toml has no sensors or no prior, which it takes to make the run again"
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{run.folder.path}: config.toml does not say how to make the run again: {error}") from error
+    config = RunConfig(run.folder.estimator, kept.settings, kept.sensors, kept.prior, kept.seed)
     stamps: list[float] = []
     poses: list[Array] = []
 

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import polars as pl
+from pydantic import Field
 
 from factorgraph_loc.bounded import DATA, foreign, read_bytes
+from factorgraph_loc.columns import LATEST
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import LearntPoint
+from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.experiments.output import FILES
 from factorgraph_loc.experiments.stored_run import trajectory_of
 from factorgraph_loc.files import FileModel, parse_model, read_json, read_toml
 from factorgraph_loc.log import Log
-from factorgraph_loc.parquet_files import read_parquet
-from factorgraph_loc.text import quoted, told
+from factorgraph_loc.text import told
 from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
@@ -39,20 +41,31 @@ class _Learnt(FileModel, extra="ignore"):
     landmarks: dict[str, _Landmark]
 
 
+class StoredConfig(FileModel, extra="ignore"):
+    """What is read of ``config.toml``, the effective configuration of a run."""
+
+    log: Annotated[str, Field(min_length=1)]
+    estimator: Annotated[str, Field(min_length=1)]
+    sensors: tuple[str, ...] | None = None
+    prior: str | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class RunFolder:
-    """Where a run is kept, and what it is of. ``config``: the effective configuration as ``config.toml`` has it."""
+    """Where a run is kept, and what it is of."""
 
     path: Path
-    config: dict[str, Any]
+    config: StoredConfig
 
     @property
     def log(self) -> str:
-        return str(self.config["log"])
+        return self.config.log
 
     @property
     def estimator(self) -> str:
-        return str(self.config["estimator"])
+        return self.config.estimator
 
 
 @dataclass(frozen=True)
@@ -98,7 +111,7 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
     InputError if a run is not of this log, or if one of its files is not as it was written.
     """
     names = [folder.estimator for folder in folders]
-    with_seeds = [f"{folder.estimator}-seed{folder.config.get('seed', 0)}" for folder in folders]
+    with_seeds = [f"{folder.estimator}-seed{folder.config.seed}" for folder in folders]
     if len(set(names)) < len(names):
         names = with_seeds
     if len(set(names)) < len(names):
@@ -111,25 +124,27 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
 def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     if folder.log != log.name:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
-    path = folder.path / "estimates.parquet"
+    path = folder.path / NAME
+    table = parse_estimates(read_bytes(path, DATA), path)
+    table = table.filter(pl.all_horizontal(pl.col(key).is_finite() for key in ("x", "y", "heading")))
+    table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)
+    causal = table.filter(pl.col("kind") == "causal")
+    localized = causal.filter(pl.col("status") == "localized")["t"].min()
+    causal = causal.filter(pl.col("t") >= (np.inf if localized is None else localized))
+    final = table.filter(pl.col("kind") == "final")
     try:
-        table = read_parquet(path)
-        table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)
-        causal = table.filter(pl.col("kind") == "causal")
-        localized = causal.filter(pl.col("status") == "localized")["t"].min()
-        causal = causal.filter(pl.col("t") >= (np.inf if localized is None else localized), pl.col("x").is_finite())
-        final = table.filter(pl.col("kind") == "final")
-        run = StoredRun(
-            name,
-            folder,
-            trajectory_of(causal, log.t0_ns),
-            trajectory_of(final, log.t0_ns),
-            {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
-            _landmarks(folder.path / "learnt.json"),
-            _events(folder.path / "events.csv", log.t0_ns),
-        )
-    except (OSError, pl.exceptions.PolarsError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder.path}: cannot be read as results of a run: {told(error)}") from error
+        of_causal, of_final = trajectory_of(causal, log.t0_ns), trajectory_of(final, log.t0_ns)
+    except ValueError as error:
+        raise InputError(f"{path}: holds no trajectory: {told(error)}") from error
+    run = StoredRun(
+        name,
+        folder,
+        of_causal,
+        of_final,
+        {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
+        _landmarks(folder.path / "learnt.json"),
+        _events(folder.path / "events.csv", log.t0_ns),
+    )
     _check_times(run, log)
     return run
 
@@ -145,13 +160,9 @@ def _check_times(run: StoredRun, log: Log) -> None:
             )
 
 
-def _config(folder: Path) -> dict[str, Any]:
+def _config(folder: Path) -> StoredConfig:
     path = folder / "config.toml"
-    config = read_toml(path)
-    for key in ("log", "estimator"):
-        if not isinstance(config.get(key), str):
-            raise InputError(f"{path}: {key} is {quoted(config.get(key))}, expected a name")
-    return config
+    return parse_model(StoredConfig, read_toml(path), path)
 
 
 def _series(table: pl.DataFrame, key: str, t0_ns: int) -> tuple[Array, Array]:
@@ -169,6 +180,8 @@ def _landmarks(path: Path) -> dict[str, LearntPoint]:
 
 def _events(path: Path, t0_ns: int) -> tuple[tuple[float, str], ...]:
     content = read_bytes(path, DATA)
-    with foreign(path, "is not a table of events"):
-        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String})
-    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.select("t_ns", "event").iter_rows())
+    with foreign(path, "is no table of events"):
+        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String}).select("t_ns", "event")
+    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_between(-LATEST, LATEST).all():
+        raise InputError(f"{path}: has a row without a stamp and an event, expected both")
+    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.iter_rows())

@@ -138,7 +138,7 @@ def a_result(folder: Path, rng: Generator) -> None:
     if rng.random() < 0.3:
         write_mcap(log, runs, folder / "x.mcap")
     if rng.random() < 0.3:
-        sensors = runs[0].folder.config.get("sensors", log.rig.sensors)
+        sensors = runs[0].folder.config.sensors or log.rig.sensors
         write_g2o(pose_graph(log, runs[0].final, sensors, runs[0].landmarks), folder / "x.g2o")
     if rng.random() < 0.1:
         write_rrd(log, runs, folder / "x.rrd", {})

@@ -46,8 +46,8 @@ def test_an_estimator_without_particles(log, results):
 
 
 def test_a_configuration_that_is_not_whole(log, filtered):
-    config = {key: value for key, value in filtered.folder.config.items() if key != "seed"}
-    with pytest.raises(InputError, match=r"config.toml does not say how to make the run again: 'seed'"):
+    config = filtered.folder.config.model_copy(update={"prior": None})
+    with pytest.raises(InputError, match=r"config.toml has no sensors or no prior"):
         particles_of(replace(filtered, folder=replace(filtered.folder, config=config)), log)
 
 

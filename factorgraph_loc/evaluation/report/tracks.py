@@ -11,8 +11,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.evaluation.inference import independent_count
-from factorgraph_loc.parquet_files import parse_parquet
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
@@ -62,7 +62,7 @@ def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
 
     Times are from ``t0_ns`` on, by default from the first tick.
     """
-    table = parse_parquet(estimates, "estimates.parquet", _COLUMNS)
+    table = parse_estimates(estimates, NAME, _COLUMNS)
     columns = {name: _numbers(table[name]) for name in _COLUMNS if name not in ("kind", "t_ns", "status")}
     t_ns = table["t_ns"].to_numpy()
     t = (t_ns - (int(t_ns.min(initial=2**62)) if t0_ns is None else t0_ns)) / 1e9
@@ -71,7 +71,7 @@ def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
 
 def read_errors(estimates: bytes) -> dict[str, Array]:
     """The known position errors [m] of ``estimates.parquet`` by kind; see :func:`read_series`."""
-    table = parse_parquet(estimates, "estimates.parquet", ("kind", "status", "error_position"))
+    table = parse_estimates(estimates, NAME, ("kind", "status", "error_position"))
     errors = _numbers(table["error_position"])
     return {kind: _known(errors[rows]) for kind, rows in _kinds(table).items()}
 
