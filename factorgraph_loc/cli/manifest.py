@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -18,16 +19,16 @@ def manifest(bag: BagPath, json: Json = False) -> None:
     from factorgraph_loc.readers.bag_file import open_bag
     from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, remarks
 
-    path, here = bag.resolve(), Path.cwd().resolve()
+    path, here = Path(os.path.realpath(bag)), Path.cwd().resolve()
     below = path.is_relative_to(here)
     root = here if below else path.parent
-    stem = path.with_suffix("") if path.is_file() else path
-    beside = {
-        kind: (file.relative_to(root)).as_posix()
-        for kind in ("rig", "world")
-        if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file()
-    }
     with open_bag(path) as opened:
+        stem = path.with_suffix("") if path.is_file() else path
+        beside = {
+            kind: (file.relative_to(root)).as_posix()
+            for kind in ("rig", "world")
+            if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file()
+        }
         proposal = propose(opened)
         content = manifest_of(proposal, path.relative_to(root).as_posix(), beside)
         told = remarks(opened, proposal, beside)

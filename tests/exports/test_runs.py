@@ -1,12 +1,15 @@
 """Runs are read back as they were written."""
 
+import io
 import shutil
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.estimates_file import NUMBERS
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
@@ -55,6 +58,56 @@ def test_bad_folders(log, results, tmp_path):
     (tmp_path / "cut" / "estimates.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"cut/estimates.parquet: is not a Parquet file"):
         read_runs(find_runs(tmp_path / "cut"), log)
+
+
+def _parquet(**columns):
+    """The bytes of a table of estimates with other columns."""
+    usual = {name: [0.5] for name in NUMBERS} | {"kind": ["final"], "status": ["localized"], "t_ns": [10**18]}
+    content = io.BytesIO()
+    pl.DataFrame({name: column for name, column in (usual | columns).items() if column is not None}).write_parquet(
+        content
+    )
+    return content.getvalue()
+
+
+DAMAGE = [
+    *(("config.toml", text) for text in (b"", b"log = 5", b'log = "x"\nestimator = []', b"\xff", b"[" * 5000)),
+    *(
+        ("config.toml", b'log = "arc"\nestimator = "ekf"\n' + more)
+        for more in (b"sensors = 5", b"seed = 'x'", b"settings = 1")
+    ),
+    *(
+        ("learnt.json", text)
+        for text in (b"", b"5", b"[]", b'{"landmarks": 5}', b'{"landmarks": {"a": 5}}', b"[" * 5000)
+    ),
+    ("learnt.json", b'{"landmarks": {"a": {"x": "y", "y": 1, "covariance": [1]}}}'),
+    *(
+        ("events.csv", text)
+        for text in (b"", b"a,b\n1,2\n", b"t_ns,event\nx,y\n", b"t_ns,event\n,y\n", b"t_ns,event\n5,\n")
+    ),
+    *(("estimates.parquet", content) for content in (b"", b"PAR1", b"PAR1" + bytes(100) + b"PAR1", _parquet(x=None))),
+    *(("estimates.parquet", _parquet(**{name: [["a"]]})) for name in ("kind", "t_ns", "x", "nees")),
+    *(("estimates.parquet", _parquet(t_ns=[stamp])) for stamp in (None, 2**62, 0.5)),
+    ("estimates.parquet", _parquet(x=["0.5"])),
+]
+
+
+@pytest.mark.parametrize(("name", "content"), DAMAGE)
+def test_a_damaged_file_is_one_line_that_names_it(log, results, tmp_path, name, content):
+    run_folder = find_runs(results)[0].path
+    shutil.copytree(run_folder, tmp_path / "run")
+    (tmp_path / "run" / name).write_bytes(content)
+    with pytest.raises(InputError, match=name):
+        read_runs(find_runs(tmp_path / "run"), log)
+
+
+@pytest.mark.parametrize("name", ["config.toml", "learnt.json", "events.csv", "estimates.parquet"])
+def test_a_folder_in_the_place_of_a_file_is_told(log, results, tmp_path, name):
+    shutil.copytree(find_runs(results)[0].path, tmp_path / "run")
+    (tmp_path / "run" / name).unlink()
+    (tmp_path / "run" / name).mkdir()
+    with pytest.raises(InputError, match=f"{name}: is a folder"):
+        read_runs(find_runs(tmp_path / "run"), log)
 
 
 def test_of_an_estimator_without_causal_estimates_the_final_ones_are_played(log, tmp_path):

@@ -144,7 +144,7 @@ def test_a_result_folder_and_what_was_learnt():
     assert run.landmarks["L003"].covariance[0] == pytest.approx([0.01082084, -0.00144921], rel=1e-5)
     constants = json.loads((FILES / "run/learnt.json").read_text())["constants"]
     assert constants["scale_distance"]["value"] == 0.014265578937229673
-    assert run.folder.config["settings"]["landmarks"] == "unknown"
+    assert run.folder.config.settings["landmarks"] == "unknown"
 
 
 def test_a_comparison():
