@@ -47,7 +47,7 @@ from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
-from factors import se2
+from factors import positive, se2
 from factors.odometry import Increment
 from factors.reprojection import carrier, huber_weight
 from factors.se2 import Array
@@ -349,7 +349,7 @@ def _smoothed(
     first ``size`` values of the error are smoothed, on which the others have no influence later."""
     transition, predicted = after.step.transition[:size, :size], after.predicted[:size, :size]
     own = here.covariance[:size, :size]
-    gain = np.linalg.solve(predicted, transition @ own).T
+    gain = positive.solve(predicted, transition @ own).T
     change = np.zeros(ROBOT)
     change[:size] = gain @ robot.minus(after.step.robot)[:size]
     smoothed = here.covariance.copy()

@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 
 from factorgraph_loc.estimators.robust_update import GATE
 from factorgraph_loc.estimators.space_motion import ROBOT, RobotState, Step, cross
-from factors import inverse_depth
+from factors import inverse_depth, positive
 from factors.reprojection import CameraModel, linearize_in_space, mounted
 from factors.se2 import Array
 
@@ -220,7 +220,7 @@ class Innovation:
         blocks = total.reshape(len(noise), 2, len(noise), 2)
         k = np.arange(len(noise))
         blocks[k, :, k, :] += noise
-        return np.asarray(np.linalg.cholesky(total), dtype=float)
+        return positive.root(total)
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
         """:meth:`root`, and its inverse times ``carried`` transposed."""

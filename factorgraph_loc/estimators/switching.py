@@ -161,6 +161,6 @@ def _smoothed(record: _Record, step: Increment, after: tuple[Array, Array]) -> t
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))
     if positive.squared(error, predicted + after[1]) > JUMPED:
         return record.pose, record.covariance
-    gain = np.linalg.solve(predicted, se2.adjoint(se2.inverse(step.delta)) @ record.covariance).T
+    gain = positive.solve(predicted, se2.adjoint(se2.inverse(step.delta)) @ record.covariance).T
     covariance = record.covariance + gain @ (after[1] - predicted) @ gain.T
     return se2.compose(record.pose, se2.exp(gain @ error)), (covariance + covariance.T) / 2.0

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.estimators.monoslam_state import Innovation
 from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -267,3 +268,12 @@ def test_there_is_no_trajectory_before_the_start(drive):
     setup = Setup(log.rig, log.world, SENSORS, np.random.default_rng(0))
     found = create("monoslam", setup, settings_of("monoslam", {})).trajectory()
     assert (found.poses.shape, found.covariances.shape) == ((0, 3), (0, 3, 3))
+
+
+def test_an_innovation_that_rounding_made_singular_still_has_a_gain():
+    """As of a robot that is known to a million kilometres, by pixels with no noise to speak of."""
+    direction = np.arange(1.0, 5.0)
+    innovation = Innovation(np.ones((12, 4)), np.zeros((4, 0)), np.arange(0), 1e20 * np.outer(direction, direction))
+    root, spread = innovation.gain(np.broadcast_to(1e-4 * np.eye(2), (2, 2, 2)))
+    assert np.allclose(root @ root.T, innovation.covariance, rtol=1e-9)
+    assert np.all(np.isfinite(spread))
