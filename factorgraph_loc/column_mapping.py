@@ -22,7 +22,7 @@ from factorgraph_loc.columns import LATEST, Column, require_span
 from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, nearest, parse_json, read_text
-from factorgraph_loc.text import listed, quoted, told
+from factorgraph_loc.text import listed, quoted, told, well_formed
 from factors.se2 import Array
 
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
@@ -241,7 +241,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
             for column, value in found.items():
                 if isinstance(value, (dict, list)):
                     raise bad_field(path, column, value, "a number or a text", row=row)
-                columns[column].append("" if value is None else str(value))
+                columns[column].append("" if value is None else well_formed(str(value)))
     for column in needed:
         if passed and not seen[column]:
             raise InputError(f"{path}: no object has {quoted(column)}, the first has {listed(keys)}")

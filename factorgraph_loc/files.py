@@ -230,12 +230,12 @@ def replacing(path: Path) -> Iterator[Path]:
 def write_text(path: Path, text: str) -> None:
     """Write a text file at once or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names need not be UTF-8
 
 
 def write_toml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a TOML file at once or not at all."""
-    write_text(path, tomli_w.dumps(content))
+    write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\{found[0]}", tomli_w.dumps(content)))
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:

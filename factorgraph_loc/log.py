@@ -25,6 +25,7 @@ from factorgraph_loc.measurements import (
     YawRate,
 )
 from factorgraph_loc.rig import Rig
+from factorgraph_loc.text import well_formed
 from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factorgraph_loc.world import World
@@ -226,6 +227,9 @@ class Log:
     warnings: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
     reference3: Trajectory3 | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", well_formed(self.name))  # it may be that of a file
 
     def span(self) -> tuple[float, float]:
         """First and last stamp of all streams [s]."""

@@ -45,6 +45,11 @@ def told(error: BaseException) -> str:
     return plain(says or type(error).__name__)
 
 
+def well_formed(text: str) -> str:
+    """``text`` as every file and table can hold it: lone surrogates, the bytes of file names that are not UTF-8, as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def one_line(message: str) -> str:
     """A message as errors carry it."""
     return plain(message.strip(), MESSAGE)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.evaluation.statistics import pooled_rms
+from factorgraph_loc.text import MESSAGE, plain
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -73,7 +74,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         # a word a line, so that the table is narrow; folded or cut numbers would be worse than broken lines
         table.add_column(Text(name.replace(" ", "\n")), justify="left" if i < 2 else "right", no_wrap=True)
     for line, after in zip(lines, [*lines[1:], None], strict=True):
-        table.add_row(*line, end_section=after is None or after[0] != line[0])
+        table.add_row(*(plain(cell, MESSAGE) for cell in line), end_section=after is None or after[0] != line[0])
     return table
 
 

@@ -30,8 +30,8 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
 @pytest.fixture(scope="module")
 def named_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a log with a name that ASCII does not have."""
-    t = np.arange(20) * 0.1
-    odometry = IncrementStream(t, np.full(20, 0.05), np.zeros(20), np.zeros(20))
+    t = np.arange(200) * 0.1
+    odometry = IncrementStream(t, np.full(200, 0.05), np.zeros(200), np.zeros(200))
     folder = tmp_path_factory.mktemp("logs") / "named"
     write_native(Log(NAME, Rig(sensors=("odometry",)), World(), {"odometry": odometry}, None), folder)
     return folder
@@ -87,3 +87,13 @@ def test_file_names_of_all_kinds_are_told(tmp_path: Path) -> None:
     told = done.stderr.decode()
     assert "caf\\udce9 \\x1b[31mred \\u202e" in told
     assert told.removesuffix("\n").isprintable()
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(named_log: Path, tmp_path: Path) -> None:
+    """The limit is on the size of files; Python ignores its signal, so that writing fails as on a full disk."""
+    command = f"ulimit -f 1; {FGLOC} convert {named_log} {tmp_path}/out"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.decode().count("\n") == 1
+    assert "File too large" in done.stderr.decode()
+    assert list(tmp_path.iterdir()) == []

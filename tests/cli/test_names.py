@@ -1,0 +1,87 @@
+"""Names of logs and landmarks are whatever others wrote: results are made, and no terminal obeys what is printed of them."""
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.main import app
+from factorgraph_loc.evaluation.tables import comparison_table
+from factorgraph_loc.files import read_toml, write_toml
+from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log
+from factorgraph_loc.readers import write_native
+from factorgraph_loc.rig import BearingRangeSettings, Rig
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World
+
+ANY = st.text(st.characters(), max_size=60) | st.sampled_from(["n" * 300, "a $x^{$ b", "[/red]{x}:smile:", "../../up"])
+RIG = Rig(sensors=("odometry", "bearing_range"), bearing_range=BearingRangeSettings(range_sigma=0.1))
+
+
+def named(name: str, landmark: str) -> Log:
+    """Two seconds of driving straight on, past a landmark."""
+    t = np.arange(20) * 0.1
+    x = 0.05 * np.arange(20)
+    sightings = BearingRangeStream(t, [landmark] * 20, np.hypot(5.0 - x, 2.0), np.arctan2(2.0, 5.0 - x))
+    streams = {"odometry": IncrementStream(t, np.full(20, 0.05), 0.0 * t, 0.0 * t), "bearing_range": sightings}
+    reference = Trajectory(t, np.column_stack((x, 0.0 * x, 0.0 * x)))
+    return Log(name, RIG, World(landmarks={landmark: Landmark(x=5.0, y=2.0)}), streams, reference)
+
+
+def shown(text: str) -> bool:
+    """Whether a terminal shows all of it."""
+    return all(c == "\n" or c.isprintable() for c in text)
+
+
+@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(
+    name=ANY, landmark=st.text("ab$_\\é廊\x1b\u202e", min_size=1, max_size=40).filter(lambda text: text == text.strip())
+)
+@example(name="a $x^{$ b\x1b[31m\u202e\n" + "n" * 300, landmark="$$\x1b[2J")
+@example(name="caf\udce9", landmark="\x9b")
+def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        log, out = Path(folder, "log"), Path(folder, "out")
+        write_native(named(name, landmark), log)
+        for command in (["info", log], ["info", log, "--json"], ["run", log, "-e", "ekf", "-o", out]):
+            done = CliRunner().invoke(app, [str(word) for word in command])
+            assert done.exit_code == 0, done.output
+            assert shown(done.stdout + done.stderr)
+        assert read_toml(out / "config.toml")
+        assert json.loads((out / "metrics.json").read_text())
+        assert list((out / "plots").glob("*.png"))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(name=ANY)
+def test_tables_documents_and_lines_show_no_character_that_a_terminal_obeys(name: str) -> None:
+    done = CliRunner().invoke(app, ["info", name])  # a name that is no log
+    assert shown(done.output)
+
+
+@pytest.mark.parametrize("name", ["\x1b[31m\x00\u202e\x9b", "a\nb", "caf\udce9", "[/red]:smile:{x}"])
+def test_whatever_is_printed_goes_through_one_function(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    row = {"log": name, "estimator": name, "seed": 0, "status": "ok"}
+    show.rich_table(comparison_table([row]))
+    show.table(["name"], [[name]])
+    show.fields({"name": name})
+    show.document({name: name})
+    show.note(name)
+    show.warnings([name * 500])
+    with show.progress(name, counted=True) as bar:
+        bar(1, 2, name)
+    out, err = capsys.readouterr()
+    assert shown(out + err)
+    assert max(map(len, err.splitlines())) <= 320
+    assert ":smile:" in out or "\\" in out
+
+
+def test_toml_holds_file_names_that_are_not_utf_8(tmp_path: Path) -> None:
+    write_toml(tmp_path / "a.toml", {"log": "caf\udce9", "name": "\x1b\u202e"})
+    assert read_toml(tmp_path / "a.toml") == {"log": "caf\\udce9", "name": "\x1b\u202e"}
