@@ -87,9 +87,10 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
     """The content of a text in TOML; InputError as of :func:`read_toml`."""
-    if found := _LONG_KEY.search(text):  # the time that tomllib takes grows with the square of the parts
-        line = text.count(chr(10), 0, found.start()) + 1
-        raise InputError(f"{plain(source)}:{line}: a key has more than {DEEPEST} parts")
+    for row, line in enumerate(text.split("\n"), start=1):
+        # the time that tomllib takes grows with the square of the parts
+        if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
+            raise InputError(f"{plain(source)}:{row}: a key has more than {DEEPEST} parts")
     with bounded.foreign(source, "is not TOML"):
         content = tomllib.loads(text)
     check_content(content, source)
@@ -239,7 +240,7 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """All values that are neither tables nor lists, each with its key; InputError where those are nested too deep."""
+    """All values that are neither tables, lists nor floats, each with its key; InputError where they are nested too deep."""
     waiting = [("", content, 0)]
     while waiting:
         key, value, depth = waiting.pop()
@@ -249,7 +250,7 @@ def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
             raise InputError(f"{source}: {plain(key)} lies more than {DEEPEST} tables or lists deep")
         else:
             entries = value.items() if isinstance(value, dict) else ((key, entry) for entry in value)
-            waiting += [(name, entry, depth + 1) for name, entry in entries]
+            waiting += [(name, entry, depth + 1) for name, entry in entries if type(entry) is not float]
 
 
 def _integer(digits: str) -> int:

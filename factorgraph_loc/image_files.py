@@ -16,6 +16,7 @@ from factorgraph_loc.errors import InputError
 
 # without those for which Pillow would start other programs
 FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP", "GIF", "TGA", "SUN", "JPEG2000")
+PNG = b"\x89PNG\r\n\x1a\n"
 NO_IMAGE = "is not an image that can be decoded"
 TOO_LARGE = f"has too many pixels, expected at most {PIXELS:,}"
 
@@ -39,7 +40,13 @@ def pillow_image(file: BinaryIO, source: object) -> Iterator[Image.Image]:
 
 
 def image_size(content: bytes, source: object) -> tuple[int, int]:
-    """Width and height [px] as the head says them; InputError as of :func:`pillow_image`."""
+    """Width and height [px] as the head says them; InputError as of :func:`pillow_image`, and for a PNG of which a part says it
+    is longer than the file, for which OpenCV takes memory."""
+    at = len(PNG) if content.startswith(PNG) else len(content)
+    while at + 8 <= len(content):
+        at += 12 + int.from_bytes(content[at : at + 4], "big")
+        if at > len(content):
+            raise InputError(f"{source}: {NO_IMAGE}: it is cut off, or a part of it is damaged")
     with pillow_image(io.BytesIO(content), source) as image:
         return image.size
 

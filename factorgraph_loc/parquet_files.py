@@ -35,10 +35,11 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
     if not (kind in (pl.String, pl.Null, pl.Categorical) or kind.is_integer() or isinstance(kind, pl.Enum)):
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
-        found = column.cast(pl.String).fill_null("")
-        length = int(found.str.len_bytes().sum())
-        require_size(source, f"the length of all texts of {name}", length, DATA)  # one may be referred to many times
-        return found.to_list()
+        found = column.cast(pl.String)
+        if len(found) * found.estimated_size() > DATA:  # one long text may be referred to many times
+            length = int(found.str.len_bytes().sum())
+            require_size(source, f"the length of all texts of {name}", length, DATA)
+        return [text or "" for text in found.to_list()]
 
 
 @contextmanager

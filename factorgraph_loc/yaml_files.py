@@ -31,6 +31,11 @@ class _Loader(yaml.SafeLoader):
         super().__init__(_DIRECTIVE.sub(r"\1", read_text(path, YAML)))
         self.path, self.depth = path, 0
 
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803 - as PyYAML names it
+        if self.flow_level == DEEPEST:  # the time that PyYAML takes grows with the square of the depth
+            raise InputError(f"{self.path}:{self.line + 1}: more than {DEEPEST} blocks are within each other")
+        super().fetch_flow_collection_start(TokenClass)
+
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         where = f"{self.path}:{event.start_mark.line + 1}: "

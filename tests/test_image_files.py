@@ -63,6 +63,14 @@ def test_what_is_no_image_is_one_line(tmp_path, content):
         read_image(tmp_path / "a.png")
 
 
+def test_a_part_of_a_png_that_is_longer_than_the_file_takes_no_memory(tmp_path):
+    whole = bytes(cv2.imencode(".png", np.zeros((24, 40, 3), dtype=np.uint8))[1])
+    at = whole.index(b"IDAT")
+    (tmp_path / "a.png").write_bytes(whole[: at - 4] + struct.pack(">I", 2**30) + whole[at:])
+    with pytest.raises(InputError, match=r"a.png: is not an image that can be decoded"):
+        read_image(tmp_path / "a.png")
+
+
 def test_sixteen_bits_become_eight():
     values = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
     np.testing.assert_array_equal(as_image(values), np.round(values / 257.0).astype(np.uint8))

@@ -111,3 +111,12 @@ def test_a_file_that_would_grow_is_refused_at_once(read):
     with pytest.raises(InputError, match="is an alias"):
         read(f"a: &a [1, 1]\n{grown}")
     assert time.perf_counter() - began < 1.0
+
+
+def test_lists_within_lists_take_no_longer_than_others(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 1\nb: " + "[" * 50_000 + "\n")
+    started = time.monotonic()
+    with pytest.raises(InputError, match=r"a.yaml:2: more than 20 blocks are within each other"):
+        read_yaml(path)
+    assert time.monotonic() - started < 2.0
