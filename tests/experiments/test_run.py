@@ -101,7 +101,7 @@ def test_a_pose_that_is_not_finite_is_an_error(log):
         run(log, RunConfig("fake", {"broken_at": 0.95}))
 
 
-@pytest.mark.parametrize("far", [100.0, 1.7e9])
+@pytest.mark.parametrize("far", [100.0, 2.5e6])
 @pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
 def test_a_clock_that_jumps_costs_no_ticks(log, name, far):
     """The first row of the odometry is from before the clock was set."""
@@ -131,7 +131,7 @@ def test_gaps_without_ticks_are_a_setting(log):
 def test_stamps_that_are_no_times_of_a_log(log):
     for far in (np.nan, np.inf, 1e300):
         stream = replace(log.streams["odometry"], t=np.append(log.streams["odometry"].t[:-1], far))
-        with pytest.raises(InputError, match="has stamps from"):
+        with pytest.raises(InputError, match="has a stamp"):
             run(replace(log, streams={"odometry": stream}), RunConfig("fake", prior="0,0,0"))
 
 
