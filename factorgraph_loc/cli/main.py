@@ -30,10 +30,12 @@ from factorgraph_loc.cli.stopping import end, stoppable
 from factorgraph_loc.cli.streams import OutputError, standard_streams
 from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.experiments.threads import use_one_thread
+from factorgraph_loc.text import MESSAGE, plain
 
 DEBUG = "--debug"
 COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
 SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
+_UsageError: Any = typer.BadParameter.__mro__[1]  # of click, or of the copy of it that Typer has
 UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
 
 
@@ -57,6 +59,9 @@ class Commands(TyperGroup):
                 raise
             show.note(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
+        except _UsageError as error:
+            error.message = plain(error.message, MESSAGE)
+            raise
         except OSError as error:
             if ctx.params.get("debug"):
                 raise

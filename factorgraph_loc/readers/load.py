@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from factorgraph_loc.text import listed, one_line
 from factorgraph_loc.world import World, read_world
 
 RUN_FILE = "run.toml"
+MOST = 1000  # logs that lists of options stand for
 TABLES = (".csv", *JSON_SUFFIXES)
 
 
@@ -67,6 +69,8 @@ def load(
         key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
         for key, value in given.items()
     }
+    if (count := math.prod(map(len, choices.values()))) > MOST:
+        raise InputError(f"{log}: its options stand for {count:,} logs, expected at most {MOST:,}")
     if empty := [key for key, values in choices.items() if not values]:
         raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
     naming = [
