@@ -59,10 +59,10 @@ class Bench:
             quietly(lambda: FORMATS[kind].use(self.folder, np.random.default_rng(0)))
         elif kind == ESTIMATORS:
             self._inputs.files("native")
-            for number in range(10):
+            for number in range(3):
                 self.try_case(Case(kind, 0, number))
         else:
-            for number in range(30):
+            for number in range(10):
                 self.try_case(Case(kind, 0, number))
         self._ready.add(kind)
 
