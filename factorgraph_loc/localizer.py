@@ -102,6 +102,8 @@ class Localizer:
             new = registry.create(self._name, setup, self._settings)
         if start is None and not getattr(new, "supports_unknown_start", False):
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
+        if start is not None and getattr(new, "starts_in_space", False):
+            raise InputError(f"{self._name} begins at a pose in space, expected an estimator that begins on a floor")
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected one")
         if start is not None and not math.isnan(start.t):

@@ -20,6 +20,7 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
+from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.estimators.ekf import Ekf
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -353,3 +354,12 @@ def test_a_long_pause_holds_no_ticks(log):
     expected = run(replace(log, streams={"odometry": odometry}), RunConfig("ekf", prior="0,0,0", sensors=("odometry",)))
     assert localizer.trajectory().t.tolist() == expected.final.t.tolist()[:-1]
     assert np.diff(expected.final.t).max() > 2800.0
+
+
+def test_an_estimator_in_space_begins_on_no_floor():
+    """It is refused at once, and what went on before goes on."""
+    camera = CameraSettings(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    localizer = fgloc.Localizer(Rig(sensors=("twist", "sightings"), camera=camera), estimator="space_batch")
+    with pytest.raises(InputError, match="space_batch begins at a pose in space, expected an estimator that begins on"):
+        localizer.initialize((0.0, 0.0, 0.0))
+    assert localizer.estimate().status == "unlocalized"

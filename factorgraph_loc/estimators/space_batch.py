@@ -74,6 +74,7 @@ class SpaceBatch(Monoslam):
     """The batch in space; see the module."""
 
     estimates_points = False
+    starts_in_space = True
 
     def __init__(self, setup: Setup, settings: SpaceBatchSettings) -> None:
         if settings.landmarks != "known" or settings.planar:

@@ -162,19 +162,19 @@ def landmarks_at_the_start(log, _):
 
 @fault
 def tiny_sigmas(log, _):
-    log = with_rig(log, "bearing_range", range_sigma=1e-6, range_sigma_relative=0.0, bearing_sigma=1e-6)
+    log = with_rig(log, "bearing_range", range_sigma=1e-4, range_sigma_relative=0.0, bearing_sigma=1e-5)
     return replace(log, start=StartPose(log.start.t, log.start.pose, np.full(3, 1e-6)))
 
 
 @fault
 def huge_sigmas(log, _):
-    log = with_rig(log, "bearing_range", range_sigma=1e3, bearing_sigma=0.5)
+    log = with_rig(log, "bearing_range", range_sigma=10.0, bearing_sigma=0.5)
     return replace(log, start=StartPose(log.start.t, log.start.pose, np.full(3, 1e3)))
 
 
 @fault
 def sharp_sight_of_a_vague_start(log, _):
-    log = with_rig(log, "bearing_range", range_sigma=1e-6, range_sigma_relative=0.0, bearing_sigma=1e-6, robust=100.0)
+    log = with_rig(log, "bearing_range", range_sigma=1e-4, range_sigma_relative=0.0, bearing_sigma=1e-5, robust=100.0)
     return replace(log, start=StartPose(log.start.t, log.start.pose, np.array((1e3, 1e3, 1e3))))
 
 
