@@ -18,7 +18,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc import bounded
+from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, Manifest, parse_stored
 from factorgraph_loc.temporary import sweep
@@ -126,9 +127,9 @@ class Store:
 
     def _content(self, path: Path) -> bytes:
         try:
-            return path.read_bytes()
-        except OSError as error:
-            raise DamagedError(f"{path}: cannot be read: {error.strerror}{_AGAIN}") from error
+            return bounded.read_bytes(path, bounded.DATA)
+        except InputError as error:
+            raise DamagedError(f"{error}{_AGAIN}") from error
 
     def track(self, key: str) -> Track:
         """The causal and the final trajectory of a run, with covariances, times [s] from its first estimate."""

@@ -163,6 +163,15 @@ def test_a_file_in_the_place_of_a_folder_gives_way(store, place):
     assert store.state(KEY, thorough=True) == "ok"
 
 
+def test_a_pipe_in_the_place_of_a_file_is_damage_and_nobody_waits_for_it(store):
+    store.put(KEY, FILES)
+    (store.path(KEY) / METRICS).unlink()
+    os.mkfifo(store.path(KEY) / METRICS)
+    assert store.state(KEY) == "damaged"
+    with pytest.raises(DamagedError, match="is a named pipe, expected a regular file"):
+        store.read(KEY, METRICS)
+
+
 @pytest.mark.parametrize("name", ["estimates.parquet", METRICS, MANIFEST])
 def test_a_folder_in_the_place_of_a_file_is_damage(store, name):
     store.put(KEY, FILES)
