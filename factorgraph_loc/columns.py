@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import bad_field
+from factorgraph_loc.files import FARTHEST
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -32,7 +33,6 @@ PURE = {"1": 1.0}
 
 LATEST = 4_600_000_000_000_000_000  # ns, 145 years: a difference of two stamps has room in 64 bits
 MAX_SPAN = 30 * 86_400.0  # s between two stamps of one log
-FARTHEST = 1e7  # m: northings of UTM go so far
 FASTEST = 100.0  # m/s: a speed in mm/s is mostly above it
 FASTEST_TURN = 100.0  # rad/s: gyros measure up to 70
 LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row to the next, a pause included

@@ -18,7 +18,6 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factorgraph_loc import bounded
-from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
@@ -48,6 +47,7 @@ class FileModel(BaseModel):
 
 
 Model = TypeVar("Model", bound=BaseModel)
+FARTHEST = 1e7  # m: northings of UTM go so far
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_loc.columns import FARTHEST, POSES
+from factorgraph_loc.columns import POSES
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.experiments.images import CAMERA
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
-from factorgraph_loc.files import nearest
+from factorgraph_loc.files import FARTHEST, nearest
 from factorgraph_loc.pushed import ALL_SENSORS, numbers, seconds_of
 from factorgraph_loc.rig import Rig
 from factorgraph_loc.text import quoted

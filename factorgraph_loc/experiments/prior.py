@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.columns import FARTHEST
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.base import PosePrior, SpacePose
 from factorgraph_loc.estimators.space_pose import planar_estimate
+from factorgraph_loc.files import FARTHEST
 from factorgraph_loc.log import Log
 from factorgraph_loc.text import quoted
 from factorgraph_loc.trajectory3 import Trajectory3
@@ -109,6 +109,6 @@ def _parse(prior: str) -> list[float]:
         raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}") from None
     if len(heading) > 1:
         raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}")
-    if not (max(abs(x), abs(y)) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
         raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
     return [x, y, *heading]

@@ -44,7 +44,7 @@ from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.files import nearest
 from factorgraph_loc.log import Log, RfidStream
 from factorgraph_loc.measurements import Measurement, Odometry, Tick
-from factorgraph_loc.readers.bounds import require_bounds
+from factorgraph_loc.readers.bounds import require_bounds, require_one_span
 from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.trajectory3 import Trajectory3
@@ -96,6 +96,7 @@ def run(
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
     require_bounds(log)  # of one that a program made, too
+    require_one_span(log)
     sensors = _sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
     check_free_map(log, sensors, config.estimator, settings)

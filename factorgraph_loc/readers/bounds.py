@@ -52,9 +52,7 @@ COLUMNS: dict[type, tuple[Column, ...]] = {
 
 
 def require_bounds(log: Log) -> None:
-    """InputError at the first value of a log that lies outside its column's bounds, with the time; and at a stamp that is more than
-    :data:`~factorgraph_loc.columns.MAX_SPAN` from the others, the start's included."""
-    _require_span(log)
+    """InputError at the first value of a log that lies outside its column's bounds, with the time."""
     for name, stream in log.streams.items():
         for column in COLUMNS.get(type(stream), ()):
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
@@ -80,7 +78,9 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
         raise InputError(f"{where} at {t[i]:.3f} s: {column.name} is {value!r}, expected {column.expected}")
 
 
-def _require_span(log: Log) -> None:
+def require_one_span(log: Log) -> None:
+    """InputError at a stamp of a log that is more than :data:`~factorgraph_loc.columns.MAX_SPAN` from the others, the start's
+    included: sensors whose clocks do not agree, if each table was in order when it was read."""
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
         return
@@ -94,8 +94,7 @@ def _require_span(log: Log) -> None:
         middle = float(stamps[len(stamps) // 2])
         name, t = max(filled.items(), key=lambda item: float(np.abs(item[1] - middle).max()))
         i = int(np.argmax(np.abs(t - middle)))
-        raise InputError(
-            f"{log.name}: {name} has a stamp {t[i] - middle:+.0f} s from most others in row {i + 1}, expected {expected}"
-        )
+        where = f"{log.name}: {name} has a stamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
+        raise InputError(f"{where}, expected {expected}: do their clocks agree?")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
         raise InputError(f"{log.name}: the start is at {log.start.t:.0f} s after the first stamp, expected {expected}")

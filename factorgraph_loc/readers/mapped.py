@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.columns import IMU, require_span
+from factorgraph_loc.columns import IMU
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import FileModel, inside
 from factorgraph_loc.log import Log, Stream
@@ -93,10 +93,6 @@ def read(path: Path | None, options: Options) -> Log:
     }
     rounds = _rounds(path, options, warnings)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
-    require_span(
-        [(odometry_path, None, odometry_t_ns), *((table.path, table.rows, table.t_ns) for table in tables.values())]
-        + ([(f"{path} rfid", None, rounds.end_ns)] if rounds else [])
-    )
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
     streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
     for sensor, table in tables.items():
