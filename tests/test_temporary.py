@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from factorgraph_loc import temporary
-from factorgraph_loc.files import write_text
+from factorgraph_loc.files import replacing, write_text
 from factorgraph_loc.temporary import locked, remove_own, sweep, temporary_file, temporary_folder
 
 HOLDER = """
@@ -51,8 +51,9 @@ def test_names_say_what_it_becomes(name, tmp_path):
 
 def test_what_fails_leaves_nothing_behind(tmp_path):
     (tmp_path / "a.txt").write_text("before")
-    with pytest.raises(UnicodeEncodeError):
-        write_text(tmp_path / "a.txt", "half \udc80")
+    with pytest.raises(ZeroDivisionError), replacing(tmp_path / "a.txt") as temporary:
+        temporary.write_text("half")
+        _ = 1 / 0
     with pytest.raises(FileNotFoundError):
         write_text(tmp_path / "no" / "a.txt", "nowhere")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]

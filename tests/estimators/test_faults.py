@@ -116,7 +116,8 @@ def test_gap_in_all_sensors(name, motion, simulate):
     for sensor in log.streams:
         log = silent(log, sensor, 10.0, 70.0)
     # 500 particles are too few for a cloud as wide as that
-    result = run(log, RunConfig(name) if name == "particle_filter" else CONFIGS[name])
+    config = RunConfig(name) if name == "particle_filter" else CONFIGS[name]
+    result = run(log, replace(config, tick_gap=100.0))
     assert np.all(np.isfinite(result.poses))
     assert np.all(np.isfinite(result.final.covariances))
     final = errors(result.final, log.reference)
