@@ -30,7 +30,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
 _WIDTH, _DPI = 16.0, 100
 _TITLE, _LINES = 80, 3  # characters and lines of a text at most
-_LABEL, _LEGEND = 40, 160  # characters of a label, and of a line of the legend
+_LABEL, _LEGEND = 60, 160  # characters of a label, and of a line of the legend
 
 
 @dataclass(frozen=True)
