@@ -46,6 +46,8 @@ BY_SUFFIX: dict[str, tuple[Damage, ...]] = {
     ".mcap": (binaries.messages(".mcap"),),
     ".db3": (binaries.sqlite, binaries.messages(".db3")),
 }
+# these open the file, with libraries that end the process, or panic, at some damaged ones
+OF_WHOLE_FILES = (binaries.matlab, binaries.parquet)
 Content = bytes | Special
 
 
@@ -62,7 +64,7 @@ def damaged(files: Mapping[str, bytes], rng: Generator) -> dict[str, Content]:
             continue
         kinds = BY_SUFFIX.get(Path(name).suffix, (binaries.raw,))
         change = pick(rng, kinds) if rng.random() < 0.7 else binaries.raw
-        if change is binaries.matlab and name in out:  # scipy's reader ends the process at some damaged files
+        if change in OF_WHOLE_FILES and name in out:
             change = binaries.raw
         if rng.random() < 0.02:
             out[name] = b""
