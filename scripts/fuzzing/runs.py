@@ -15,7 +15,8 @@ from numpy.random import Generator
 import factorgraph_loc as fgloc
 from fuzzing import damage
 from fuzzing.absurd import pick
-from fuzzing.calls import ESTIMATORS, check_pose
+from fuzzing.calls import ESTIMATORS
+from fuzzing.results import check_pose
 from fuzzing.verdicts import WrongResultError
 
 Table = list[list[str]]
