@@ -1,27 +1,21 @@
 """What an estimator says at a time is the same whether the log goes on or not: every estimator on every sensor."""
 
 from dataclasses import fields, replace
-from functools import cache
 from itertools import compress
 
 import cv2
 import numpy as np
 import pytest
-from camera_world import simulate as simulate_room
-from camera_world import with_frames
-from test_space_batch import carried
+from short_logs import frames, late, office, plaza, room, with_gyro
+from space_world import carried
 
 from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.registry import ESTIMATORS
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import ImageStream, YawRateStream, cut
+from factorgraph_loc.log import ImageStream, cut
 from factorgraph_loc.points import PointMap
 from factorgraph_loc.readers import load
-from factorgraph_loc.rfid_settings import PhaseSettings, RssiSettings
-from factorgraph_loc.rig import ImuSettings
-from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation import simulate as simulate_office
 from factorgraph_loc.world import World
 
 READS = ("odometry", "rfid")
@@ -47,64 +41,14 @@ def prefix(log, end):
     return replace(log, streams={name: until(name, stream) for name, stream in log.streams.items()})
 
 
-@cache
-def plaza():
-    (log,) = load("plaza2")
-    start = log.span()[0]
-    part = cut(log, start, start + 24.0)
-    return replace(part, start=log.start)
-
-
-@cache
-def office():
-    """Reads with strength and phase; some tags are first read in the second half, others never."""
-    world = {"tags": 12, "landmarks": 20}
-    log = simulate_office(preset("office", {"drive": {"duration": 14.0}, "phase": {}, "rssi": {}, "world": world}), 3)
-    strength = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3)
-    phase = PhaseSettings(tempering=0.5, max_range=4.0)
-    rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})
-    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
-
-
-def late():
-    """Each other look arrives after the one that follows it."""
-    log = office()
-    stream = log.streams["bearing_range"]
-    looks = np.unique(stream.t, return_inverse=True)[1]
-    order = np.lexsort((np.arange(len(looks)), looks ^ 1))
-    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
-    moved = {k: v[order] if isinstance(v, np.ndarray) else [v[i] for i in order] for k, v in columns.items()}
-    return replace(log, streams=log.streams | {"bearing_range": replace(stream, **moved)})
-
-
-def turning():
-    """With a gyro."""
-    log = office()
-    wheels = log.streams["odometry"]
-    t = np.arange(0.0, 14.0, 0.05)
-    rate = np.interp(t, wheels.t[1:], wheels.dtheta[1:] / np.diff(wheels.t)) + 0.01
-    rig = log.rig.model_copy(update={"imu": ImuSettings()})
-    return replace(log, rig=rig, streams=log.streams | {"imu": YawRateStream(t, rate)})
-
-
-@cache
-def room():
-    return simulate_room(seconds=8.0)
-
-
-@cache
-def frames():
-    return with_frames(room(), clutter=30)
-
-
 LOGS = {
     "ranges": (plaza, {}),
     "landmarks": (office, {"sensors": ("odometry", "bearing_range")}),
-    "late landmarks": (late, {"sensors": ("odometry", "bearing_range")}),
+    "late landmarks": (lambda: late(office(), "bearing_range"), {"sensors": ("odometry", "bearing_range")}),
     "rfid": (office, {"sensors": READS}),
     "rssi": (office, {"sensors": (*READS, "rssi")}),
     "phase": (office, {"sensors": (*READS, "phase")}),
-    "gyro": (turning, {"sensors": ("odometry", "imu", "bearing_range")}),
+    "gyro": (lambda: with_gyro(office()), {"sensors": ("odometry", "imu", "bearing_range")}),
     "sightings": (room, {}),
     "camera": (frames, {}),
     "space": (lambda: carried(0), {}),

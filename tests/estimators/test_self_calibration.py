@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import DEPTH, TRUTH, miscalibrated
 
 from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream
 from factorgraph_loc.measurements import BearingRange, IncrementOdometry, Tick
 from factorgraph_loc.rig import (
     BearingRangeSettings,
@@ -21,7 +21,6 @@ from factorgraph_loc.rig import (
     Rig,
 )
 from factorgraph_loc.world import Landmark, World
-from factors import bearing_range, se2
 
 CONFIGS = {
     "ekf": RunConfig("ekf"),
@@ -29,57 +28,6 @@ CONFIGS = {
     "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
     "batch": RunConfig("batch"),
 }
-# what the constants are, as changes from the rig's; the rig states twice as much as standard deviation
-TRUTH = {
-    "scale_distance": 0.06,
-    "heading_rate_bias": 0.02,
-    "bearing_range.x": 0.25,
-    "bearing_range.y": -0.2,
-    "bearing_range.bearing_bias": 0.05,
-    "bearing_range.range_scale": 0.06,
-    # the model takes the robot's velocity as constant for that long, which it is not where turns begin and end
-    "bearing_range.time_offset": 0.1,
-}
-DEPTH = {"bearing_range.depth_axis": 0.08, "bearing_range.x": 0.25}
-
-
-def miscalibrated(log, truth, *, depth=False, seed=0):
-    """The log of a robot whose constants differ by ``truth`` from those of its rig.
-
-    A sensor of depths sees 60 degrees to each side.
-    """
-    rng = np.random.default_rng(seed)
-    odometry = log.streams["odometry"]
-    v = odometry.v / (1.0 + truth.get("scale_distance", 0.0))
-    w = odometry.w + truth.get("heading_rate_bias", 0.0)
-    changes = np.array([truth.get(f"bearing_range.{name}", 0.0) for name in bearing_range.PARAMETERS])
-    kind = {"range_kind": "depth"} if depth else {}
-    settings = log.rig.bearing_range.model_copy(update=kind)
-    model = bearing_range.recalibrated(settings.model(), changes)
-
-    offset = truth.get("bearing_range.time_offset", 0.0)
-    t = np.unique(log.streams["bearing_range"].t)
-    t = t[t + offset <= log.reference.t[-1]]
-    poses, points = log.reference.at(t + offset)[:, None], log.world.positions()
-    distance = np.hypot(*(points - poses[..., :2]).transpose(2, 0, 1))
-    ranges, bearings = bearing_range.predict(model, poses, points)
-    visible = (distance < 5.0) & ((np.abs(bearings) < np.pi / 3.0) if depth else True)
-    ranges = ranges + settings.range_sigma * rng.standard_normal(ranges.shape)
-    bearings = se2.wrap(bearings + settings.bearing_sigma * rng.standard_normal(ranges.shape))
-    rows, columns = np.nonzero(visible)
-    names = np.array(list(log.world.landmarks))[columns].tolist()
-    seen = BearingRangeStream(t[rows], names, ranges[rows, columns], bearings[rows, columns])
-
-    sigmas = {name: 2.0 * abs(value) for name, value in truth.items()}
-    of_sensor = {name.partition(".")[2]: s for name, s in sigmas.items() if "." in name}
-    of_odometry = {name: s for name, s in sigmas.items() if "." not in name}
-    rig = log.rig.model_copy(
-        update={
-            "odometry": log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty(**of_odometry)}),
-            "bearing_range": settings.model_copy(update={"uncertainty": BearingRangeUncertainty(**of_sensor)}),
-        }
-    )
-    return replace(log, rig=rig, streams={"odometry": replace(odometry, v=v, w=w), "bearing_range": seen})
 
 
 @pytest.fixture(scope="module")

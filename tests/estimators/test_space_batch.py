@@ -4,95 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from space_world import RIG, SIGMA, carried, with_features
 
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.evaluation import space
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import FeatureStream, Log, RightSightingStream, SightingStream, TwistStream, cut
-from factorgraph_loc.measurements import CameraFrame, Tick
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.log import cut
+from factorgraph_loc.measurements import Tick
 from factorgraph_loc.readers import load
-from factorgraph_loc.rig import Rig, TwistSettings
-from factorgraph_loc.trajectory3 import Trajectory3
-from factorgraph_loc.world import World
-from factors.reprojection import linearize_in_space
-
-STEP, SECONDS, SIGMA = 0.1, 8.0, 2.0
-SHIFT, TURN = (0.02, 0.03, 0.04), (0.03, 0.02, 0.05)
-LENS = {"fx": 450.0, "fy": 450.0, "cx": 320.0, "cy": 240.0, "pixel_sigma": SIGMA}
-RIG = Rig(
-    sensors=("twist", "sightings", "sightings_right"),
-    twist=TwistSettings(shift=SHIFT, turn=TURN),
-    camera=CameraSettings(x=0.05, y=0.1, roll=0.1, pitch=0.2, **LENS),
-    camera_right=CameraSettings(x=0.05, y=-0.1, roll=0.1, pitch=0.2, **LENS),
-)
-POINTS = np.random.default_rng(11).uniform((2.0, -2.0, -1.5), (4.0, 2.0, 1.0), (15, 3))
-
-
-def carried(seed):
-    """A vehicle that sways and turns about all axes in front of 15 points, which both cameras see; its motion is measured."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(SECONDS / STEP) + 1) * STEP
-    v = np.column_stack((0.3 * np.cos(t), 0.4 * np.sin(0.7 * t), 0.2 * np.cos(1.3 * t)))
-    w = np.column_stack((0.3 * np.cos(1.1 * t), 0.2 * np.sin(0.9 * t), 0.3 * np.cos(0.8 * t)))
-    noise = rng.standard_normal((2, len(t), 3))
-    true_v = v + noise[0] * SHIFT / np.sqrt(STEP)
-    true_w = w + noise[1] * TURN / np.sqrt(STEP)
-    positions, rotations = [np.zeros(3)], [np.eye(3)]
-    for i in range(len(t) - 1):
-        half = Rotation.from_rotvec(true_w[i] * STEP / 2.0).as_matrix()
-        positions.append(positions[-1] + rotations[-1] @ half @ true_v[i] * STEP)
-        rotations.append(rotations[-1] @ half @ half)
-    truth = Trajectory3(t, np.array(positions), np.array(rotations))
-    names = [f"p{i}" for i in range(len(POINTS))]
-    world = World(points=PointMap.of(names, POINTS))
-    streams = {"twist": TwistStream(t, v, w)}
-    for sensor, kind, settings in (
-        ("sightings", SightingStream, RIG.camera),
-        ("sightings_right", RightSightingStream, RIG.camera_right),
-    ):
-        model, rows, seen = settings.model(), [], []
-        for k in range(1, len(t)):
-            camera = positions[k] + rotations[k] @ model.position
-            pixels, *_ = linearize_in_space(model, camera, rotations[k] @ model.rotation, POINTS)
-            ahead = ((POINTS - camera) @ rotations[k] @ model.rotation)[:, 2] > 0.3
-            visible = np.flatnonzero(ahead & model.contains(pixels))
-            rows += [(k, i) for i in visible.tolist()]
-            seen.append(pixels[visible] + SIGMA * rng.standard_normal((len(visible), 2)))
-        k, i = np.array(rows).T
-        streams[sensor] = kind(t[k], [names[j] for j in i.tolist()], *np.concatenate(seen).T)
-    return Log("carried", RIG, world, streams, reference3=truth)
-
-
-def with_features(log, tempering):
-    """What the left camera sees has no name, but looks like what was seen of the same point from the start."""
-    rng = np.random.default_rng(12)
-    looks = rng.standard_normal((len(POINTS), 64)).astype(np.float32)
-    rows, seen = np.arange(len(POINTS)), log.streams["sightings"]
-    points = replace(
-        PointMap.of([f"p{i}" for i in rows], POINTS),
-        feature="colour",
-        owners=rows,
-        descriptors=looks,
-        seen_from=np.zeros((len(rows), 3)),
-        sizes=np.full(len(rows), 5.0),
-    )
-    t, frames = np.unique(seen.t), []
-    for stamp in t.tolist():
-        at = np.flatnonzero(seen.t == stamp)
-        which = np.array([int(seen.point[i][1:]) for i in at])
-        pixels = np.column_stack((seen.u[at], seen.v[at]))
-        frames.append(CameraFrame(stamp, "colour", pixels, np.full(len(at), 5.0), looks[which], which))
-    camera = log.rig.camera.model_copy(update={"tempering": tempering})
-    rig = log.rig.model_copy(update={"sensors": ("twist", "camera"), "camera": camera})
-    streams = {"twist": log.streams["twist"], "camera": FeatureStream(t, frames)}
-    return replace(log, rig=rig, world=World(points=points), streams=streams)
 
 
 def estimated(log, name, sensors=None, **settings):

@@ -1,0 +1,146 @@
+"""A robot that drives a loop among landmarks, with noise as its rig says, and one whose constants are not those of its rig."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
+from factorgraph_loc.rig import (
+    BearingRangeSettings,
+    BearingRangeUncertainty,
+    GrowthSettings,
+    OdometryNoise,
+    OdometrySettings,
+    OdometryUncertainty,
+    Rig,
+)
+from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.world import Landmark, World
+from factors import bearing_range, se2
+
+ODOMETRY_STEP = 0.05  # s
+RANGE_SIGMA, BEARING_SIGMA, SIGHT = 0.1, 0.03, 5.0
+WORLD = World(
+    landmarks={
+        "a": Landmark(x=-1.5, y=-1.0),
+        "b": Landmark(x=1.5, y=-1.6),
+        "c": Landmark(x=5.2, y=-0.8),
+        "d": Landmark(x=6.0, y=2.3),
+        "e": Landmark(x=5.0, y=6.1),
+        "f": Landmark(x=1.4, y=6.6),
+        "g": Landmark(x=-2.0, y=5.5),
+        "h": Landmark(x=1.8, y=2.6),
+    }
+)
+RIG = Rig(
+    odometry=OdometrySettings(
+        noise=OdometryNoise(
+            along=GrowthSettings(per_distance=0.05),
+            lateral=GrowthSettings(per_distance=0.03),
+            heading=GrowthSettings(per_distance=0.08, per_rotation=0.05),
+        )
+    ),
+    bearing_range=BearingRangeSettings(range_sigma=RANGE_SIGMA, bearing_sigma=BEARING_SIGMA, robust=3.0),
+)
+# what the constants are, as changes from the rig's; the rig states twice as much as standard deviation
+TRUTH = {
+    "scale_distance": 0.06,
+    "heading_rate_bias": 0.02,
+    "bearing_range.x": 0.25,
+    "bearing_range.y": -0.2,
+    "bearing_range.bearing_bias": 0.05,
+    "bearing_range.range_scale": 0.06,
+    # the model takes the robot's velocity as constant for that long, which it is not where turns begin and end
+    "bearing_range.time_offset": 0.1,
+}
+DEPTH = {"bearing_range.depth_axis": 0.08, "bearing_range.x": 0.25}
+
+
+def _loop(t):
+    """Speeds on a square with round corners: 10 s straight, 5 s in a quarter turn, all at 0.3 m/s."""
+    return np.full(len(t), 0.3), np.where(t % 15.0 < 10.0, 0.0, np.pi / 10.0)
+
+
+def simulate(seed=1, seconds=60.0, rate=4.0, speeds=_loop) -> Log:
+    """A log; ``rate`` [Hz] is that of the landmarks.
+
+    ``speeds(t)`` gives v [m/s] and w [rad/s] at times (N,), which the wheels report. The robot slips off what they report by the
+    noise of the rig, step by step.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds / ODOMETRY_STEP) + 1) * ODOMETRY_STEP
+    v, w = speeds(t)
+    reported = se2.exp(np.column_stack((v, 0.0 * v, w)) * ODOMETRY_STEP)
+    noise = RIG.odometry.noise
+    distance, rotation = np.abs(v) * ODOMETRY_STEP, np.abs(w) * ODOMETRY_STEP
+    variance = [
+        [g.model().variance(d, r, ODOMETRY_STEP) for g in (noise.along, noise.lateral, noise.heading)]
+        for d, r in zip(distance, rotation, strict=True)
+    ]
+    steps = se2.compose(reported, se2.exp(rng.standard_normal((len(t), 3)) * np.sqrt(variance)))
+    poses = np.zeros((len(t), 3))
+    for i in range(1, len(t)):
+        poses[i] = se2.compose(poses[i - 1], steps[i - 1])
+    truth = Trajectory(t, poses)
+    return Log(
+        name="simulated",
+        rig=RIG,
+        world=WORLD,
+        streams={
+            "odometry": VelocityStream(t, v, w),
+            "bearing_range": _sightings(truth, np.arange(0.13, seconds, 1.0 / rate), rng),
+        },
+        reference=truth,
+    )
+
+
+def _sightings(truth, t, rng):
+    names = np.array(list(WORLD.landmarks))
+    poses = truth.at(t)
+    dx, dy = (WORLD.positions()[None] - poses[:, None, :2]).transpose(2, 0, 1)
+    distance = np.hypot(dx, dy)
+    measured = distance + RANGE_SIGMA * rng.standard_normal(distance.shape)
+    bearing = np.arctan2(dy, dx) - poses[:, 2:] + BEARING_SIGMA * rng.standard_normal(distance.shape)
+    rows, columns = np.nonzero(distance < SIGHT)
+    return BearingRangeStream(
+        t[rows], names[columns].tolist(), measured[rows, columns], se2.wrap(bearing[rows, columns])
+    )
+
+
+def miscalibrated(log, truth, *, depth=False, seed=0):
+    """The log of a robot whose constants differ by ``truth`` from those of its rig.
+
+    A sensor of depths sees 60 degrees to each side.
+    """
+    rng = np.random.default_rng(seed)
+    odometry = log.streams["odometry"]
+    v = odometry.v / (1.0 + truth.get("scale_distance", 0.0))
+    w = odometry.w + truth.get("heading_rate_bias", 0.0)
+    changes = np.array([truth.get(f"bearing_range.{name}", 0.0) for name in bearing_range.PARAMETERS])
+    kind = {"range_kind": "depth"} if depth else {}
+    settings = log.rig.bearing_range.model_copy(update=kind)
+    model = bearing_range.recalibrated(settings.model(), changes)
+
+    offset = truth.get("bearing_range.time_offset", 0.0)
+    t = np.unique(log.streams["bearing_range"].t)
+    t = t[t + offset <= log.reference.t[-1]]
+    poses, points = log.reference.at(t + offset)[:, None], log.world.positions()
+    distance = np.hypot(*(points - poses[..., :2]).transpose(2, 0, 1))
+    ranges, bearings = bearing_range.predict(model, poses, points)
+    visible = (distance < 5.0) & ((np.abs(bearings) < np.pi / 3.0) if depth else True)
+    ranges = ranges + settings.range_sigma * rng.standard_normal(ranges.shape)
+    bearings = se2.wrap(bearings + settings.bearing_sigma * rng.standard_normal(ranges.shape))
+    rows, columns = np.nonzero(visible)
+    names = np.array(list(log.world.landmarks))[columns].tolist()
+    seen = BearingRangeStream(t[rows], names, ranges[rows, columns], bearings[rows, columns])
+
+    sigmas = {name: 2.0 * abs(value) for name, value in truth.items()}
+    of_sensor = {name.partition(".")[2]: s for name, s in sigmas.items() if "." in name}
+    of_odometry = {name: s for name, s in sigmas.items() if "." not in name}
+    rig = log.rig.model_copy(
+        update={
+            "odometry": log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty(**of_odometry)}),
+            "bearing_range": settings.model_copy(update={"uncertainty": BearingRangeUncertainty(**of_sensor)}),
+        }
+    )
+    return replace(log, rig=rig, streams={"odometry": replace(odometry, v=v, w=w), "bearing_range": seen})

@@ -1,0 +1,63 @@
+"""Short logs of every sensor, of an office and of a room, and a recorded one of ranges."""
+
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+from camera_world import simulate as simulate_room
+from camera_world import with_frames
+
+from factorgraph_loc.log import YawRateStream, cut
+from factorgraph_loc.readers import load
+from factorgraph_loc.rfid_settings import PhaseSettings, RssiSettings
+from factorgraph_loc.rig import ImuSettings
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation import simulate as simulate_office
+
+
+@cache
+def plaza():
+    (log,) = load("plaza2")
+    start = log.span()[0]
+    part = cut(log, start, start + 24.0)
+    return replace(part, start=log.start)
+
+
+@cache
+def office():
+    """Reads with strength and phase; some tags are first read in the second half, others never."""
+    world = {"tags": 12, "landmarks": 20}
+    log = simulate_office(preset("office", {"drive": {"duration": 14.0}, "phase": {}, "rssi": {}, "world": world}), 3)
+    strength = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3)
+    phase = PhaseSettings(tempering=0.5, max_range=4.0)
+    rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})
+    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+
+
+def late(log, sensor):
+    """The log, in which each other measurement of a sensor arrives after the one that follows it."""
+    stream = log.streams[sensor]
+    looks = np.unique(stream.t, return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(looks)), looks ^ 1))
+    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    moved = {k: v[order] if isinstance(v, np.ndarray) else [v[i] for i in order] for k, v in columns.items()}
+    return replace(log, streams=log.streams | {sensor: replace(stream, **moved)})
+
+
+def with_gyro(log):
+    """The log of increments of odometry, with a gyro."""
+    wheels = log.streams["odometry"]
+    t = np.arange(0.0, wheels.t[-1], 0.05)
+    rate = np.interp(t, wheels.t[1:], wheels.dtheta[1:] / np.diff(wheels.t)) + 0.01
+    rig = log.rig.model_copy(update={"imu": ImuSettings()})
+    return replace(log, rig=rig, streams=log.streams | {"imu": YawRateStream(t, rate)})
+
+
+@cache
+def room():
+    return simulate_room(seconds=8.0)
+
+
+@cache
+def frames():
+    return with_frames(room(), clutter=30)
