@@ -22,6 +22,7 @@ from factorgraph_loc.text import plain, quoted, told
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
 YAML = 2**16  # bytes of a YAML file, which takes a hundred times as long to read
+DEFINITION = 2**20  # letters of the definition of a ROS message, which becomes compiled functions
 DATA = 2**30  # bytes of a table, a text or a MATLAB file, as it is and unpacked
 IMAGE = 2**28  # bytes of an image's file
 GRID = 2**26  # bytes of a grid, unpacked

@@ -8,15 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc.bounded import DEFINITION, require_size
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, nearest
 from factorgraph_loc.text import quoted, told
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+    from rosbags.interfaces import Connection, MessageDefinition
     from rosbags.typesys.store import Typestore
 
 ROS1 = ".bag"
@@ -86,8 +88,12 @@ class Bag:
         """The message types of a topic, from the definitions in the bag; in one without, those that ship with ROS 2."""
         if name not in self._stores:
             connection = self._connections[name][0]
+            definition = connection.msgdef
+            require_size(
+                self.path, f"the length of the definition of {connection.msgtype}", len(definition.data), DEFINITION
+            )
             with _told(self.path):
-                self._stores[name] = _store(connection)
+                self._stores[name] = _store(connection.msgtype, definition)
             if connection.msgtype not in self._stores[name].fielddefs:
                 raise InputError(
                     f"{self.path}: topic {name} is of type {connection.msgtype}, which the bag does not define: "
@@ -158,17 +164,19 @@ def require_rosbags() -> None:
         raise InputError("ROS bags need the library rosbags: pip install 'factorgraph-loc[ros]'") from error
 
 
-def _store(connection: Connection) -> Typestore:
+@lru_cache(maxsize=64)
+def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
+    """The types that a definition tells of. They become compiled functions, which takes a hundred times as long as to read a
+    message; topics of one type share them, and so do bags that are read one after the other."""
     from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore  # noqa: PLC0415
 
-    definition = connection.msgdef
     if definition.format == MessageDefinitionFormat.NONE:
         return get_typestore(Stores.LATEST)
     store = get_typestore(Stores.EMPTY)
     types: dict[str, Any] = {}
     if definition.format == MessageDefinitionFormat.MSG:
-        types.update(get_types_from_msg(definition.data, connection.msgtype))
+        types.update(get_types_from_msg(definition.data, msgtype))
     else:
         line = "=" * 80 + "\n"
         parts = definition.data.split(line)

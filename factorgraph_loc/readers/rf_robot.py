@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.columns import TAGS
+from factorgraph_loc.columns import TAGS, require_span
 from factorgraph_loc.csv_cells import read_cells
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import FileModel, inside, parse_model, read_text
@@ -96,6 +96,8 @@ def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
     """All poses, in seconds after the first, and the time of that."""
     table, rows = read_columns(path, ("x", "y", "heading", "time"))
     t_ns = checks.stamps(path, rows, table[:, 3], per_second=1e6)  # a double holds no more digits of such a time
+    if len(rows):
+        require_span([(path, rows, t_ns)])
     keep = checks.in_order(path, rows, t_ns, warnings)
     if len(keep) < 2 or t_ns[keep[-1]] - t_ns[keep[0]] < 1e9 / simulated_odometry.RATE:
         raise InputError(f"{path}: holds less than 0.1 s of poses, expected a run of them")

@@ -10,8 +10,10 @@ import math
 import numpy as np
 
 from factorgraph_loc.log import IncrementStream
+from factorgraph_loc.ticks import TICK_GAP
 from factorgraph_loc.trajectory import Trajectory
 from factors import se2
+from factors.se2 import Array
 
 RATE = 10.0  # Hz
 SCALE_SIGMA = 0.02  # of distance and of rotation, constant over a run
@@ -35,10 +37,11 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
     - dyaw' = (1 + g) dyaw + b ds + radians(1.5) sqrt(ds) n3
 
     s, g ~ N(0, 0.02) and b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1). Drawn from ``default_rng(seed)`` in the
-    order s, b, g, then n1 and n2 of each row, then n3 of each row.
+    order s, b, g, then n1 and n2 of each row, then n3 of each row. There are no rows inside gaps of the reference of more than
+    60 s: the one behind such a gap has its whole way.
     """
-    count = math.floor((reference.t[-1] - reference.t[0]) * RATE + 1e-6)
-    t = reference.t[0] + np.arange(count + 1) / RATE
+    t = _grid(reference.t)
+    count = len(t) - 1
     poses = reference.at(np.minimum(t, reference.t[-1]))
     dx, dy, dyaw = se2.between(poses[:-1], poses[1:]).T
     rng = np.random.default_rng(seed)
@@ -52,3 +55,13 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
     rows[1:, 1] = (1.0 + s) * dy + LATERAL * root * n2
     rows[1:, 2] = (1.0 + g) * dyaw + b * ds + HEADING * root * n3
     return IncrementStream(t, *np.ascontiguousarray(rows.T))
+
+
+def _grid(stamps: Array) -> Array:
+    """Times (N,) at 10 Hz from the first of ``stamps`` on; those inside long gaps are left out, as a clock may jump by days."""
+    long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
+    begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
+    first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)
+    last = np.floor((ends - stamps[0]) * RATE + 1e-6).astype(int)
+    steps = [np.arange(i, j + 1) for i, j in zip(first, last, strict=True)]
+    return np.asarray(stamps[0] + np.concatenate(steps) / RATE)

@@ -106,6 +106,12 @@ BAD = {
     "facing beyond": ("tags.csv", TAGS + "E-3,A3,1,1,1,500\n", "tags.csv:4: facing_deg is 500.0"),
     "no tags": ("tags.csv", TAGS[:33] + "\n", "holds no tags"),
     "reference short": ("run4/reference_pose.txt", "0 0 0 1673511856.0\n", "less than 0.1 s of poses"),
+    "a clock that jumps by months": (
+        "run4/reference_pose.txt",
+        "0 0 0 1673511856\n" + "0 0 0 1683511856.3\n" * 5,
+        "reference_pose.txt:1: stamp is '1673511856000000000 ns'",
+        "at most 30 days from all others",
+    ),
     "reference going back": ("run4/reference_pose.txt", "0 0 0 5.0\n0 0 0 4.0\n", "reference_pose.txt:2: time"),
 }
 

@@ -5,11 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_idl
+from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import parse_model
-from factorgraph_loc.readers import load, rosbag
+from factorgraph_loc.readers import bag_file, load, rosbag
 from factorgraph_loc.readers.bag_file import open_bag
 from factorgraph_loc.readers.bag_manifest import propose
 from factors import se2
@@ -258,6 +258,27 @@ def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
     database.close()
     assert len(read(tmp_path / "drive", rfid=None).streams["odometry"].t) == len(POSES)
     refuse(tmp_path / "drive", "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
+
+
+def test_types_are_compiled_once_however_often_a_bag_is_read(mcap, monkeypatch):
+    """For the list of an option a bag is read once for each value."""
+    compiled = []
+
+    def counted(text, kind):
+        compiled.append(kind)
+        return get_types_from_msg(text, kind)
+
+    monkeypatch.setattr("rosbags.typesys.get_types_from_msg", counted)
+    bag_file._store.cache_clear()
+    logs = load(str(mcap), reader="rosbag", options=OPTIONS | {"base_frame": [f"base{i}" for i in range(5)]})
+    assert len(logs) == 5
+    assert sorted(compiled) == sorted(set(compiled))
+    assert "nav_msgs/msg/Odometry" in compiled
+
+
+def test_a_definition_without_end(mcap, refuse, monkeypatch):
+    monkeypatch.setattr(bag_file, "DEFINITION", 100)
+    refuse(mcap, "the length of the definition of nav_msgs/msg/Odometry is", "expected at most 100")
 
 
 def test_without_the_library(mcap, refuse, monkeypatch):

@@ -57,3 +57,19 @@ def test_no_motion_no_error():
     still = Trajectory(np.arange(101) * 0.01, np.tile((1.0, 2.0, 3.0), (101, 1)))
     odometry = wheel_odometry(still, 3)
     np.testing.assert_allclose(np.stack((odometry.dx, odometry.dy, odometry.dtheta)), 0.0, atol=1e-8)
+
+
+def test_long_gaps_have_no_rows():
+    """The rows before and behind them are on one grid, and lead from pose to pose as without a gap."""
+    way = winding(2.0)
+    later = 29 * 86_400.0
+    reference = Trajectory(
+        np.concatenate((way.t, way.t + 70.06, way.t + later)),
+        np.concatenate([way.poses + np.array((x, 0.0, 0.0)) for x in (0, 5, 10)]),
+    )
+    odometry = wheel_odometry(reference, 3)
+    behind = 70.1 + 0.1 * np.arange(20)
+    np.testing.assert_allclose(odometry.t, np.concatenate((0.1 * np.arange(21), behind, later + 0.1 * np.arange(21))))
+    assert odometry.dx[21] == pytest.approx(4.0, rel=0.2)  # 5 m to where the first part began, of which 1 m was driven
+    short = Trajectory(np.concatenate((way.t, way.t + 61.0)), np.concatenate((way.poses, way.poses)))
+    assert len(wheel_odometry(short, 3).t) == 631
