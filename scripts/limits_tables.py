@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from types import UnionType
-from typing import Annotated, Any, Union, cast, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -22,7 +22,7 @@ FILES: dict[str, type[BaseModel]] = {
     "`[start]`": StartSettings,
     "settings of simulations": SimulationSettings,
     "settings of active robots": ActiveSettings,
-    **{f"settings of {name}": cast(type[BaseModel], registry._load(name, 2)) for name in registry.ESTIMATORS},
+    **{f"settings of {name}": registry.settings_type(name) for name in registry.ESTIMATORS},
 }
 Number = tuple[str, type, float, float]
 

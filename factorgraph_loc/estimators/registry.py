@@ -16,16 +16,16 @@ from factorgraph_loc.rig import Rig
 from factorgraph_loc.text import quoted
 from factorgraph_loc.world import World
 
-# name: (module, class of the estimator, class of its settings); imported when asked for
+# by name: module, class of the estimator and class of its settings; imported when asked for
 ESTIMATORS = {
-    "dead_reckoning": ("dead_reckoning", "DeadReckoning", "DeadReckoningSettings"),
-    "ekf": ("ekf", "Ekf", "EkfSettings"),
-    "particle_filter": ("particle_filter", "ParticleFilter", "ParticleFilterSettings"),
-    "switching": ("switching", "Switching", "SwitchingSettings"),
-    "monoslam": ("monoslam", "Monoslam", "MonoslamSettings"),
-    "smoother": ("smoother", "Smoother", "SmootherSettings"),
-    "batch": ("batch", "Batch", "BatchSettings"),
-    "space_batch": ("space_batch", "SpaceBatch", "SpaceBatchSettings"),
+    "dead_reckoning": ("factorgraph_loc.estimators.dead_reckoning", "DeadReckoning", "DeadReckoningSettings"),
+    "ekf": ("factorgraph_loc.estimators.ekf", "Ekf", "EkfSettings"),
+    "particle_filter": ("factorgraph_loc.estimators.particle_filter", "ParticleFilter", "ParticleFilterSettings"),
+    "switching": ("factorgraph_loc.estimators.switching", "Switching", "SwitchingSettings"),
+    "monoslam": ("factorgraph_loc.estimators.monoslam", "Monoslam", "MonoslamSettings"),
+    "smoother": ("factorgraph_loc.estimators.smoother", "Smoother", "SmootherSettings"),
+    "batch": ("factorgraph_loc.estimators.batch", "Batch", "BatchSettings"),
+    "space_batch": ("factorgraph_loc.estimators.space_batch", "SpaceBatch", "SpaceBatchSettings"),
 }
 
 IN_SPACE = ("monoslam", "space_batch")  # those of a robot that need not be on a floor
@@ -46,13 +46,12 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 
     Raises InputError for an unknown estimator, an unknown key or a value out of bounds.
     """
-    kind = cast(type[FileModel], _load(name, 2))
-    return parse_model(kind, overrides, f"settings of {name}")
+    return parse_model(settings_type(name), overrides, f"settings of {name}")
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
     """An estimator by name."""
-    return cast(Estimator, _load(name, 1)(setup, settings))
+    return cast(Estimator, estimator_type(name)(setup, settings))
 
 
 def check_names(names: Sequence[str]) -> None:
@@ -62,7 +61,17 @@ def check_names(names: Sequence[str]) -> None:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
 
 
-def _load(name: str, which: int) -> Any:
+def estimator_type(name: str) -> type[Any]:
+    """The class of an estimator; InputError for an unknown one."""
+    return _load(name, 1)
+
+
+def settings_type(name: str) -> type[FileModel]:
+    """The class of its settings; InputError for an unknown estimator."""
+    return _load(name, 2)
+
+
+def _load(name: str, which: int) -> type[Any]:
     check_names([name])
     entry = ESTIMATORS[name]
-    return getattr(importlib.import_module(f"factorgraph_loc.estimators.{entry[0]}"), entry[which])
+    return cast(type[Any], getattr(importlib.import_module(entry[0]), entry[which]))

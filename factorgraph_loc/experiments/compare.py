@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import traceback
 from collections import Counter
@@ -138,9 +137,7 @@ def _without_needless_seeds(configs: Sequence[RunConfig]) -> list[RunConfig]:
 
 
 def _is_deterministic(estimator: str) -> bool:
-    registry.check_names([estimator])
-    module, kind, _ = registry.ESTIMATORS[estimator]
-    return bool(getattr(importlib.import_module(f"factorgraph_loc.estimators.{module}"), kind).deterministic)
+    return bool(registry.estimator_type(estimator).deterministic)
 
 
 def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:

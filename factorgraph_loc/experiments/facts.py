@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +91,4 @@ def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
     from factorgraph_loc.estimators import registry  # noqa: PLC0415
 
     effective = registry.settings_of(name, settings).model_dump(mode="json")
-    module, kind, _ = registry.ESTIMATORS[name]
-    made = getattr(importlib.import_module(f"factorgraph_loc.estimators.{module}"), kind)
-    return EstimatorFacts(effective, bool(made.deterministic))
+    return EstimatorFacts(effective, bool(registry.estimator_type(name).deterministic))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -34,11 +33,7 @@ class Prepared:
 
 def takes_pixels(estimator: str) -> bool:
     """Whether an estimator, by its name, uses what a camera sees."""
-    registry.check_names([estimator])
-    module, kind, _ = registry.ESTIMATORS[estimator]
-    return bool(
-        getattr(getattr(importlib.import_module(f"factorgraph_loc.estimators.{module}"), kind), "takes_pixels", False)
-    )
+    return bool(getattr(registry.estimator_type(estimator), "takes_pixels", False))
 
 
 def frontend_of(log: Log) -> FrontendSettings:

@@ -110,5 +110,5 @@ def fake(monkeypatch):
     monkeypatch.setitem(
         sys.modules, "factorgraph_loc.estimators.fake", SimpleNamespace(Fake=Fake, FakeSettings=FakeSettings)
     )
-    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("fake", "Fake", "FakeSettings"))
+    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("factorgraph_loc.estimators.fake", "Fake", "FakeSettings"))
     return Fake

@@ -223,7 +223,7 @@ def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run(
     script = (
         "import sys, factorgraph_loc.experiments.stored_run, factorgraph_loc.readers, factorgraph_loc.simulation\n"
         "from factorgraph_loc.estimators import registry\n"
-        "for name in registry.ESTIMATORS: registry._load(name, 1)\n"
+        "for name in registry.ESTIMATORS: registry.estimator_type(name)\n"
         "print(*sys.modules)"
     )
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
