@@ -186,7 +186,7 @@ class Experiment(FileModel):
     estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1, max_length=MOST, fail_fast=True)]
     sensors: Annotated[
         tuple[Annotated[tuple[Name, ...], Field(max_length=MOST, fail_fast=True)] | None, ...],
-        Field(max_length=MOST, fail_fast=True),
+        Field(min_length=1, max_length=MOST, fail_fast=True),
     ] = (None,)
     prior: Name | None = None
     seeds: Seeds = (0,)

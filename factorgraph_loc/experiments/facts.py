@@ -57,6 +57,10 @@ class Facts:
             self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
         return self._known.logs[digest]
 
+    def knows(self, digest: str) -> bool:
+        """Whether the logs of that digest were looked up already."""
+        return digest in self._known.logs
+
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
         """Of an estimator with these settings; InputError if there is none, or if they are none of it."""
         key = f"{name} {canonical(settings)}"

@@ -110,6 +110,14 @@ class SimulatedSource:
 
         return [simulate(named_settings(self.preset, json.loads(self.settings)), self.seed)]
 
+    def size(self) -> tuple[float, float]:
+        """How long the drive is to be [s], and how often it looks for something, from the settings alone; InputError if they are
+        none."""
+        from factorgraph_loc.simulation import named_settings  # noqa: PLC0415
+
+        settings = named_settings(self.preset, json.loads(self.settings))
+        return settings.drive.duration, sum(settings.looks().values())
+
     def load(self) -> Log:
         """The log."""
         return self.load_all()[0]

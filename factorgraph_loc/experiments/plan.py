@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.run import RunConfig
 
 MOST_RUNS = 100_000
+# what may be to simulate before the first run, each of which takes about a quarter of an hour
+MOST_SECONDS = 2_000_000  # of driving
+MOST_LOOKS = 2_000_000_000  # for tags, landmarks and points, one by one
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,8 @@ def plan(
 
     An estimator is not run again for values of a sweep that do not concern it, and one without randomness only with the first
     seed. InputError, before anything runs, for a log that cannot be read, two logs of one name, settings that are none, a prior
-    that is none, or a sensor that no log has; TooManyRunsError, before any log is read, for more than ``most`` runs.
+    that is none, or a sensor that no log has; and before any log is read, TooManyRunsError for more than ``most`` runs, InputError
+    for logs to simulate that are longer than :data:`MOST_SECONDS` together, or look more often than :data:`MOST_LOOKS`.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
     sweep = experiment.sweep
@@ -104,14 +108,32 @@ def plan(
         if entry.simulate is None
     }
     _check_count(_count(experiment, sum(map(len, recorded.values())), facts), most)
+    for entry in experiment.estimators:
+        for swept in sweep.points(entry.shown, entry.name):
+            facts.estimator(entry.name, _settings(entry, swept))  # a wrong setting is told before logs are read
+    _check_simulated(experiment, folder, digests, facts)
+    try:
+        runs = _all_runs(experiment, folder, recorded, digests, facts, most)
+    finally:  # what an interrupted plan has looked up stays known
+        digests.save()
+        facts.save()
+    return runs
+
+
+def _all_runs(
+    experiment: Experiment,
+    folder: Path,
+    recorded: Mapping[int, Sequence[LogSource]],
+    digests: FileDigests,
+    facts: Facts,
+    most: int,
+) -> list[PlannedRun]:
+    sweep = experiment.sweep
     of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
     of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
-    for entry in experiment.estimators:
-        for swept in of_others[entry.shown]:
-            facts.estimator(entry.name, _settings(entry, swept))  # a wrong setting is told before logs are read
     runs: dict[str, PlannedRun] = {}
     of_recorded = {place: [*_logs(sources, digests, facts)] for place, sources in recorded.items()}
-    for point in sweep.points(SIMULATION):
+    for number, point in enumerate(sweep.points(SIMULATION)):
         simulated = tuple(point.values())
         logs = [
             log
@@ -121,15 +143,13 @@ def plan(
             )
         ]
         _check(logs, experiment.sensors)
-        for log in logs:
+        for log in logs if number == 0 else filter(_is_simulated, logs):  # points do not concern recorded logs
             for entry in experiment.estimators:
                 concerns = of_simulated[entry.shown][simulated] if _is_simulated(log) else of_others[entry.shown]
                 for swept in concerns:
                     for run in _runs(experiment, log, entry, swept, facts):
                         runs.setdefault(f"{run.label} {run.key}", run)
                 _check_count(len(runs), most)
-    digests.save()
-    facts.save()
     return list(runs.values())
 
 
@@ -149,6 +169,22 @@ def _check_count(count: int, most: int) -> None:
     if count > most:
         shown = f"{count:,}" if count < 10**12 else f"{count:.1g}"
         raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
+
+
+def _check_simulated(experiment: Experiment, folder: Path, digests: FileDigests, facts: Facts) -> None:
+    """InputError if more would have to be simulated than may be."""
+    seconds, looks = 0.0, 0.0
+    for point in experiment.sweep.points(SIMULATION):
+        for entry in experiment.logs:
+            if entry.simulate is not None:
+                sources = _simulated(entry, point, folder)
+                new = sum(not facts.knows(digests.of_source(source)) for source in sources)
+                size = sources[0].size() if new else (0.0, 0.0)
+                seconds, looks = seconds + new * size[0], looks + new * size[1]
+                if seconds > MOST_SECONDS or looks > MOST_LOOKS:
+                    what = f"{seconds:,.0f} s and {looks:,.0f} looks for tags, landmarks and points"
+                    expected = f"{MOST_SECONDS:,} s and {MOST_LOOKS:,} looks"
+                    raise InputError(f"has to simulate drives of {what} or more, expected at most {expected}")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:

@@ -18,6 +18,8 @@ Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
 Seconds = Annotated[float, Field(ge=0.0, le=1e5, description="s")]
 Hertz = Annotated[float, Field(ge=1e-3, le=100.0, description="1/s")]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+MOST_TAGS = 10_000
+MOST_LOOKS = 50_000_000  # of a kind of sensor at tags, landmarks or points: all are in memory at once
 Surface = Literal["wall", "shelf", "floor"]
 
 
@@ -33,7 +35,7 @@ class WorldSettings(FileModel):
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
     width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
     depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
-    tags: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    tags: Annotated[int, Field(ge=0, le=MOST_TAGS)] | None = None
     density: Annotated[float, Field(ge=1e-4, le=100.0, description="tags per m^2")] | None = None
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
     tag_height: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 1.2
@@ -45,6 +47,8 @@ class WorldSettings(FileModel):
     def _has_one_number(self) -> WorldSettings:
         if (self.tags is None) == (self.density is None):
             raise ValueError("expected either tags or density")
+        if self.tag_count() > MOST_TAGS:
+            raise ValueError(f"density makes {self.tag_count():,} tags, expected at most {MOST_TAGS:,}")
         return self
 
     def tag_count(self) -> int:
@@ -189,7 +193,21 @@ class SimulationSettings(FileModel):
         names = list(self.rig.rfid.all_antennas())
         if stop is not None and stop.antenna not in names:
             raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
+        for what, looks in self.looks().items():
+            if looks > MOST_LOOKS:
+                raise ValueError(f"{what} are looked for {looks:,.0f} times in all, expected at most {MOST_LOOKS:,}")
         return self
+
+    def looks(self) -> dict[str, float]:
+        """How often a drive looks for each of its tags, landmarks and points, added up over all that there are of a kind."""
+        assert self.rig.rfid is not None
+        rounds = self.rounds_per_second * len(self.rig.rfid.all_antennas())
+        per_second = {
+            "tags": rounds * self.world.tag_count(),
+            "landmarks": self.sightings.rate * self.world.landmarks,
+            "points": self.pixels.rate * self.world.points,
+        }
+        return {what: self.drive.duration * often for what, often in per_second.items()}
 
 
 # eight antennas at the tags' height; the odometry's noise is that of wheel_odometry

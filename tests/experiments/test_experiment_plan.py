@@ -95,6 +95,58 @@ def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
         planned(**content)
 
 
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"drive": {"duration": 14_400.0}}, "2,016,000 s and "),
+        ({"drive": {"duration": 600.0}, "world": {"tags": 3000}}, "28,800,000 looks"),
+    ],
+)
+def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, monkeypatch, settings, expected):
+    """Each kind of limit, with 140 logs; those that are known already need not be simulated."""
+    monkeypatch.setattr(facts, "_facts", lambda *_: pytest.fail("a log was looked at"))
+    looks = expected.endswith("looks")
+    monkeypatch.setattr(plan_module, "MOST_LOOKS", 28_799_999 if looks else 10**12)
+    with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
+        planned(logs=["one", {"simulate": "office", "settings": settings, "seeds": [3] if looks else range(140)}])
+
+
+def test_what_is_simulated_already_counts_no_more(planned, monkeypatch):
+    logs = [{"simulate": "office", "settings": {"drive": {"duration": 20.0}}, "seeds": [1, 2]}]
+    monkeypatch.setattr(plan_module, "MOST_SECONDS", 40)
+    first = planned(logs=logs)
+    monkeypatch.setattr(plan_module, "MOST_SECONDS", 0)
+    assert planned(logs=logs) == first
+    with pytest.raises(InputError, match="20 s and 12,800 looks"):
+        planned(logs=[*logs, logs[0] | {"seeds": [3]}])
+
+
+def test_an_interrupted_plan_keeps_what_it_has_looked_up(planned, monkeypatch):
+    logs = [{"simulate": "office", "settings": {"drive": {"duration": 20.0}}, "seeds": [1, 2]}]
+    look, made = facts._facts, []
+
+    def once(log):
+        if made:
+            raise KeyboardInterrupt
+        made.append(log.name)
+        return look(log)
+
+    monkeypatch.setattr(facts, "_facts", once)
+    with pytest.raises(KeyboardInterrupt):
+        planned(logs=logs)
+    monkeypatch.setattr(facts, "_facts", lambda log: made.append(log.name) or look(log))
+    assert [run.log for run in planned(logs=logs)] == made == ["office-1", "office-2"]
+
+
+def test_recorded_logs_are_planned_once_for_all_points_of_simulated_ones(planned, monkeypatch):
+    made, runs = [], plan_module._runs
+    monkeypatch.setattr(plan_module, "_runs", lambda e, log, *rest: made.append(log.name) or runs(e, log, *rest))
+    office = {"simulate": "office", "settings": {"drive": {"duration": 5.0}}}
+    found = planned(logs=["one", office], sweep={"simulation.world.tags": [3, 4, 5]})
+    assert [run.log for run in found] == ["one", "office-0", "office-0", "office-0"]
+    assert made.count("one") == 1
+
+
 def test_what_is_not_run_again_does_not_count(planned):
     sweep = {"short.lag": [1, 2, 3], "ekf.max_delay": [0.4, 0.5]}
     estimators = ["ekf", {"name": "smoother", "label": "short"}, "dead_reckoning"]

@@ -9,7 +9,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.files import parse_model
 from factorgraph_loc.rig import write_rig
-from factorgraph_loc.simulation import PRESETS, SimulationSettings, read_settings, simulate
+from factorgraph_loc.simulation import PRESETS, SimulationSettings, named_settings, read_settings, simulate
 from factorgraph_loc.simulation.settings import SightingSettings
 from factorgraph_loc.simulation.sightings import sighting_stream
 from factorgraph_loc.world import Landmark, World
@@ -118,6 +118,20 @@ def test_no_landmark_is_seen_through_a_wall_too_far_or_out_of_view():
     look = (np.array((1.0,)), np.zeros((1, 3)), settings, np.random.default_rng(0))
     seen = sighting_stream(bearing_range.BearingRangeModel(), world, *look)
     assert seen.landmark == ["beside", "before"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"world": {"density": 100.0}}, "density makes 24,000 tags, expected at most 10,000"),
+        ({"world": {"tags": 10_000}}, "tags are looked for 96,000,000 times in all, expected at most 50,000,000"),
+        ({"world": {"landmarks": 10_000}, "sightings": {"rate": 100.0}}, "landmarks are looked for 600,000,000 times"),
+        ({"world": {"points": 10_000}, "pixels": {"rate": 100.0}}, "points are looked for 600,000,000 times"),
+    ],
+)
+def test_what_would_take_all_memory_is_refused(changes, words):
+    with pytest.raises(InputError, match=words):
+        named_settings("office", changes)
 
 
 def test_a_file_changes_a_preset(tmp_path):
