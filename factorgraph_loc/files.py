@@ -1,6 +1,7 @@
 """Reading what people write, and writing so that nothing is half-written."""
 
 import difflib
+import gc
 import hashlib
 import json
 import math
@@ -25,6 +26,7 @@ from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
 LONGEST_FILE = 100  # bytes of a file's name that is made from another
 DEEPEST = 64  # tables or lists within each other, and parts of a key
 MANY = 1000  # names that a misspelt one is compared to: each takes its time
+MOST_ENTRIES = 1_000_000  # of all tables and lists of a file
 MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
@@ -80,8 +82,8 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or
-    has a date or an integer of more than 64 bits, of which no file of ours has any."""
+    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, has more
+    than :data:`MOST_ENTRIES`, or a date or an integer of more than 64 bits, of which no file of ours has any."""
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
 
@@ -98,8 +100,8 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
 
 
 def check_content(content: dict[str, Any], source: object) -> None:
-    """InputError for what none of our files has: what is nested deeper than :data:`DEEPEST`, a date, an integer of more than 64
-    bits, text that is none in UTF-8, or what is no value of TOML at all."""
+    """InputError for what none of our files has: what is nested deeper than :data:`DEEPEST`, more than :data:`MOST_ENTRIES`, a
+    date, an integer of more than 64 bits, text that is none in UTF-8, or what is no value of TOML at all."""
     for key, value in _leaves(content, source):
         if isinstance(value, int) and abs(value) >= 2**63:
             raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
@@ -135,7 +137,7 @@ def parse_json(text: str, source: object) -> Any:
         raise InputError(f"{source}: is not JSON: it is nested too deep") from error
     except ValueError as error:
         raise InputError(f"{source}: is not JSON: {told(error)}") from error
-    if text.count("[") + text.count("{") > DEEPEST:
+    if text.count("[") + text.count("{") > DEEPEST or len(text) > MOST_ENTRIES:
         deque(_leaves(content, source), maxlen=0)
     return content
 
@@ -146,7 +148,8 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
         return kind.model_validate(content)
     except ValidationError as error:
         # a misspelt key is also a missing one: the spelling is what the user can act on
-        first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+        with _without_collection():
+            first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
         key = plain(".".join(str(part) for part in first["loc"]))
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
@@ -159,6 +162,18 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]
         raise InputError(f"{source}: {key} is {quoted(first['input'])}: {expected}{more}") from error
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Without looks for garbage, which take ten times as long as to make a million dictionaries."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
@@ -240,8 +255,10 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """All values that are neither tables, lists nor floats, each with its key; InputError where they are nested too deep."""
+    """All values that are neither tables, lists nor floats, each with its key; InputError where they are nested too deep, or where
+    there are too many of all."""
     waiting = [("", content, 0)]
+    count = 0
     while waiting:
         key, value, depth = waiting.pop()
         if not isinstance(value, dict | list):
@@ -249,6 +266,8 @@ def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
         elif depth == DEEPEST:
             raise InputError(f"{source}: {plain(key)} lies more than {DEEPEST} tables or lists deep")
         else:
+            count += len(value)
+            bounded.require_size(source, "the number of its values", count, MOST_ENTRIES)
             entries = value.items() if isinstance(value, dict) else ((key, entry) for entry in value)
             waiting += [(name, entry, depth + 1) for name, entry in entries if type(entry) is not float]
 

@@ -1,3 +1,4 @@
+import gc
 import os
 import socket
 import time
@@ -6,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc import bounded
+from factorgraph_loc import bounded, files
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import inside, parse_json, read_json, read_text, read_toml
+from factorgraph_loc.files import inside, parse_json, parse_model, read_json, read_text, read_toml
+from factorgraph_loc.world import World
 
 
 def refused(call, *words: str) -> str:
@@ -143,6 +145,40 @@ def test_what_is_no_toml_of_ours_is_one_line(tmp_path, content, words):
     started = time.monotonic()
     refused(lambda: read_toml(path), "a.toml", words)
     assert time.monotonic() - started < 2.0
+
+
+@pytest.mark.parametrize("many", ["[[0.5, 0.5], [0.5]]", "{a = 1, b = [1.0, 2.0]}", "[1, 2, 3, 4]"])
+def test_a_file_has_so_many_values_at_most(tmp_path, monkeypatch, many):
+    path = tmp_path / "a.toml"
+    path.write_text(f"x = {many}\n")
+    monkeypatch.setattr(files, "MOST_ENTRIES", 6)
+    read_toml(path)
+    monkeypatch.setattr(files, "MOST_ENTRIES", 4)
+    refused(lambda: read_toml(path), "a.toml: the number of its values is", "expected at most")
+
+
+def test_json_has_so_many_values_at_most(monkeypatch):
+    monkeypatch.setattr(files, "MOST_ENTRIES", 10)
+    assert parse_json("[1, 1, 1, 1, 1, 1, 1, 1, 1, 1]", "a.json") == [1] * 10
+    refused(lambda: parse_json("[1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]", "a.json"), "the number of its values is 11")
+
+
+def test_to_tell_one_of_many_faults_looks_for_no_garbage():
+    """Those looks would take ten times as long as all else."""
+    looks = []
+
+    def note(phase, info):
+        looks.append((phase, info))
+
+    gc.callbacks.append(note)
+    try:
+        refused(
+            lambda: parse_model(World, {"name": "a", "walls": ["a"] * 20_000}, "a.toml"), "walls.0 is 'a'", "19999 more"
+        )
+    finally:
+        gc.callbacks.remove(note)
+    assert len(looks) < 10
+    assert gc.isenabled()
 
 
 def test_long_words_and_numbers_with_points_are_no_long_keys(tmp_path):
