@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
-from factorgraph_loc.cli.main import app
+from factorgraph_loc.cli.app import app
 from factorgraph_loc.log import ImageStream, IncrementStream, Log
 from factorgraph_loc.readers import load, write_native
 from factorgraph_loc.rig import Rig

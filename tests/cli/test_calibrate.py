@@ -12,7 +12,7 @@ def calibrated(short_log, tmp_path_factory):
     """The rig of the short log, its report, and what was printed."""
     from typer.testing import CliRunner  # noqa: PLC0415
 
-    from factorgraph_loc.cli.main import app  # noqa: PLC0415
+    from factorgraph_loc.cli.app import app  # noqa: PLC0415
 
     out = tmp_path_factory.mktemp("rigs") / "mower.rig.toml"
     result = CliRunner().invoke(app, ["calibrate", str(short_log), "-o", str(out)])

@@ -50,7 +50,7 @@ def a_log(seconds=70.0):
 def calibrated(tmp_path_factory):
     from typer.testing import CliRunner  # noqa: PLC0415
 
-    from factorgraph_loc.cli.main import app  # noqa: PLC0415
+    from factorgraph_loc.cli.app import app  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("rfid")
     write_native(a_log(), folder / "circles")

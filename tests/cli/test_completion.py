@@ -50,7 +50,7 @@ def test_words_are_completed(line, expected):
 
 def test_completion_loads_no_numerical_libraries():
     code = (
-        "import sys, factorgraph_loc.cli.main\n"
+        "import sys, factorgraph_loc.cli.app\n"
         "from factorgraph_loc.cli import completion\n"
         "assert completion.logs('plaza') and completion.estimators('ekf,') and completion.preset('')\n"
         "print(sorted({'numpy', 'gtsam', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))"

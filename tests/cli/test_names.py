@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from factorgraph_loc.cli import show
-from factorgraph_loc.cli.main import app
+from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.tables import comparison_table
 from factorgraph_loc.files import read_toml, write_toml
 from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import pytest
 from typer.main import get_command
 
-from factorgraph_loc.cli.main import app, main
+from factorgraph_loc.cli.app import app
+from factorgraph_loc.cli.main import main
 from factorgraph_loc.errors import InputError, RunFailedError
 
 

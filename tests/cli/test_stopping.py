@@ -84,3 +84,26 @@ def test_a_signal_is_not_lost_in_a_destructor():
         end_slowly()
     assert stopped.value.number == signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize(
+    "module", ["factorgraph_loc.cli.stopping", "factorgraph_loc.cli.app", "typer", "factorgraph_loc.cli.simulating"]
+)
+def test_a_signal_while_modules_are_imported(module, processes):
+    """Of modules that the command imports itself: the interpreter sends the signal as it looks for one of them."""
+    code = (
+        "import signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == {module!r}:\n"
+        "            sys.meta_path.remove(self)\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        f"sys.modules.pop({module!r}, None)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from factorgraph_loc.cli.main import main\n"
+        "sys.argv[1:] = ['--version']\n"
+        "main()\n"
+    )
+    running = processes.start(sys.executable, "-c", code, stderr=subprocess.PIPE)
+    assert running.communicate(timeout=processes.PATIENCE)[1] == "interrupted\n"
+    assert running.returncode == 130

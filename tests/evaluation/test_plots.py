@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from factorgraph_loc.cli.main import app
+from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
 from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream

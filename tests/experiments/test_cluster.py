@@ -9,7 +9,7 @@ from collections import Counter
 import pytest
 from typer.testing import CliRunner
 
-from factorgraph_loc.cli.main import app
+from factorgraph_loc.cli.app import app
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments import cluster
 from factorgraph_loc.experiments.experiment_file import Limits, read_experiment

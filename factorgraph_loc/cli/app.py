@@ -1,0 +1,130 @@
+"""The commands of ``fgloc``. The command line only parses and prints; numerical libraries are imported inside the commands."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from typing import Annotated, Any
+
+import typer
+from typer.completion import install_callback, show_callback
+from typer.core import TyperGroup
+
+from factorgraph_loc import __version__
+from factorgraph_loc.cli import (
+    active,
+    calibrating,
+    experimenting,
+    exporting,
+    features,
+    images,
+    inspecting,
+    manifest,
+    mapping,
+    running,
+    show,
+    simulating,
+    viewing,
+)
+from factorgraph_loc.cli.stopping import end
+from factorgraph_loc.cli.streams import OutputError, standard_streams
+from factorgraph_loc.errors import FglocError, unusable
+from factorgraph_loc.experiments.threads import use_one_thread
+from factorgraph_loc.text import MESSAGE, plain
+
+DEBUG = "--debug"
+COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
+SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
+_UsageError: Any = typer.BadParameter.__mro__[1]  # of click, or of the copy of it that Typer has
+UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
+
+
+class Commands(TyperGroup):
+    """The one place where an error that a user can cause becomes a line on stderr and an exit code."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """``--debug`` is taken wherever it stands on the line. A shell named after an option of completion is the one meant;
+        Typer alone would take the one that it runs in."""
+        if len(args) == 2 and args[0] in COMPLETION and args[1] in SHELLS:
+            COMPLETION[args[0]](ctx, self.params[0], args[1])
+        if DEBUG in args:
+            args = [DEBUG, *(arg for arg in args if arg != DEBUG)]
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except FglocError as error:
+            if ctx.params.get("debug"):
+                raise
+            show.note(f"error: {error}")
+            raise typer.Exit(error.exit_code) from error
+        except _UsageError as error:
+            error.message = plain(error.message, MESSAGE)
+            raise
+        except OSError as error:
+            if ctx.params.get("debug"):
+                raise
+            show.note(f"error: {unusable(error)}")
+            raise typer.Exit(FglocError.exit_code) from error
+        except KeyboardInterrupt as stop:
+            raise typer.Exit(end(stop)) from stop
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, or a file or standard output "
+    "that cannot be written, 70 a fault of the program, 129, 130 and 143 hung up, interrupted and terminated, 141 who reads the "
+    "output has ended.",
+)
+app.command()(inspecting.datasets)
+app.command()(inspecting.info)
+app.command()(inspecting.convert)
+app.command()(manifest.manifest)
+app.command()(running.run)
+app.command()(running.compare)
+app.command()(viewing.view)
+app.command()(exporting.export)
+app.command()(calibrating.calibrate)
+app.command("map")(mapping.map_)
+app.command()(images.images)
+app.command()(simulating.simulate)
+app.command()(active.active)
+app.add_typer(experimenting.app, name="experiment")
+app.add_typer(features.app, name="features")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        show.line(f"fgloc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def fgloc(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option(DEBUG, help="Show the traceback of an error. May stand anywhere on the line.")
+    ] = False,
+) -> None:
+    """Localize a robot from logged runs: look at a log, run an estimator on it, compare estimators."""
+
+
+def run() -> None:
+    """The command by the arguments of this process, which it ends."""
+    use_one_thread()
+    try:
+        with standard_streams():
+            app()
+    except OutputError as error:  # of --help and --version too
+        show.note(f"error: {error}")
+        sys.exit(error.exit_code)
+    except Exception as error:
+        for line in traceback.format_exc().splitlines():
+            show.note(line)
+        sys.exit(error.exit_code if isinstance(error, FglocError) else UNFORESEEN)
