@@ -1,6 +1,8 @@
 """The fuzzer: its cases are the same each time, its damage stays what it says, its processes survive; and a first round of it."""
 
+import sys
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,3 +110,15 @@ def test_a_first_round(kind, shared):
     count = 12 if kind in FORMATS else 12 if kind == LOCALIZER else 4
     found = shared.try_cases(kind, 1, 0, count)
     assert not [f"{Case(kind, 1, k).command}: {v.error} at {v.place}" for k, v in found if v.outcome == "bad"]
+
+
+def test_what_a_fuzzer_that_was_ended_leaves_is_swept_by_the_next(tmp_path, processes, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    fuzz = (sys.executable, Path(__file__).parents[2] / "scripts" / "fuzz", "toml", "--keep", tmp_path / "kept")
+    running = processes.start(*fuzz, "--case", 0)
+    processes.wait_until(lambda: list(tmp_path.glob(".fz*/*")))
+    running.terminate()
+    running.wait()
+    assert list(tmp_path.glob(".fz*/*"))
+    assert processes.start(*fuzz, "--cases", 0).wait(processes.PATIENCE) == 0
+    assert not list(tmp_path.iterdir())
