@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import polars as pl
@@ -14,6 +11,7 @@ import polars as pl
 from factorgraph_loc import parquet_pages
 from factorgraph_loc.bounded import DATA, foreign, read_bytes, require_size
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.quiet import quiet
 
 
 def read_parquet(path: Path) -> pl.DataFrame:
@@ -23,7 +21,7 @@ def read_parquet(path: Path) -> pl.DataFrame:
 
 def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
     """The table, or some ``columns`` of it, in the bytes of a Parquet file; InputError as of :func:`read_parquet`."""
-    with foreign(source, "is not a Parquet file that can be read"), _quiet():
+    with foreign(source, "is not a Parquet file that can be read"), quiet():
         parquet_pages.check(content, source)
         return pl.read_parquet(io.BytesIO(content), columns=None if columns is None else list(columns))
 
@@ -40,24 +38,3 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
             length = int(found.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)
         return [text or "" for text in found.to_list()]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Standard error goes nowhere: threads of polars that stumble over a damaged page write pages to it, before they raise."""
-    if threading.current_thread() is not threading.main_thread():  # whose output the others share
-        yield
-        return
-    try:
-        kept = os.dup(2)
-    except OSError:  # it is closed
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)

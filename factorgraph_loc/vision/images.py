@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.bounded import IMAGE, foreign, read_bytes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.image_files import NO_IMAGE, image_size
+from factorgraph_loc.quiet import quiet
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]
@@ -78,7 +79,7 @@ def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
     """The pixels of an image's file as OpenCV gives them with ``flags``; InputError if it is none, or one of more than
     :data:`~factorgraph_loc.bounded.PIXELS` pixels, before memory is taken for them. OpenCV itself would take 2^30."""
     image_size(content, source)
-    with foreign(source, NO_IMAGE):
+    with foreign(source, NO_IMAGE), quiet():
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if image is None:
         raise InputError(f"{source}: {NO_IMAGE}, expected PNG, JPEG, PPM or the like")
