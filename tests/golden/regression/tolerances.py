@@ -1,0 +1,143 @@
+"""How far results may be from those that are held: on this machine, on another processor, and where a last bit decides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factors import se2
+from regression.differences import Difference, differences
+from regression.records import Record
+
+SAME = 1e-9  # on one machine, with the same arithmetic
+TOLERANCE = 1e-6  # between processors, where nothing branches
+
+
+@dataclass(frozen=True)
+class Branch:
+    """Why the last bits of its numbers decide what a case does, and how far another processor's results may then be off.
+
+    ``loose``: by quantity, of numbers as of :func:`regression.differences.size_of`, but of poses beside covariances in units of
+    the stored standard deviations; infinite for what is not held at all. ``tolerance``: of all other numbers.
+    """
+
+    reason: str
+    loose: Mapping[str, float] = field(default_factory=dict)
+    tolerance: float = TOLERANCE
+
+    def allows(self, difference: Difference, old: Record, new: Record) -> bool:
+        """Whether a difference is no larger than that."""
+        bound = self.loose.get(difference.quantity, self.tolerance)
+        size, (kind, _, what) = difference.size, difference.quantity.rpartition(".")
+        if (
+            difference.quantity in self.loose
+            and what == "poses"
+            and f"{kind}.covariances" in old.numbers
+            and np.isfinite(size)
+        ):
+            size = _in_sigmas(kind, old, new)
+        return size <= bound
+
+
+NOT_HELD = math.inf
+# The bounds are two to three times what was measured with the kernels Haswell, Prescott and SkylakeX of the BLAS library, and with
+# numba for a generic processor.
+DRAWN = Branch(
+    "Final trajectories are drawn backwards by eigenvectors of covariances, whose signs another kernel of the BLAS library turns.",
+    {"final.poses": 0.7, "final.covariances": 1.6},
+)
+SINGLE_PRECISION = Branch(
+    "Particles are weighed by tables of tags in single precision, whose last bits decide which are resampled.",
+    {
+        **{"causal.poses": 1.2, "causal.covariances": 1.2, "final.poses": 1.2, "final.covariances": 1.8},
+        **{
+            "learnt.constants": 1.0,
+            "belief": NOT_HELD,
+            "belief.poses": 0.1,
+            "belief.weights": 0.1,
+            "nis.rfid.sums": 0.1,
+        },
+        **{f"{kind}.sums": 0.01 for kind in ("nis.bearing_range", "residuals.bearing_range.range")},
+        "residuals.bearing_range.bearing.sums": 0.01,
+    },
+)
+WHEN_FOUND = {
+    **dict.fromkeys(("status", "nis", "nis.rfid.t", "nis.rfid.sums", "residuals"), NOT_HELD),
+    "events.t": 0.4,
+}
+FOUND_BY_PARTICLES = Branch(
+    SINGLE_PRECISION.reason + " So the place is found some ticks earlier or later.",
+    {**SINGLE_PRECISION.loose, **WHEN_FOUND},
+)
+FOUND = Branch(
+    FOUND_BY_PARTICLES.reason,
+    {
+        **{"causal.poses": 1.2, "causal.covariances": 1.2, "final.poses": 0.01, "final.covariances": 1e-3},
+        **{"learnt.constants": 0.01, "belief.poses": 0.1, "belief.weights": 0.1},
+        **WHEN_FOUND,
+    },
+)
+UNDECIDED = Branch(
+    "Many places explain what was seen equally well: which of them a search keeps, and in which order, is left to rounding.",
+    dict.fromkeys(("belief", "belief.weights", "belief.poses", "causal.poses", "causal.covariances"), NOT_HELD),
+)
+ILL_CONDITIONED = Branch(
+    "The camera's constants can hardly be told apart by now, and rounding is amplified as often as they are linearised anew.",
+    tolerance=1e-4,
+)
+CHOSEN = Branch(
+    SINGLE_PRECISION.reason + " So is the way that is chosen, and from there on everything is another run.",
+    dict.fromkeys(
+        (
+            *("truth.poses", "steps.poses", "steps.covariances", "steps.particles.sums", "steps.chosen.poses"),
+            *("steps.t", "steps.values", "candidates"),
+        ),
+        NOT_HELD,
+    ),
+)
+
+
+def branch_of(case: str) -> Branch | None:
+    """That of a case ``SCENARIO/LABEL``."""
+    name, _, label = case.partition("/")
+    if label == "log":
+        return None
+    particles = label.startswith("particle_filter")
+    hears_tags = name.startswith(("tags", "recorded-tags", "fault"))
+    if name.startswith("active"):
+        found = CHOSEN
+    elif name == "tags-landmarks-undecided" and not particles:
+        found = UNDECIDED
+    elif name in ("tags-unknown-start", "tags-unknown-heading", "tags-kidnapped", "tags-landmarks-unknown-start"):
+        found = FOUND_BY_PARTICLES if particles or label == "switching" else FOUND
+    elif hears_tags and (particles or label == "switching"):
+        found = SINGLE_PRECISION
+    elif particles:
+        found = DRAWN
+    elif name == "points-self-calibration" and label.startswith("smoother"):
+        found = ILL_CONDITIONED
+    else:
+        return None
+    return found
+
+
+def beyond(old: Record, new: Record, tolerance: float) -> list[Difference]:
+    """What differs by more than a tolerance."""
+    return [d for d in differences(old, new) if d.size > tolerance]
+
+
+def beyond_processors(case: str, old: Record, new: Record) -> list[Difference]:
+    """What differs by more than processors make results of a case differ."""
+    branch = branch_of(case)
+    return [d for d in beyond(old, new, TOLERANCE) if branch is None or not branch.allows(d, old, new)]
+
+
+def _in_sigmas(kind: str, old: Record, new: Record) -> float:
+    """The largest difference of poses in units of their standard deviations."""
+    poses, covariances = old.numbers[f"{kind}.poses"], old.numbers[f"{kind}.covariances"]
+    difference = new.numbers[f"{kind}.poses"] - poses
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    return float(np.nanmax(np.abs(difference) / np.sqrt(covariances[:, (0, 3, 5)])))
