@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from factorgraph_loc.bounded import DEFINITION, require_size
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import inside, nearest
+from factorgraph_loc.readers import bag_unpacking
 from factorgraph_loc.text import quoted, told
 
 if TYPE_CHECKING:
@@ -144,6 +145,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     for file in path.iterdir() if path.is_dir() else ():
         inside(path, file.name, path)  # a link could lead elsewhere, and a FIFO would wait for ever
     require_rosbags()
+    bag_unpacking.bound()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
     from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415
 

@@ -106,7 +106,7 @@ uint64 first_seen_us
 class BagMaker:
     """Writes a bag of ROS version 1 (``.bag``) or 2 (a folder, by its storage), with a custom message ``shop_msgs/msg/Reads``."""
 
-    def __init__(self, path: Path, storage: str = "mcap") -> None:
+    def __init__(self, path: Path, storage: str = "mcap", compression: tuple[object, ...] = ()) -> None:
         self.path, self.ros1 = path, path.suffix == ".bag"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
         self.store.register(get_types_from_msg(READS, "shop_msgs/msg/Reads"))
@@ -116,6 +116,8 @@ class BagMaker:
             self.writer = rosbag1.Writer(path)
         else:
             self.writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+        if compression:
+            self.writer.set_compression(*compression)
         self.writer.open()
         self.connections: dict[str, object] = {}
 
