@@ -249,13 +249,11 @@ class Localizer:
                     estimator.initialize(self._prior)
         # as in a run of a log: a tick comes after all that was measured by then
         for t in self._ticks.before(m.t):
-            with self._guard.taking(Tick(t)):
-                estimator.process(Tick(t))
+            self._guard.process(estimator, Tick(t))
         if not isinstance(m, Odometry) and not self._is_under_way(m.t):
             estimator.diagnostics.ignore("before the start")
             return
-        with self._guard.taking(m):
-            estimator.process(m)
+        self._guard.process(estimator, m)
 
     def _check_stamp(self, m: Odometry | Exteroceptive) -> None:
         where = f"{type(m).__name__} at {m.t:.3f} s"
@@ -309,9 +307,4 @@ class Localizer:
         self._tidied = self._newest
         if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)
-        found = estimator.diagnostics
-        for innovations in found.nis.values():
-            del innovations[:-ROWS_KEPT]
-        for residuals in found.residuals.values():
-            del residuals[:-ROWS_KEPT]
-        del found.events[:-ROWS_KEPT]
+        estimator.diagnostics.keep_last(ROWS_KEPT)

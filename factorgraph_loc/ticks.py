@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from factorgraph_loc.errors import InputError
 
@@ -39,8 +39,14 @@ class Ticks:
         """How long it has been since the start, without gaps."""
         return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
 
-    def before(self, t: float) -> Iterator[float]:
+    def before(self, t: float) -> Iterable[float]:
         """The ticks that come before a measurement at ``t``, which is the next to arrive."""
+        if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
+            self._newest = t
+            return ()  # as with most rows of odometry
+        return self._before(t)
+
+    def _before(self, t: float) -> Iterator[float]:
         if t > self._newest + self._gap:
             yield from self.rest()
             self.skipped.append((self._newest, t))

@@ -8,10 +8,12 @@ there is a matter of rounding, and is raised to that. Covariances that need no h
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf
 
 from factors.se2 import Array
 
 LEAST = 1e-12  # the smallest eigenvalue of a correlation matrix that can be inverted
+CLEAR = 1e-9  # a determinant of one
 
 
 def nearest(covariances: Array) -> Array:
@@ -26,9 +28,14 @@ def nearest(covariances: Array) -> Array:
 def sound(covariance: Array) -> Array:
     """The covariance (D, D) itself where it can be inverted, else the :func:`nearest` that can."""
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if np.all(sigmas > 0.0) and np.linalg.eigvalsh(covariance / sigmas[:, None] / sigmas)[0] > LEAST:
+    if not np.all(sigmas > 0.0):
+        return nearest(covariance)
+    shares = covariance / sigmas[:, None] / sigmas
+    root, failed = dpotrf(shares, lower=1)
+    # with such a determinant the smallest eigenvalue of a correlation matrix is far above the least: det < e * smallest
+    if not failed and np.prod(root.diagonal()) ** 2 > CLEAR:
         return covariance
-    return nearest(covariance)
+    return covariance if np.linalg.eigvalsh(shares)[0] > LEAST else nearest(covariance)
 
 
 def whitener(covariances: Array) -> Array:

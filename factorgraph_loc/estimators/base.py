@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
@@ -120,6 +120,9 @@ class Written:
     rejected: Mapping[str, int]
 
 
+NOTHING_WRITTEN = Written({}, {}, {}, {})
+
+
 @dataclass
 class Diagnostics:
     """Counts and consistency figures of a run.
@@ -137,18 +140,36 @@ class Diagnostics:
     late: dict[str, int] = field(default_factory=dict)
     events: list[tuple[float, str]] = field(default_factory=list)
     dead_tags: dict[str, float] = field(default_factory=dict)
+    # the last mark, while nothing is written after it: most of what is taken writes nothing
+    _mark: Mark | None = field(default=None, init=False, repr=False, compare=False)
 
     def ignore(self, reason: str, count: int = 1) -> None:
+        self._mark = None
         self.ignored[reason] = self.ignored.get(reason, 0) + count
 
     def reject(self, reason: str, count: int = 1) -> None:
+        self._mark = None
         self.rejected[reason] = self.rejected.get(reason, 0) + count
 
     def drop_late(self, sensor: str, count: int = 1) -> None:
         self.late[sensor] = self.late.get(sensor, 0) + count
 
     def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
+        self._mark = None
         self.nis.setdefault(sensor, []).append((t, nis, dof))
+
+    def add_residuals(self, name: str, values: Iterable[float]) -> None:
+        self._mark = None
+        self.residuals.setdefault(name, []).extend(values)
+
+    def keep_last(self, rows: int) -> None:
+        """Forget all but the last ``rows`` of each list."""
+        self._mark = None
+        for innovations in self.nis.values():
+            del innovations[:-rows]
+        for residuals in self.residuals.values():
+            del residuals[:-rows]
+        del self.events[:-rows]
 
     def copy(self) -> Diagnostics:
         """One of its own with the same content."""
@@ -164,11 +185,18 @@ class Diagnostics:
 
     def mark(self) -> Mark:
         """What there is now, for :meth:`since`."""
+        if self._mark is None:
+            self._mark = self._counted()
+        return self._mark
+
+    def _counted(self) -> Mark:
         rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
         return Mark(rows, values, dict(self.ignored), dict(self.rejected))
 
     def since(self, mark: Mark) -> Written:
         """What was added since then."""
+        if mark is self._mark:
+            return NOTHING_WRITTEN
         return Written(
             {name: rows[mark.nis.get(name, 0) :] for name, rows in self.nis.items()},
             {name: values[mark.residuals.get(name, 0) :] for name, values in self.residuals.items()},
@@ -180,6 +208,7 @@ class Diagnostics:
         """Take out what was added, as what it tells of will be taken once more: a measurement counts once, however often an
         estimator goes back in time. Rows may be gone by now: a robot that runs for long keeps the last ones. What was ``late``
         stays, and so do ``events``, which did happen."""
+        self._mark = None
         _remove(self.nis, written.nis)
         _remove(self.residuals, written.residuals)
         for totals, counts in ((self.ignored, written.ignored), (self.rejected, written.rejected)):

@@ -213,9 +213,11 @@ class Filter(ABC):
 
     def _catch_up(self, ahead: Filter) -> None:
         """Take over what the one that is ahead has predicted; the generator stays, as others draw by it too."""
-        vars(self).update((name, value) for name, value in vars(ahead).items() if name != "_rng")
-        if self._rng is not None and ahead._rng is not None:
-            self._rng.bit_generator.state = ahead._rng.bit_generator.state
+        rng = self._rng
+        vars(self).update(vars(ahead))
+        self._rng = rng
+        if rng is not None and ahead._rng is not None:
+            rng.bit_generator.state = ahead._rng.bit_generator.state
 
     def _begin(self, m: Exteroceptive | Tick) -> None:
         """Start without a prior, at the first measurement that tells something of the pose."""

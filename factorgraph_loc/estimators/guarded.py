@@ -9,6 +9,8 @@ with the program itself (a name, a type, a key) is none of these, and passes.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
 from typing import Self
@@ -16,7 +18,7 @@ from typing import Self
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.base import PoseEstimate
+from factorgraph_loc.estimators.base import Estimator, PoseEstimate
 from factorgraph_loc.measurements import Measurement, Tick
 from factorgraph_loc.pushed import sensor_of
 from factorgraph_loc.text import plain
@@ -33,7 +35,7 @@ CLEAR = 1e-4  # share of a variance that the others leave unexplained: nothing m
 
 
 class Guard:
-    """What runs of an estimator go through: ``with guard.taking(measurement): ...``.
+    """What runs of an estimator go through: ``guard.process(estimator, measurement)``, ``with guard.telling(what): ...``.
 
     ``who``: the estimator and the log, or the estimator alone. Warnings of NumPy are silent inside, as what comes of them is
     checked: :func:`sound`, :func:`sound_trajectory`.
@@ -43,12 +45,31 @@ class Guard:
         self._who = who
         self._last: Measurement | None = None  # what was taken
         self._telling = ""
-        self._quiet = np.errstate()
+        self._silence = np.errstate(all="ignore")
+        self._is_quiet = False
 
-    def taking(self, measurement: Measurement) -> Self:
-        """A context in which the estimator is given a measurement."""
+    @contextmanager
+    def quiet(self) -> Iterator[None]:
+        """A context in which NumPy is silent all the time: it costs as much to silence it once as to give one row of odometry."""
+        with np.errstate(all="ignore"):
+            self._is_quiet = True
+            try:
+                yield
+            finally:
+                self._is_quiet = False
+
+    def process(self, estimator: Estimator, measurement: Measurement) -> None:
+        """Give a measurement to the estimator."""
         self._last, self._telling = measurement, ""
-        return self
+        if not self._is_quiet:
+            with self:
+                estimator.process(measurement)
+            return
+        try:
+            estimator.process(measurement)
+        except Exception as error:
+            self._pass_on(error)
+            raise
 
     def telling(self, what: str) -> Self:
         """A context in which it is asked for something, such as ``the estimate at 1.000 s``."""
@@ -56,12 +77,19 @@ class Guard:
         return self
 
     def __enter__(self) -> Self:
-        self._quiet = np.errstate(all="ignore")
-        self._quiet.__enter__()
+        if not self._is_quiet:
+            self._silence = np.errstate(all="ignore")
+            self._silence.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._quiet.__exit__(None, None, None)
+        if not self._is_quiet:
+            self._silence.__exit__(None, None, None)
+        if error is not None:
+            self._pass_on(error)
+
+    def _pass_on(self, error: BaseException) -> None:
+        """Raise what an error of a computation becomes; nothing for others."""
         if isinstance(error, FAILURES) or (isinstance(error, RunFailedError) and type(error) is RunFailedError):
             raise self._failure(_reason(error)) from error
 

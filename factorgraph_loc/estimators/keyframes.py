@@ -237,7 +237,8 @@ class KeyframeGraph(ABC):
         if ODOMETRY_KEY not in self._constants:
             return increment
         changes = self._odometry_constants.full(self._constants[ODOMETRY_KEY], len(PARAMETERS))
-        return replace(increment, delta=recalibrated(increment.delta, increment.moving, changes))
+        delta = recalibrated(increment.delta, increment.moving, changes)
+        return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def _constant_priors(self) -> tuple[Values, Values]:
         """Means and covariances of the sensors' constants before any measurement."""

@@ -127,7 +127,7 @@ class KnownLandmarks:
         errors = -update.residual * sigmas(factor.model, factor.ranges)
         for i, (name, measured) in enumerate((("range", factor.ranges), ("bearing", factor.bearings))):
             found = errors[~np.isnan(measured), i].tolist()
-            self._diagnostics.residuals.setdefault(f"bearing_range.{name}", []).extend(found)
+            self._diagnostics.add_residuals(f"bearing_range.{name}", found)
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:

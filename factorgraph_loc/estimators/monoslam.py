@@ -266,7 +266,7 @@ class Monoslam(Filter):
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
         self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
         for i, name in enumerate("uv"):
-            self.diagnostics.residuals.setdefault(f"{sensor}.{name}", []).extend(residual[:, i].tolist())
+            self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
 
     def _relocated(
         self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match

@@ -18,7 +18,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Mode, PoseEstimate, PosePrior, Status, Written
+from factorgraph_loc.estimators.base import (
+    NOTHING_WRITTEN,
+    Belief,
+    Diagnostics,
+    Mode,
+    PoseEstimate,
+    PosePrior,
+    Status,
+    Written,
+)
 from factorgraph_loc.estimators.graph_parts import GraphSettings, Guess, Keyframe
 from factorgraph_loc.estimators.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.estimators.landmarks import KnownLandmarks
@@ -44,7 +53,6 @@ from factors.se2 import Array
 
 # m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
 UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
-NOTHING_WRITTEN = Written({}, {}, {}, {})
 SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 
 

@@ -166,8 +166,8 @@ class KnownPoints:
         """Record the innovation of an update at time ``t``."""
         self._diagnostics.innovation("camera", t, update.nis, update.dof)
         u, v = (-factor.model.sigma * update.residual.T).tolist()
-        self._diagnostics.residuals.setdefault("camera.u", []).extend(u)
-        self._diagnostics.residuals.setdefault("camera.v", []).extend(v)
+        self._diagnostics.add_residuals("camera.u", u)
+        self._diagnostics.add_residuals("camera.v", v)
         if self._clock is not None:
             self._clock.add(t, median(u) / factor.model.fx)
 

@@ -139,7 +139,8 @@ def run(
         lambda share: report(before + (1.0 - before) * share),
         watch,
     )
-    loop.run()
+    with guard.quiet():
+        loop.run()
     started = perf_counter()
     in_space = None
     with guard.telling("the final trajectory"):
@@ -234,8 +235,7 @@ class _Loop:
                 self._tick(tick)
             if is_odometry:
                 for m in group:
-                    with self._guard.taking(m):
-                        self._estimator.process(m)
+                    self._guard.process(self._estimator, m)
             elif t < self._start:
                 self._estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
             else:
@@ -274,8 +274,7 @@ class _Loop:
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
         for m in measurements:
-            with self._guard.taking(m):
-                self._estimator.process(m)
+            self._guard.process(self._estimator, m)
         with self._guard.telling(f"the estimate at {t:.3f} s"):
             sound(self._estimator.estimate())
         self._update_s.append(perf_counter() - started)
@@ -284,8 +283,7 @@ class _Loop:
     def _tick(self, t: float) -> None:
         with self._guard.telling(f"the estimate at {t:.3f} s"):
             e = sound(self._estimator.estimate(t))
-        with self._guard.taking(Tick(t)):
-            self._estimator.process(Tick(t))
+        self._guard.process(self._estimator, Tick(t))
         # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)

@@ -184,8 +184,7 @@ class _Loop:
         return False
 
     def _feed(self, measurement: Measurement) -> None:
-        with self._guard.taking(measurement):
-            self._estimator.process(measurement)
+        self._guard.process(self._estimator, measurement)
 
     def _estimate(self) -> PoseEstimate:
         with self._guard.telling(f"the estimate at {self._robot.t:.3f} s"):

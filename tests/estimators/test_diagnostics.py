@@ -84,7 +84,7 @@ def test_what_is_taken_back_leaves_no_trace():
     mark = diagnostics.mark()
     diagnostics.innovation("camera", 2.0, 2.0, 2)
     diagnostics.innovation("rfid", 2.0, 1.0, 1)
-    diagnostics.residuals.setdefault("camera.u", []).extend((1.0, 2.0))
+    diagnostics.add_residuals("camera.u", (1.0, 2.0))
     diagnostics.ignore("stranger")
     diagnostics.reject("astray", 3)
     diagnostics.take_back(diagnostics.since(mark))
@@ -128,7 +128,7 @@ def test_rows_are_taken_back_whatever_came_after_them():
     for t in (5.0, 6.0, 4.9):
         mark = diagnostics.mark()
         diagnostics.innovation("camera", t, 2.0, 2)
-        diagnostics.residuals.setdefault("camera.u", []).append(10.0 * t)
+        diagnostics.add_residuals("camera.u", (10.0 * t,))
         written[t] = diagnostics.since(mark)
     for t in (6.0, 5.0):
         diagnostics.take_back(written[t])
