@@ -131,7 +131,7 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     The heading error is a random walk along the way, so it also displaces the end: with the chord seen from the end and
     the walk spread evenly over it, by a third of its variance (and half of it as covariance).
     """
-    return Increment(*relative(model.noise(), start, end))
+    return Increment(*relative(np.array(model.noise()), start, end))
 
 
 # the constants that recalibrated() changes

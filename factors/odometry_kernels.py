@@ -22,7 +22,7 @@ State = tuple[float, float, float, float, float, float, float, float]
 
 
 @numba.njit(cache=True)
-def relative(noise: Noise, start: State, end: State) -> tuple[Array, Array, float, float]:
+def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
     """As of :func:`factors.odometry.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, of two states of a
     chain (t, x, y, heading, path, turn, unknown, still)."""
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]

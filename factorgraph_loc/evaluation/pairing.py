@@ -11,6 +11,7 @@ correlated, and just this one where both are the same.
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,10 +43,10 @@ class Pairs:
 def thinned(t: Array) -> Integers:
     """Which of the stamps ``t`` (N,), ascending, are scored: the first, and each that comes 0.1 s or more after the one before."""
     kept: list[int] = []
-    i = 0
-    while i < len(t):
+    stamps, i = t.tolist(), 0
+    while i < len(stamps):
         kept.append(i)
-        i = max(i + 1, int(np.searchsorted(t, t[i] + 1.0 / RATE - TOLERANCE)))
+        i = max(i + 1, bisect.bisect_left(stamps, stamps[i] + 1.0 / RATE - TOLERANCE, i))
     return np.array(kept, dtype=np.int64)
 
 
