@@ -1,6 +1,9 @@
 """What fails in an estimator is one line, and what it says is checked."""
 
 import math
+import warnings
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +15,15 @@ from factorgraph_loc.measurements import BearingRange, Tick, VelocityOdometry
 from factorgraph_loc.trajectory import Trajectory
 
 SEEN = BearingRange(3.25, ("a",), np.ones(1), np.zeros(1))
+
+
+def failing(error):
+    """An estimator that cannot take a measurement."""
+
+    def process(_):
+        raise error
+
+    return SimpleNamespace(process=process)
 
 
 def estimate(covariance=None, pose=(1.0, 2.0, 0.3), status="localized"):
@@ -30,10 +42,11 @@ def estimate(covariance=None, pose=(1.0, 2.0, 0.3), status="localized"):
         (RunFailedError("the graph cannot be solved"), "the graph cannot be solved"),
     ],
 )
-def test_a_failure_is_one_line_with_estimator_time_and_measurement(error, reason):
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_failure_is_one_line_with_estimator_time_and_measurement(error, reason, quiet):
     guard = Guard("ekf on hall")
-    with pytest.raises(RunFailedError) as told, guard.taking(SEEN):
-        raise error
+    with pytest.raises(RunFailedError) as told, guard.quiet() if quiet else nullcontext():
+        guard.process(failing(error), SEEN)
     assert str(told.value) == f"ekf on hall: bearing_range at 3.250 s: {reason}"
     assert told.value.__cause__ is error
     with pytest.raises(RunFailedError) as told, guard.telling("the estimate at 4.000 s"):
@@ -41,17 +54,30 @@ def test_a_failure_is_one_line_with_estimator_time_and_measurement(error, reason
     assert str(told.value) == f"ekf on hall: the estimate at 4.000 s (after bearing_range at 3.250 s): {reason}"
 
 
-def test_faults_of_the_program_and_of_the_input_pass():
+@pytest.mark.parametrize("quiet", [True, False])
+def test_faults_of_the_program_and_of_the_input_pass(quiet):
     guard = Guard("ekf")
     for error in (KeyError("a"), TypeError("b"), AttributeError("c"), InputError("d"), KeyboardInterrupt()):
-        with pytest.raises(type(error)), guard.taking(VelocityOdometry(1.0, 0.0, 0.0)):
-            raise error
+        with pytest.raises(type(error)), guard.quiet() if quiet else nullcontext():
+            guard.process(failing(error), VelocityOdometry(1.0, 0.0, 0.0))
 
 
 def test_warnings_are_silent_inside_and_as_before_outside():
-    before = np.geterr()
-    with Guard("ekf").taking(Tick(1.0)):
+    before, guard = np.geterr(), Guard("ekf")
+
+    def overflow(_=None):
         assert not np.isfinite(np.array(1e300) * np.array(1e300))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        guard.process(SimpleNamespace(process=overflow), Tick(1.0))
+        with guard.quiet():
+            guard.process(SimpleNamespace(process=overflow), Tick(1.0))
+            with guard.telling("the estimate"):
+                overflow()
+            overflow()
+        with guard.telling("the estimate"):
+            overflow()
     assert np.geterr() == before
 
 
