@@ -113,6 +113,11 @@ def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
+def way(trajectory: Trajectory) -> Array:
+    """The places (N, 2) of a trajectory as one line, broken in each pause by a row of NaN."""
+    return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
+
+
 def legend(figure: Figure, axes: Iterable[Axes]) -> None:
     """One legend below the axes, of all that is drawn in any of them."""
     entries: dict[str, Any] = {}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, lay_out, legend, styles, with_pauses
+from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, lay_out, legend, styles, way, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.log import Log
 from factorgraph_loc.tag_map import tag_map
@@ -28,11 +28,12 @@ def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
     for (name, track), style in zip(tracks.items(), styles(), strict=False):
         if track.causal is None:
             continue
-        axes["map"].plot(*track.causal.poses[:, :2].T, label=name, linewidth=1.3, zorder=3, **style)
+        axes["map"].plot(*way(track.causal).T, label=name, linewidth=1.3, zorder=3, **style)
         assert track.causal.covariances is not None, "what is estimated has a covariance"
-        sigmas = np.sqrt(np.diagonal(track.causal.covariances, axis1=1, axis2=2))
+        deviations = np.sqrt(np.diagonal(track.causal.covariances, axis1=1, axis2=2))
+        t, sigmas = with_pauses(track.causal.t, deviations)
         for row, (what, _) in enumerate(DEVIATIONS):
-            axes[what].plot(track.causal.t, sigmas[:, row], linewidth=1.2, **style)
+            axes[what].plot(t, sigmas[:, row], linewidth=1.2, **style)
     for what, unit in DEVIATIONS:
         axes[what].set_ylabel(f"std of {what} [{unit}]")
         axes[what].set_ylim(bottom=0.0)
@@ -56,7 +57,7 @@ def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
         label = f"{name} (final)" if track.causal is None else name
         if not len(trajectory):
             continue
-        axes["map"].plot(*trajectory.poses[:, :2].T, label=label, linewidth=1.3, zorder=3, **style)
+        axes["map"].plot(*way(trajectory).T, label=label, linewidth=1.3, zorder=3, **style)
         if log.reference is not None:
             e = errors(trajectory, log.reference, track.max_gap)
             t, error = with_pauses(e.t, np.maximum(e.position, 1e-4))
@@ -76,7 +77,7 @@ def _map(axis: Axes, log: Log) -> None:
     if len(tags):
         axis.plot(*tags[:, :2].T, "s", color=COLOURS[-1], markersize=5, markerfacecolor="none", label="tags", zorder=2)
     if log.reference is not None:
-        axis.plot(*log.reference.poses[:, :2].T, color="0.75", linewidth=4.0, label="reference", zorder=1)
+        axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")

@@ -18,6 +18,7 @@ from factorgraph_loc.evaluation.figures import (
     mark_events,
     save,
     styles,
+    way,
     with_pauses,
 )
 from factorgraph_loc.evaluation.metrics import Errors, errors
@@ -106,8 +107,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         if log.reference is not None:
-            _, line = with_pauses(log.reference.t, log.reference.poses)
-            axis.plot(line[:, 0], line[:, 1], color="0.75", linewidth=4.0, label="reference", zorder=1)
+            axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
         if len(walls):
             axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
         if len(tags):
@@ -117,7 +117,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
         for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
             kind, trajectory = track.kinds()[i]
             if trajectory is not None:
-                axis.plot(*trajectory.poses[:, :2].T, label=estimator, linewidth=1.2, zorder=3, **style)
+                axis.plot(*way(trajectory).T, label=estimator, linewidth=1.2, zorder=3, **style)
                 axis.plot(*trajectory.poses[0, :2], "o", color=style["color"], markersize=5, zorder=4)
             axis.set_title(f"{kind} (dot: start)")
         axis.set_aspect("equal", adjustable="box")
@@ -213,8 +213,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
     t = trajectory.t
     axis.axhline(0.0, color="0.5", linewidth=0.8)
     if trajectory.covariances is not None:
-        sigma = np.sqrt(trajectory.covariances[:, row, row])
-        axis.fill_between(t, -2.0 * sigma, 2.0 * sigma, color=COLOURS[5], alpha=0.45, linewidth=0.0, label="2 sigma")
+        at, sigma = with_pauses(t, np.sqrt(trajectory.covariances[:, row, row]))
+        axis.fill_between(at, -2.0 * sigma, 2.0 * sigma, color=COLOURS[5], alpha=0.45, linewidth=0.0, label="2 sigma")
     axis.plot(
         *with_pauses(e.t, e.difference[:, row]), color=COLOURS[0], linewidth=1.0, label="error (gaps: no reference)"
     )

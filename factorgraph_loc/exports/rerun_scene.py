@@ -175,9 +175,11 @@ def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour
 
 
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """The way up to each time: its pieces, of which the view shows those of the past."""
+    """The way up to each time: its pieces, of which the view shows those of the past; none across a gap."""
     positions = trajectory.poses[:, :2]
-    _lines_over_time(recording, at, trajectory.t[1:], np.stack((positions[:-1], positions[1:]), axis=1), colour)
+    near = np.diff(trajectory.t) <= scene.GAP
+    pieces = np.stack((positions[:-1], positions[1:]), axis=1)
+    _lines_over_time(recording, at, trajectory.t[1:][near], pieces[near], colour)
 
 
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:

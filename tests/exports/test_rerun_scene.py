@@ -14,6 +14,7 @@ from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.points import PointMap
+from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.trajectory3 import Trajectory3
 from factors import reprojection
 
@@ -86,6 +87,16 @@ def test_robots_go_their_ways(log, results, recording):
         assert len(recording(f"/world/{run.name}/ellipse", "strips")) == len(run.causal)
         ((_, (path,)),) = recording(f"/world/{run.name}/final", "strips")
         assert np.allclose(np.array(path)[:, :2], run.final.poses[:, :2], atol=1e-6)
+
+
+def test_no_trail_leads_across_a_gap(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(rerun_scene, "_lines_over_time", lambda _, at, t, lines, __: drawn.append((at, t, lines)))
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (5.0, 5.0, 0.0), (6.0, 5.0, 0.0)])
+    rerun_scene._trail(None, "/way", Trajectory(np.array((0.0, 0.1, 100.0, 100.1)), poses), (0, 0, 0))
+    ((at, t, lines),) = drawn
+    assert (at, t.tolist()) == ("/way", [0.1, 100.1])
+    assert lines.tolist() == [[[0.0, 0.0], [1.0, 0.0]], [[5.0, 5.0], [6.0, 5.0]]]
 
 
 def test_tags_are_lit_while_they_are_read(recording):

@@ -19,6 +19,9 @@ function nearest(t, at) {
   return Math.abs(t[low] - at) <= Math.abs(t[high] - at) ? low : high;
 }
 
+// time between two of so many poses above which no line joins them [s]
+const longest = (duration, count) => Math.max(5, (6 * duration) / Math.max(1, count));
+
 // errors at so few poses say nothing
 const isScored = (track) => track.e.filter((e) => e !== null).length >= 10;
 
@@ -113,8 +116,8 @@ class Tracks {
       const { t, x, y } = run[this.kind];
       const g = svg("g", { class: colour(run.v), "stroke-width": thickness(k, runs.length) }, this.plan);
       const inside = t.map((at) => !this.window || (at >= this.window[0] && at <= this.window[1]));
-      if (this.window) svg("path", { d: this.line(x, y), class: "line away" }, g);
-      svg("path", { d: this.line(x.map((v, i) => (inside[i] ? v : null)), y), class: "line" }, g);
+      if (this.window) svg("path", { d: this.line(t, x, y), class: "line away" }, g);
+      svg("path", { d: this.line(t, x.map((v, i) => (inside[i] ? v : null)), y), class: "line" }, g);
     });
     this.cursors = svg("g", {}, this.root);
     this.scaleBar = svg("g", { class: "axes" }, this.root);
@@ -142,10 +145,13 @@ class Tracks {
     ];
   }
 
-  line(x, y) {
+  // broken where there are no poses for long
+  line(t, x, y) {
+    const pause = longest(t[t.length - 1] - t[0], t.length);
     let text = "", pen = "M";
     for (let i = 0; i < x.length; i++) {
       if (x[i] === null) { pen = "M"; continue; }
+      if (i && t[i] - t[i - 1] > pause) pen = "M";
       text += pen + x[i].toFixed(3) + " " + (-y[i]).toFixed(3);
       pen = "L";
     }
@@ -293,7 +299,7 @@ class Tracks {
     const band = [[x(track.t[known[0]]), y(0)], ...known.map((i) => [x(track.t[i]), y(track.s[i])]), [x(track.t[known[known.length - 1]]), y(0)]];
     if (known.length) svg("path", { d: path(band) + "Z", class: "sigma" }, data);
     const scored = inside.filter((i) => track.e[i] !== null);
-    const pause = Math.max(5, (6 * (to - from)) / Math.max(1, scored.length));
+    const pause = longest(to - from, scored.length);
     const line = scored.flatMap((i, k) => [...(k && track.t[i] - track.t[scored[k - 1]] > pause ? [[null, null]] : []), [x(track.t[i]), y(track.e[i])]]);
     svg("path", { d: path(line), class: "line thin" }, data);
     svg("text", { x: box.left, y: 13, class: "label " + colour(run.v) }, root, `${this.names[run.v]}: position error [m], seed ${run.seed}`);
