@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
+from typing import Never
 
 import gtsam
 
 from factorgraph_loc.estimators.summary import Summary
-from factorgraph_loc.estimators.variables import Node, Values
 from factors.se2 import Array
 
 FIRST_WAIT = 1.0  # s until the next try, twice as long each time
@@ -26,29 +26,16 @@ class Stalled:
         self._known = known
         self._left = left
 
-    def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        raise RuntimeError("the last try failed")
+    def _fail(self, *_: object, **__: object) -> Never:
+        raise RuntimeError("there is no solver: the last try failed")
 
-    def begin(
-        self,
-        factors: Iterable[gtsam.NonlinearFactor],
-        nodes: Sequence[Node],
-        values: Values,
-        stamps: Mapping[int, float],
-    ) -> None:
-        raise RuntimeError("the last try failed")
+    update = begin = covariance = linear = _fail
 
     def value(self, key: int) -> Array:
         return self._known(key)
 
-    def covariance(self, key: int) -> Array:
-        raise RuntimeError("there is no solver")
-
     def estimates(self) -> gtsam.Values:
         return gtsam.Values()
-
-    def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
-        raise RuntimeError("there is no solver")
 
     @property
     def oldest(self) -> int:
