@@ -27,7 +27,12 @@ def plaza():
 def office():
     """Reads with strength and phase; some tags are first read in the second half, others never."""
     world = {"tags": 12, "landmarks": 20}
-    log = simulate_office(preset("office", {"drive": {"duration": 14.0}, "phase": {}, "rssi": {}, "world": world}), 3)
+    changes = {"drive": {"duration": 14.0}, "phase": {}, "rssi": {}, "world": world}
+    return with_signals(simulate_office(preset("office", changes), 3))
+
+
+def with_signals(log):
+    """The log of a rig that knows how strength and phase were simulated."""
     strength = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3)
     phase = PhaseSettings(tempering=0.5, max_range=4.0)
     rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})

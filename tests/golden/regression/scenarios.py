@@ -14,7 +14,6 @@ from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.log import Log
 from factorgraph_loc.planning.closed_loop import run_active
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.readers import describe
 from factorgraph_loc.simulation import preset
 from regression import logs
 from regression.records import Record, record_active, record_log, record_run
@@ -26,6 +25,7 @@ RUNS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "ekf_iterated": ("ekf", {"iterations": 3}),
     "particle_filter": ("particle_filter", {"particles": 300}),
     "particle_filter_kld": ("particle_filter", {"particles": 600, "kld": True, "min_particles": 100}),
+    "particle_filter_many": ("particle_filter", {}),
     "smoother": ("smoother", {}),
     "smoother_lag": ("smoother", {"lag": 3.0}),
     "batch": ("batch", {}),
@@ -110,7 +110,8 @@ def _tags(**faults: Any) -> Callable[[], Log]:
     return partial(logs.tags, faults)
 
 
-def _recorded(name: str, start: float, seconds: float, labels: tuple[str, ...], **more: Any) -> Scenario:
+def recorded(name: str, start: float, seconds: float, labels: tuple[str, ...], **more: Any) -> Scenario:
+    """Estimators on a part of a recorded log."""
     return Scenario(partial(logs.recorded, name, start, seconds), labels, data=name, **more)
 
 
@@ -204,29 +205,16 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
             "all_tags_read_everywhere",
         )
     },
-    "recorded-mrclam": _recorded("mrclam6-robot3", 40.0, 8.0, ON_FLOOR),
-    "recorded-mrclam-unknown-start": _recorded("mrclam6-robot3", 40.0, 8.0, FINDERS, prior="unknown"),
-    "recorded-mrclam-slam": _recorded("mrclam6-robot3", 40.0, 8.0, MAPPERS, settings=UNKNOWN),
-    "recorded-woods": _recorded("woods-r5", 70.0, 8.0, ON_FLOOR),
+    "recorded-mrclam": recorded("mrclam6-robot3", 40.0, 8.0, ON_FLOOR),
+    "recorded-mrclam-unknown-start": recorded("mrclam6-robot3", 40.0, 8.0, FINDERS, prior="unknown"),
+    "recorded-mrclam-slam": recorded("mrclam6-robot3", 40.0, 8.0, MAPPERS, settings=UNKNOWN),
+    "recorded-woods": recorded("woods-r5", 70.0, 8.0, ON_FLOOR),
     "recorded-tags": Scenario(
         logs.aisle, (*GRAPHS, "particle_filter"), (*TAGS, "rssi", "phase"), data="rfid-aisle-run13"
     ),
-    "recorded-space": _recorded("starry_night", 5.0, 6.0, IN_SPACE),
+    "recorded-space": recorded("starry_night", 5.0, 6.0, IN_SPACE),
     "active-tags": ActiveScenario("office", "information", ("active_mcl", "smoother")),
     "active-landmarks": ActiveScenario(
         "office", "nearest_tags", ("active_mcl", "smoother"), {"world": {"tags": 10, "landmarks": 20}}
     ),
 }
-
-
-def long_scenarios() -> dict[str, Scenario]:
-    """A minute of each recorded log that is here, by every estimator with its default settings."""
-    found = {}
-    for known in describe():
-        if known.present and known.name not in WITHOUT_MOTION:
-            labels = IN_SPACE if known.name == "starry_night" else (*ON_FLOOR, LAG)
-            found[f"long-{known.name}"] = _recorded(known.name, 0.0, 60.0, labels)
-    return found
-
-
-WITHOUT_MOTION = ("sevenscenes",)  # images alone, of a camera in a hand
