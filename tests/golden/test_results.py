@@ -85,6 +85,24 @@ def test_sizes_of_differences(name, old, new, size):
     assert size_of(name, np.array(old), np.array(new)) == pytest.approx(size, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("quantity", "off", "held"),
+    [
+        ("final.poses", 0.5, True),
+        ("final.poses", 1.5, False),
+        ("causal.poses", 1e-7, True),
+        ("causal.poses", 1e-5, False),
+    ],
+)
+def test_where_a_case_branches_only_what_depends_on_it_is_held_less_closely(quantity, off, held):
+    """Poses of a drawn trajectory by their standard deviation, here 0.2."""
+    kind = quantity.partition(".")[0]
+    numbers = {quantity: np.zeros((2, 3)), f"{kind}.covariances": np.tile(0.04 * np.eye(3)[np.triu_indices(3)], (2, 1))}
+    old, new = (Record({}, {**numbers, quantity: np.full((2, 3), x)}) for x in (0.0, off * (0.2 if off > 0.1 else 1.0)))
+    assert (beyond_processors("points/particle_filter", old, new) == []) == held
+    assert beyond_processors("points/smoother", old, new) or off < TOLERANCE
+
+
 def test_two_commits_are_held_against_each_other(tmp_path, monkeypatch):
     name = "landmarks-bearings"
     write(tmp_path, [name], extra={})
