@@ -1,7 +1,10 @@
 """Every estimator on every sensor gives the results that are stored; ``scripts/golden renew`` stores them anew."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -142,3 +145,17 @@ def test_results_are_renewed_where_they_changed(tmp_path, monkeypatch):
     (line,) = commands.renew([])
     assert line.startswith(f"{name}/ekf: final.poses differs by 1.0e-03; causal.position_rmse 0.")
     assert commands.renew([]) == []
+
+
+def test_the_command(tmp_path):
+    script = Path(__file__).parents[2] / "scripts/golden"
+    told = [
+        subprocess.run(
+            [sys.executable, script, action, tmp_path, "--long", "--only", "landmarks-bearings"],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for action in ("write", "compare")
+    ]
+    assert told == ["", "nothing differs\n"]
