@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 import factorgraph_loc
+from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scoring import RULE
 from factorgraph_loc.experiments.log_source import LogSource
@@ -81,8 +82,8 @@ def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
 def read_cache(file: Path, kind: type[Kept]) -> Kept | None:
     """What was kept; None if it is not there or damaged, for it can be made again."""
     try:
-        return kind.model_validate_json(file.read_bytes())
-    except (OSError, ValidationError):
+        return kind.model_validate_json(bounded.read_bytes(file, bounded.DATA))
+    except (InputError, ValidationError):
         return None
 
 

@@ -1,11 +1,13 @@
 """Which runs an experiment has, and what their keys depend on."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
+from pydantic import BaseModel
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments import facts, globs, keys
@@ -281,3 +283,17 @@ def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run(
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
     outside = tuple(f"factorgraph_loc.{part.removesuffix('.py').replace('/', '.')}" for part in keys.OUTSIDE)
     assert [name for name in loaded if name.startswith(outside)] == []
+
+
+def test_a_cache_that_is_too_large_or_no_file_is_made_again(tmp_path):
+    class Kept(BaseModel):
+        one: int
+
+    file = tmp_path / "cache.json"
+    keys.write_cache(file, Kept(one=1))
+    assert keys.read_cache(file, Kept) == Kept(one=1)
+    os.truncate(file, 2**40)
+    assert keys.read_cache(file, Kept) is None
+    file.unlink()
+    os.mkfifo(file)
+    assert keys.read_cache(file, Kept) is None
