@@ -24,7 +24,7 @@ from factorgraph_loc.estimators.base import (
     PosePrior,
     finds_heading,
 )
-from factorgraph_loc.estimators.guarded import Guard, sound, sound_trajectory
+from factorgraph_loc.estimators.guarded import Guard, sound, sound_belief, sound_trajectory
 from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.live_start import prior_of, require_options, usable_sensors
 from factorgraph_loc.measurements import CameraFrame, Exteroceptive, IncrementOdometry, Odometry, Tick
@@ -165,13 +165,14 @@ class Localizer:
             return self._estimate(t)
 
     def belief(self) -> Belief:
-        """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them."""
+        """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them. RunFailedError
+        as there."""
         with self._lock:
             self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
                 return Belief(())
             with self._guard.telling(f"the belief at {self._newest:.3f} s"):
-                return copy.deepcopy(self._estimator.belief(self._newest))
+                return copy.deepcopy(sound_belief(self._estimator.belief(self._newest)))
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the past, with what came later: ten times a second from the start to before the newest stamp, of the

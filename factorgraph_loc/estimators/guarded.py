@@ -18,7 +18,7 @@ from typing import Self
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.base import Estimator, PoseEstimate
+from factorgraph_loc.estimators.base import Belief, Estimator, PoseEstimate
 from factorgraph_loc.measurements import Measurement, Tick
 from factorgraph_loc.pushed import sensor_of
 from factorgraph_loc.text import plain
@@ -116,6 +116,17 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
         return estimate
     covariance = _positive(estimate.covariance)
     return estimate if covariance is estimate.covariance else replace(estimate, covariance=covariance)
+
+
+def sound_belief(belief: Belief) -> Belief:
+    """The same of each mode of a belief, and of its particles."""
+    for values in (belief.particles, belief.weights):
+        if values is not None and not np.all(np.isfinite(values)):
+            raise ValueError("the particles are not finite")
+    if not all(np.all(np.isfinite(mode.pose)) for mode in belief.modes):
+        raise ValueError("the pose is not finite")
+    modes = tuple(replace(mode, covariance=_positive(mode.covariance)) for mode in belief.modes)
+    return replace(belief, modes=modes)
 
 
 def sound_trajectory(trajectory: Trajectory) -> Trajectory:

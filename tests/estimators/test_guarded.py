@@ -3,14 +3,15 @@
 import math
 import warnings
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.estimators.base import PoseEstimate
-from factorgraph_loc.estimators.guarded import Guard, nearest_positive, sound, sound_trajectory
+from factorgraph_loc.estimators.base import Belief, Mode, PoseEstimate
+from factorgraph_loc.estimators.guarded import Guard, nearest_positive, sound, sound_belief, sound_trajectory
 from factorgraph_loc.measurements import BearingRange, Tick, VelocityOdometry
 from factorgraph_loc.trajectory import Trajectory
 
@@ -137,3 +138,16 @@ def test_a_trajectory_names_the_time_of_the_pose_that_cannot_be():
     with pytest.raises(RunFailedError, match=r"the pose at 2\.000 s is not finite"), guard.telling("final"):
         sound_trajectory(Trajectory(t, poses))
     assert len(sound_trajectory(Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))) == 0
+
+
+def test_a_belief_is_held_to_what_an_estimate_is():
+    good = Mode(0.5, np.zeros(3), np.eye(3))
+    belief = Belief((good, good), np.zeros((2, 3)), np.full(2, 0.5))
+    told = sound_belief(belief)
+    assert np.array_equal(told.modes[1].covariance, np.eye(3))
+    assert told.particles is belief.particles
+    for bad in (replace(good, covariance=np.full((3, 3), np.nan)), replace(good, pose=np.array((0.0, np.inf, 0.0)))):
+        with pytest.raises(ValueError, match="is not finite"):
+            sound_belief(replace(belief, modes=(good, bad)))
+    with pytest.raises(ValueError, match="the particles are not finite"):
+        sound_belief(replace(belief, particles=np.full((2, 3), np.nan)))
