@@ -74,7 +74,11 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
                 if message.topic not in channels:
                     channels[message.topic] = writer.register_channel(message.topic, "json", schemas[message.schema])
                 ns = zero_ns + round(message.t * 1e9)
-                data = json.dumps(_stamped(message.content, ns), separators=(",", ":"), allow_nan=False).encode()
+                try:
+                    data = json.dumps(_stamped(message.content, ns), separators=(",", ":"), allow_nan=False).encode()
+                except ValueError as error:
+                    where = f"{message.topic} at {message.t:.3f} s"
+                    raise InputError(f"{path}: {where} has a value that is not finite") from error
                 writer.add_message(channels[message.topic], log_time=ns, publish_time=ns, data=data)
             writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:

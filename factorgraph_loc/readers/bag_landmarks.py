@@ -119,7 +119,7 @@ class PixelsOfPoints:
 
     def __init__(self, bag: Bag, options: PixelTopic) -> None:
         topic = bag.topic(options.topic)
-        self._corners = options.fields is None
+        self._corners = not options.fields
         if self._corners and topic.type != CORNERS:
             raise InputError(
                 f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {CORNERS}"
@@ -129,7 +129,7 @@ class PixelsOfPoints:
             if lacking := [path for path in CORNER_FIELDS if path not in known]:
                 raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {listed(lacking)}")
         fields: dict[Any, str] = dict(options.fields or {})
-        if fields and set(fields) != {"landmark", "u", "v"}:
+        if not self._corners and set(fields) != {"landmark", "u", "v"}:
             raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected landmark, u and v")
         self._fields = Fields(bag, topic, fields)
         self._rows = Rows(f"{bag.path} {topic.name}", 2)

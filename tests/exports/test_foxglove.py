@@ -125,3 +125,12 @@ def test_without_the_library_or_the_folder(log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[foxglove\]'"):
         write_mcap(log, [], tmp_path / "log.mcap")
+
+
+def test_what_the_format_cannot_hold_is_told_of_and_nothing_is_left(log, runs, tmp_path):
+    poses = runs[0].causal.poses.copy()
+    poses[3, 0] = np.nan
+    broken = replace(runs[0], causal=replace(runs[0].causal, poses=poses))
+    with pytest.raises(InputError, match=r"at \d+\.\d+ s has a value that is not finite"):
+        write_mcap(log, [broken], tmp_path / "log.mcap")
+    assert not list(tmp_path.iterdir())

@@ -293,6 +293,13 @@ def test_landmarks_of_a_type_that_is_not_known(maker, refuse_drive, refused):
     refused(maker.path, "fields are landmark, expected landmark with x, y and z", reader="rosbag", options=options)
 
 
+@pytest.mark.parametrize("fields", [None, {}])
+def test_pixels_of_a_type_that_is_not_known(maker, refuse_drive, fields):
+    maker.reads("/rfid", T0, [("E2AA", 1, -60.0, 0.0, T0)])
+    why = "/rfid is of type shop_msgs/msg/Reads: give its fields; known without: apriltag_msgs"
+    refuse_drive(maker, why, sightings={"topic": "/rfid"} | ({} if fields is None else {"fields": fields}))
+
+
 def test_corners_of_tags(maker, read_drive):
     maker.store.register(get_types_from_msg(TAGS, "apriltag_msgs/msg/AprilTagDetectionArray"))
     corners = [maker.make("apriltag_msgs/msg/Point", x=10.0 + i, y=20.0 + i) for i in range(4)]
