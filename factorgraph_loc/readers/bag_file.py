@@ -64,6 +64,9 @@ class Bag:
         self._stores: dict[str, Typestore] = {}
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
+            # SQLite has bytes and numbers in columns of text, too
+            if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+                raise InputError(f"{path}: the name or the type of a topic is no text")
             self._connections.setdefault(connection.topic, []).append(connection)
         self.topics = {
             name: Topic(name, connections[0].msgtype, sum(c.msgcount for c in connections))

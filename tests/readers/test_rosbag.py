@@ -2,6 +2,8 @@
 
 import sqlite3
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -364,3 +366,9 @@ def test_definitions_in_idl(tmp_path, bag_maker, read):
     rfid = {"topic": "/ping", "fields": {"epc": "epc", "rssi": "power"}, "antenna": "front"}
     reads = read(tmp_path / "drive", rfid=rfid).streams["rfid"]
     assert (reads.epc, reads.rssi.tolist(), reads.t.tolist()) == (["E2CC"], [-55.0], [0.1])
+
+
+def test_a_topic_whose_name_is_no_text():
+    connection = SimpleNamespace(topic=b"/odom", msgtype="nav_msgs/msg/Odometry", msgcount=1)
+    with pytest.raises(InputError, match=r"^log\.db3: the name or the type of a topic is no text$"):
+        bag_file.Bag(Path("log.db3"), SimpleNamespace(connections=[connection]))
