@@ -26,48 +26,37 @@ if TYPE_CHECKING:
         simulate,
     )
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
-    from factorgraph_loc.estimators.base import PoseEstimate
     from factorgraph_loc.evaluation.inference import contrast
     from factorgraph_loc.experiments.index import load_results
-    from factorgraph_loc.grids import read_grid, write_grid
-    from factorgraph_loc.localizer import Localizer
-    from factorgraph_loc.log import (
-        BearingRangeStream,
-        FeatureStream,
-        ImageStream,
-        IncrementStream,
-        Log,
-        RfidStream,
-        RightSightingStream,
-        SightingStream,
-        StartPose,
-        TwistStream,
-        VelocityStream,
-        YawRateStream,
-    )
-    from factorgraph_loc.measurements import (
-        BearingRange,
-        CameraFrame,
-        Exteroceptive,
-        IncrementOdometry,
-        Measurement,
-        Odometry,
-        PixelSightings,
-        RfidScan,
-        Tick,
-        Twist,
-        VelocityOdometry,
-        YawRate,
-    )
-    from factorgraph_loc.points import PointMap
-    from factorgraph_loc.pushed import RfidRead
-    from factorgraph_loc.readers.load import load, read_log
-    from factorgraph_loc.readers.native import write_native
-    from factorgraph_loc.readers.write import write_log
-    from factorgraph_loc.rig import Rig, read_rig, write_rig
-    from factorgraph_loc.trajectory import Trajectory, read_tum, write_tum
-    from factorgraph_loc.trajectory3 import Trajectory3
-    from factorgraph_loc.world import Landmark, Tag, World, read_world, write_world
+    from factorgraph_loc.io.native.native import write_native
+    from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+    from factorgraph_loc.io.native.world_file import read_world, write_world
+    from factorgraph_loc.io.readers.load import load, read_log
+    from factorgraph_loc.io.write import write_log
+    from factorgraph_loc.live.localizer import Localizer
+    from factorgraph_loc.live.pushed import RfidRead
+    from factorgraph_loc.maps.points import PointMap
+    from factorgraph_loc.model.belief import PoseEstimate
+    from factorgraph_loc.model.log import Log, StartPose
+    from factorgraph_loc.model.measurement import Exteroceptive, Measurement, Odometry, Tick
+    from factorgraph_loc.model.rig import Rig
+    from factorgraph_loc.model.trajectory import Trajectory, read_tum, write_tum
+    from factorgraph_loc.model.trajectory3 import Trajectory3
+    from factorgraph_loc.model.world import World
+    from factorgraph_loc.sensors.camera.measurement import PixelSightings
+    from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, RightSightingStream, SightingStream
+    from factorgraph_loc.sensors.landmarks.map import Landmark
+    from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+    from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+    from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+    from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+    from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
+    from factorgraph_loc.sensors.rfid.map import Tag
+    from factorgraph_loc.sensors.rfid.measurement import RfidScan
+    from factorgraph_loc.sensors.rfid.stream import RfidStream
+    from factorgraph_loc.sensors.twist.measurement import Twist
+    from factorgraph_loc.sensors.twist.stream import TwistStream
+    from factorgraph_loc.vision.frame import CameraFrame
 
 __version__ = "0.1.0"
 __all__ = [
@@ -139,48 +128,37 @@ __all__ = [
 # names by their module, below this package; all others are in `api`. To read a table, nothing that estimates is needed.
 _MODULES = {
     "errors": ("FglocError", "InputError", "RunFailedError"),
-    "estimators.base": ("PoseEstimate",),
     "evaluation.inference": ("contrast",),
     "experiments.index": ("load_results",),
-    "grids": ("read_grid", "write_grid"),
-    "localizer": ("Localizer",),
-    "log": (
-        "BearingRangeStream",
-        "FeatureStream",
-        "ImageStream",
-        "IncrementStream",
-        "Log",
-        "RfidStream",
-        "RightSightingStream",
-        "SightingStream",
-        "StartPose",
-        "TwistStream",
-        "VelocityStream",
-        "YawRateStream",
-    ),
-    "measurements": (
-        "BearingRange",
-        "CameraFrame",
-        "Exteroceptive",
-        "IncrementOdometry",
-        "Measurement",
-        "Odometry",
-        "PixelSightings",
-        "RfidScan",
-        "Tick",
-        "Twist",
-        "VelocityOdometry",
-        "YawRate",
-    ),
-    "points": ("PointMap",),
-    "pushed": ("RfidRead",),
-    "readers.load": ("load", "read_log"),
-    "readers.native": ("write_native",),
-    "readers.write": ("write_log",),
-    "rig": ("Rig", "read_rig", "write_rig"),
-    "trajectory": ("Trajectory", "read_tum", "write_tum"),
-    "trajectory3": ("Trajectory3",),
-    "world": ("Landmark", "Tag", "World", "read_world", "write_world"),
+    "io.native.native": ("write_native",),
+    "io.native.rig_file": ("read_rig", "write_rig"),
+    "io.native.world_file": ("read_world", "write_world"),
+    "io.readers.load": ("load", "read_log"),
+    "io.write": ("write_log",),
+    "live.localizer": ("Localizer",),
+    "live.pushed": ("RfidRead",),
+    "maps.points": ("PointMap",),
+    "model.belief": ("PoseEstimate",),
+    "model.log": ("Log", "StartPose"),
+    "model.measurement": ("Exteroceptive", "Measurement", "Odometry", "Tick"),
+    "model.rig": ("Rig",),
+    "model.trajectory": ("Trajectory", "read_tum", "write_tum"),
+    "model.trajectory3": ("Trajectory3",),
+    "model.world": ("World",),
+    "sensors.camera.measurement": ("PixelSightings",),
+    "sensors.camera.stream": ("FeatureStream", "ImageStream", "RightSightingStream", "SightingStream"),
+    "sensors.landmarks.map": ("Landmark",),
+    "sensors.landmarks.measurement": ("BearingRange",),
+    "sensors.landmarks.stream": ("BearingRangeStream",),
+    "sensors.odometry.measurement": ("IncrementOdometry", "VelocityOdometry", "YawRate"),
+    "sensors.odometry.stream": ("IncrementStream", "VelocityStream", "YawRateStream"),
+    "sensors.rfid.grids": ("read_grid", "write_grid"),
+    "sensors.rfid.map": ("Tag",),
+    "sensors.rfid.measurement": ("RfidScan",),
+    "sensors.rfid.stream": ("RfidStream",),
+    "sensors.twist.measurement": ("Twist",),
+    "sensors.twist.stream": ("TwistStream",),
+    "vision.frame": ("CameraFrame",),
 }
 _ELSEWHERE = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 

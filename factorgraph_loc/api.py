@@ -17,11 +17,11 @@ from typing import Any, Literal
 from factorgraph_loc.calibration import calibrate as calibration
 from factorgraph_loc.calibration import report as rig_report
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation import features as feature_scores
+from factorgraph_loc.evaluation.features import scores as feature_scores
+from factorgraph_loc.evaluation.features.feature_evaluation import feature
+from factorgraph_loc.evaluation.features.sequences import find_sequences
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.result import RunResult
-from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.experiments import run as running
@@ -29,19 +29,19 @@ from factorgraph_loc.experiments.cluster import on_cluster
 from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
 from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.files import replacing
-from factorgraph_loc.log import Log
-from factorgraph_loc.readers import Dataset, describe, load, read_log, write_log, write_native
-from factorgraph_loc.readers.native import require_new
-from factorgraph_loc.rig import write_rig
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.temporary import of_system, temporary_folder
+from factorgraph_loc.io.native.native import require_new
+from factorgraph_loc.io.native.rig_file import write_rig
+from factorgraph_loc.io.readers import Dataset, describe, load, read_log, write_log, write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
 from factorgraph_loc.simulation import simulate as make_log
-from factorgraph_loc.simulation.recorded import RecordedLooks
-from factorgraph_loc.temporary import of_system, temporary_folder
 from factorgraph_loc.text import listed
-from factorgraph_loc.ticks import TICK_GAP
-from factorgraph_loc.vision.feature_evaluation import feature
-from factorgraph_loc.vision.sequences import find_sequences
 
 __all__ = [
     "Run",

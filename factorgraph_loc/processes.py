@@ -23,7 +23,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.experiments.threads import use_one_thread
+from factorgraph_loc.threads import use_one_thread
 
 BEAT = 0.3  # s between two calls of what wants to be called while jobs are made
 READY = "ready"

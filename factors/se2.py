@@ -12,6 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+Integers = NDArray[np.int64]
+
+
 Array = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-4

@@ -7,14 +7,14 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from factorgraph_loc.columns import TABLES, Table
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.files import bounds
+from factorgraph_loc.files.columns import TABLES, Table
+from factorgraph_loc.files.models import bounds
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.io.readers.manifests import StartSettings
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.readers.manifests import StartSettings
-from factorgraph_loc.rig import Rig
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.world import World
 
 FILES: dict[str, type[BaseModel]] = {
     "`NAME.rig.toml`": Rig,

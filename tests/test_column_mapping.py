@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
-from factorgraph_loc.columns import POSES, TAGS
-from factorgraph_loc.csv_cells import Cells
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
+from factorgraph_loc.files.columns import POSES, TAGS
+from factorgraph_loc.files.csv_cells import Cells
 
 STAMPS = st.integers(-(2**61), 2**61)
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.columns import BEARING_RANGE, MEASURED_RANGE, TABLES, VELOCITIES
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import BEARING_RANGE, MEASURED_RANGE, TABLES, VELOCITIES
 
 COLUMNS = [pytest.param(column, id=f"{table.name}.{column.name}") for table in TABLES for column in table.columns]
 

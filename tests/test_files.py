@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc import bounded, files
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import inside, parse_json, parse_model, read_json, read_text, read_toml
-from factorgraph_loc.world import World
+from factorgraph_loc.files import bounded
+from factorgraph_loc.files import models as files
+from factorgraph_loc.files.models import inside, parse_json, parse_model, read_json, read_text, read_toml
+from factorgraph_loc.model.world import World
 
 
 def refused(call, *words: str) -> str:

@@ -20,11 +20,12 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.estimators.ekf import Ekf
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import IncrementStream, cut
+from factorgraph_loc.fusion.ekf import Ekf
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factors import se2
 
 SENSORS = ("odometry", "rfid", "bearing_range")
@@ -153,7 +154,7 @@ def test_many_threads_push_while_others_pull(log):
 )
 def test_memory_does_not_grow_with_the_drive(log, monkeypatch, name, sensors, settings):
     """Twenty-four rounds of a circle, 20 s each: as much is kept after the last one as after the eighth."""
-    monkeypatch.setattr("factorgraph_loc.localizer.ROWS_KEPT", 50)
+    monkeypatch.setattr("factorgraph_loc.live.localizer.ROWS_KEPT", 50)
     localizer = fgloc.Localizer(log.rig, log.world, name, sensors=sensors, settings=settings, history=10.0)
     pose, landmarks = np.array((2.0, 2.0, 0.0)), tuple(log.world.landmarks)[:3]
     places = np.array([log.world.position(landmark) for landmark in landmarks])

@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import (
-    BearingRangeStream,
-    IncrementStream,
-    Log,
-    RfidStream,
-    StartPose,
-    VelocityStream,
-    YawRateStream,
-    cut,
-    join,
-)
-from factorgraph_loc.measurements import BearingRange, IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.readers import load, write_native
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World, read_world
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.model.log import Log, StartPose, cut, join
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 
 def column(*values):

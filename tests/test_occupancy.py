@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.occupancy import read_walls
-from factorgraph_loc.world import read_world
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.maps.occupancy import read_walls
 
 YAML = """\
 image: hall.pgm

@@ -5,9 +5,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from factorgraph_loc import parquet_pages
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.parquet_files import parse_parquet, text_column
+from factorgraph_loc.files import parquet_pages
+from factorgraph_loc.files.parquet import parse_parquet, text_column
 
 
 def table(rows: int = 2000) -> pl.DataFrame:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.points import PointMap, read_points, write_points
+from factorgraph_loc.maps.points import PointMap, read_points, write_points
 
 
 def a_map(count, views, feature="sift", seed=0):

@@ -25,8 +25,8 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.live_start import prior_of
-from factorgraph_loc.pushed import COLUMNS, checked, scan_of
+from factorgraph_loc.live.pushed import COLUMNS, checked, scan_of
+from factorgraph_loc.live.start import prior_of
 
 ONE = np.ones(1)
 SOUND = [

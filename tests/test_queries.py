@@ -9,15 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.experiments.prior import resolve_prior
-from factorgraph_loc.log import Log, SightingStream, VelocityStream
-from factorgraph_loc.measurements import BearingRange
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
-from factors import reprojection
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import SightingStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors.camera import model as reprojection
 
 ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")
 BOTH, SEEN = ("odometry", "rfid", "bearing_range"), ("odometry", "sightings")

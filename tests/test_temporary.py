@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc import temporary
-from factorgraph_loc.files import replacing, write_text
-from factorgraph_loc.temporary import locked, remove_own, sweep, temporary_file, temporary_folder
+from factorgraph_loc.files import temporary
+from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.temporary import locked, remove_own, sweep, temporary_file, temporary_folder
 
 HOLDER = """
 import os, sys, time
 from pathlib import Path
 
-from factorgraph_loc.files import replacing
-from factorgraph_loc.temporary import temporary_folder
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.temporary import temporary_folder
 
 folder = Path(sys.argv[1])
 with replacing(folder / "map.world.toml") as one, temporary_folder(folder / "log") as two:
@@ -97,7 +97,7 @@ LOCKER = """
 import sys
 from pathlib import Path
 
-from factorgraph_loc.temporary import locked
+from factorgraph_loc.files.temporary import locked
 
 count = Path(sys.argv[1]) / "count"
 for _ in range(50):

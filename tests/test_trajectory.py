@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.trajectory import Trajectory, nanoseconds, read_tum, write_tum
+from factorgraph_loc.model.trajectory import Trajectory, nanoseconds, read_tum, write_tum
 
 
 def quarter_circle():

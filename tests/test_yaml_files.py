@@ -5,7 +5,7 @@ import time
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.yaml_files import DEEPEST, read_yaml
+from factorgraph_loc.files.yaml import DEEPEST, read_yaml
 
 
 @pytest.fixture

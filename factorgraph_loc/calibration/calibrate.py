@@ -11,8 +11,6 @@ from factorgraph_loc.calibration.consistency import Consistency, Evaluate, infla
 from factorgraph_loc.calibration.held_out import folds_of, recordings
 from factorgraph_loc.calibration.judging import Judgement
 from factorgraph_loc.calibration.learn import EXTEROCEPTIVE, Knowledge, has_heading, learn, sensing
-from factorgraph_loc.calibration.rfid_learn import RfidKnowledge
-from factorgraph_loc.calibration.rfid_tempering import tempered
 from factorgraph_loc.calibration.selection import (
     MODEL,
     PLACES,
@@ -26,9 +24,14 @@ from factorgraph_loc.calibration.selection import (
     dependents_of,
 )
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, RfidStream, VelocityStream
-from factorgraph_loc.rfid_settings import default_models
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
+from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
+from factorgraph_loc.sensors.rfid.settings import default_models
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 Scores = Mapping[str, Any]
 STEPS = 6  # that are told of progress

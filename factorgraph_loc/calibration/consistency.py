@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
 
 Evaluate = Callable[[Log], Mapping[str, Any]]
 """Runs an estimator on a log, with the log's rig, and gives the scores of :func:`factorgraph_loc.evaluation.metrics.score`."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.calibration.robust import Constant, Fit, is_worth
+from factorgraph_loc.fitting.robust import Constant, Fit, is_worth
 from factors.se2 import Array
 
 # the constants that an estimator can learn on each run, with the most that the rig takes

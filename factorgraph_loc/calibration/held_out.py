@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.calibration.rfid_rounds import distinct
-from factorgraph_loc.calibration.windows import odometry_of
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import Log, cut
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.log import Log, cut
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.calibration.windows import odometry_of
+from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
 
 QUARTERS = 4  # that a log has
 WARM_UP = 2.0  # s of odometry before a stretch: commands act late

@@ -6,17 +6,20 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from factorgraph_loc.calibration import odometry, sightings
 from factorgraph_loc.calibration.constants import UNCERTAIN, Learnt, describe
-from factorgraph_loc.calibration.noise import NoiseFit, fit_noise
-from factorgraph_loc.calibration.rfid_choice import Kind
-from factorgraph_loc.calibration.rfid_learn import RfidKnowledge, learn_rfid
-from factorgraph_loc.calibration.robust import Constant, Fit, folds, gains, is_worth
-from factorgraph_loc.calibration.sightings import Correlation, Sightings
-from factorgraph_loc.calibration.windows import Windows, cut
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import BearingRangeSettings, GrowthSettings, OdometryNoise, Rig
+from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains, is_worth
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.landmarks import calibration as sightings
+from factorgraph_loc.sensors.landmarks.calibration import Correlation, Sightings
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.odometry.calibration import constants as odometry
+from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
+from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
+from factorgraph_loc.sensors.rfid.calibration.choice import Kind
+from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
 from factors.se2 import Array
 
 MIN_WINDOWS = 20
@@ -55,7 +58,7 @@ class Knowledge:
 @dataclass(frozen=True)
 class WheelsFit:
     """All constants of the odometry fitted together, from ``start`` and with ``sigmas`` (3,) of the residuals; ``gain`` (P, K): see
-    :func:`~factorgraph_loc.calibration.robust.gains`; ``denied``: names of those that windows at rest deny."""
+    :func:`~factorgraph_loc.fitting.robust.gains`; ``denied``: names of those that windows at rest deny."""
 
     everything: Fit
     gain: Array
@@ -85,8 +88,8 @@ def learn(
 ) -> Knowledge:
     """The rig that ``logs`` tell, starting from ``rig``, whose values stay where a log cannot tell them better.
 
-    ``grids`` and ``rfid_kind``: see :func:`~factorgraph_loc.calibration.rfid_learn.learn_rfid`; for logs with reads of tags.
-    ``by_log``: see :func:`settled`. Raises InputError if a log is too short.
+    ``grids`` and ``rfid_kind``: see :func:`~factorgraph_loc.sensors.rfid.calibration.learn.learn_rfid`; for logs with reads of
+    tags. ``by_log``: see :func:`settled`. Raises InputError if a log is too short.
     """
     logs = [replace(log, rig=rig) for log in logs]
     windows: tuple[Windows, ...] = ()

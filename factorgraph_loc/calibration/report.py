@@ -8,10 +8,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from factorgraph_loc.calibration import figures, rfid_figures, rfid_report
+from factorgraph_loc.calibration import figures
 from factorgraph_loc.calibration.calibrate import Calibration, Scores
 from factorgraph_loc.calibration.constants import Learnt
 from factorgraph_loc.calibration.selection import MODEL, NOISE, SCATTER
+from factorgraph_loc.sensors.rfid.calibration import figures as rfid_figures
+from factorgraph_loc.sensors.rfid.calibration import report as rfid_report
 from factors.se2 import Array
 
 UNITS = {

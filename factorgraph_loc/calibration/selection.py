@@ -25,12 +25,12 @@ from factorgraph_loc.calibration.learn import (
     learn,
     settled,
 )
-from factorgraph_loc.calibration.rfid_choice import Kind
-from factorgraph_loc.calibration.rfid_learn import learn_rfid
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.log import Log
-from factorgraph_loc.rfid_settings import RfidSettings
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.calibration.choice import Kind
+from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 
 TOGETHER = (("x", "y"), ("delay", "lag"))  # constants that are judged together where both are learnt
 SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")

@@ -85,7 +85,7 @@ def active(
 
 def _settings(world: str, changes: dict[str, Any]) -> tuple[SimulationSettings, ActiveSettings]:
     """The world and the run: no key is of both."""
-    from factorgraph_loc.files import nearest, parse_model
+    from factorgraph_loc.files.models import nearest, parse_model
     from factorgraph_loc.planning.settings import ActiveSettings
     from factorgraph_loc.simulation import SimulationSettings
 

@@ -29,8 +29,8 @@ from factorgraph_loc.cli import (
 from factorgraph_loc.cli.stopping import end
 from factorgraph_loc.cli.streams import OutputError, standard_streams
 from factorgraph_loc.errors import FglocError, unusable
-from factorgraph_loc.experiments.threads import use_one_thread
 from factorgraph_loc.text import MESSAGE, plain
+from factorgraph_loc.threads import use_one_thread
 
 DEBUG = "--debug"
 COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}

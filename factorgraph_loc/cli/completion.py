@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from factorgraph_loc.shipped import manifests
+from factorgraph_loc.files.shipped import manifests
 
 # said again here, as the modules that know them load much; a test compares
 ESTIMATORS = (

@@ -15,8 +15,8 @@ from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import StoredRun
-    from factorgraph_loc.log import Log
-    from factorgraph_loc.trajectory import Trajectory
+    from factorgraph_loc.model.log import Log
+    from factorgraph_loc.model.trajectory import Trajectory
 
 FORMATS = (".mcap", ".tum", ".kitti", ".g2o")
 
@@ -60,7 +60,7 @@ def export(
         in_space = log.reference3 if not runs and log.reference is None else None
         files.append(write_kitti(in_space or _trajectory(log, runs, out), out))
     else:
-        from factorgraph_loc.trajectory import write_tum
+        from factorgraph_loc.model.trajectory import write_tum
 
         write_tum(_trajectory(log, runs, out), out, log.t0_ns)
     if json:

@@ -32,9 +32,9 @@ def evaluate(
 ) -> None:
     """Compare features on images of flat scenes: repeatability, matching, the homography found, time."""
     from factorgraph_loc.errors import InputError
-    from factorgraph_loc.evaluation import features as evaluation
-    from factorgraph_loc.vision.feature_evaluation import feature
-    from factorgraph_loc.vision.sequences import find_sequences
+    from factorgraph_loc.evaluation.features import scores as evaluation
+    from factorgraph_loc.evaluation.features.feature_evaluation import feature
+    from factorgraph_loc.evaluation.features.sequences import find_sequences
 
     names = list(dict.fromkeys(parse_list(features)))
     if not names:

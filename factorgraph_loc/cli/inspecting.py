@@ -24,9 +24,9 @@ from factorgraph_loc.cli.options import (
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
-    from factorgraph_loc.evaluation.inspect_camera import ImageSummary, PixelSummary
-    from factorgraph_loc.evaluation.inspect_rfid import RfidSummary
-    from factorgraph_loc.log import Log
+    from factorgraph_loc.model.log import Log
+    from factorgraph_loc.sensors.camera.summary import ImageSummary, PixelSummary
+    from factorgraph_loc.sensors.rfid.summary import RfidSummary
 
 
 class Format(StrEnum):
@@ -38,7 +38,7 @@ class Format(StrEnum):
 
 def datasets(data_root: DataRoot = None, json: Json = False) -> None:
     """List the logs that are known by name, and whether their files are there."""
-    from factorgraph_loc.readers import describe
+    from factorgraph_loc.io.readers import describe
 
     known = [asdict(dataset) for dataset in describe(data_root)]
     if json:
@@ -59,8 +59,9 @@ def info(
 ) -> None:
     """Show what a log holds, and what looks wrong with it; of a ROS bag, its topics."""
     from factorgraph_loc.evaluation.inspect import inspect
-    from factorgraph_loc.readers import manifests, read_manifest, verify
-    from factorgraph_loc.readers.bag_file import is_bag
+    from factorgraph_loc.files.shipped import manifests
+    from factorgraph_loc.io.bags.file import is_bag
+    from factorgraph_loc.io.readers import read_manifest, verify
 
     if reader is None and is_bag(Path(log)) and Path(log).exists():
         info_of_bag(Path(log), json)
@@ -95,7 +96,7 @@ def convert(
     json: Json = False,
 ) -> None:
     """Write a log in the native format, a folder of tables that any program can read, or as a ROS bag."""
-    from factorgraph_loc.readers import write_log
+    from factorgraph_loc.io.readers import write_log
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     for warning in loaded.warnings:

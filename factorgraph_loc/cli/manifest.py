@@ -16,8 +16,8 @@ BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .
 
 def manifest(bag: BagPath, json: Json = False) -> None:
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file, and look through it."""
-    from factorgraph_loc.readers.bag_file import open_bag
-    from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, remarks
+    from factorgraph_loc.io.bags.file import open_bag
+    from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose, remarks
 
     path, here = Path(os.path.realpath(bag)), Path.cwd().resolve()
     below = path.is_relative_to(here)
@@ -42,8 +42,8 @@ def manifest(bag: BagPath, json: Json = False) -> None:
 
 def info_of_bag(bag: Path, json: Json) -> None:
     """The topics of a bag."""
-    from factorgraph_loc.readers.bag_file import open_bag
-    from factorgraph_loc.readers.bag_manifest import propose
+    from factorgraph_loc.io.bags.file import open_bag
+    from factorgraph_loc.io.bags.manifest import propose
 
     with open_bag(bag) as opened:
         uses = propose(opened).uses

@@ -26,10 +26,10 @@ from factorgraph_loc.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from factorgraph_loc.calibration.mapping import LandmarkMap
-    from factorgraph_loc.calibration.point_mapping import PointReport
-    from factorgraph_loc.calibration.tag_mapping import MadeTags
     from factorgraph_loc.experiments.maps import DroppedTags
+    from factorgraph_loc.mapping.mapping import LandmarkMap
+    from factorgraph_loc.mapping.point_mapping import PointReport
+    from factorgraph_loc.mapping.tag_mapping import MadeTags
 
 MAPPERS = ("batch", "smoother", "ekf")  # as factorgraph_loc.experiments.maps has them
 HEADER = ("landmark", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
@@ -108,9 +108,9 @@ def map_(
 
 def _tell(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> tuple[str, ...]:
     """Print the table of what was found, where there is one, and return what there is to say of it."""
-    from factorgraph_loc.calibration.mapping import LandmarkMap
-    from factorgraph_loc.calibration.tag_mapping import MadeTags
     from factorgraph_loc.experiments.maps import DroppedTags
+    from factorgraph_loc.mapping.mapping import LandmarkMap
+    from factorgraph_loc.mapping.tag_mapping import MadeTags
 
     if isinstance(found, DroppedTags):
         return mapping_tags.tell_dropped(found)
@@ -141,8 +141,8 @@ def _rows(made: LandmarkMap) -> list[tuple[str, ...]]:
 
 
 def _document(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> dict[str, Any]:
-    from factorgraph_loc.calibration.mapping import LandmarkMap
-    from factorgraph_loc.calibration.tag_mapping import MadeTags
+    from factorgraph_loc.mapping.mapping import LandmarkMap
+    from factorgraph_loc.mapping.tag_mapping import MadeTags
 
     if isinstance(found, LandmarkMap):
         return _landmark_document(found)

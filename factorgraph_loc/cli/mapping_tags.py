@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from factorgraph_loc.cli import show
 
 if TYPE_CHECKING:
-    from factorgraph_loc.calibration.tag_mapping import MadeTags
     from factorgraph_loc.experiments.maps import DroppedTags
+    from factorgraph_loc.mapping.tag_mapping import MadeTags
 
 HEADER = ("tag", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 

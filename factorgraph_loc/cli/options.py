@@ -14,7 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import listed, plain, quoted
 
 if TYPE_CHECKING:
-    from factorgraph_loc.log import Log
+    from factorgraph_loc.model.log import Log
 
 LogName = Annotated[
     str,
@@ -94,7 +94,7 @@ class LogOptions:
 
     def load(self, names: Sequence[str]) -> list[Log]:
         """The logs of several names; a name may stand for several logs."""
-        from factorgraph_loc.readers import load
+        from factorgraph_loc.io.readers import load
 
         options = dict(key_and_value(text, "--reader-option") for text in self.reader_option or ())
         return [
@@ -120,7 +120,7 @@ def parse_list(text: str) -> tuple[str, ...]:
 
 def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str, dict[str, Any]]:
     """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run."""
-    from factorgraph_loc.estimators.registry import check_names
+    from factorgraph_loc.fusion.registry import check_names
 
     settings: dict[str, dict[str, Any]] = {name: {} for name in estimators}
     for text in texts:
@@ -142,7 +142,7 @@ def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str,
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
     """``a.b=3`` as ("a.b", 3)."""
-    from factorgraph_loc.files import DEEPEST, is_utf8
+    from factorgraph_loc.files.models import DEEPEST, is_utf8
 
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip() or not is_utf8(text):
@@ -154,7 +154,7 @@ def key_and_value(text: str, option: str) -> tuple[str, Any]:
 
 def _scalar(text: str) -> Any:
     """A value as TOML files of ours have it; a word that is none, such as a date, is itself."""
-    from factorgraph_loc.files import parse_toml
+    from factorgraph_loc.files.models import parse_toml
 
     try:
         table = parse_toml(f"value = {text}", "a value")

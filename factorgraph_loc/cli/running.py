@@ -31,12 +31,12 @@ from factorgraph_loc.cli.options import (
     parse_list,
     parse_settings,
 )
-from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.ticks import TICK_GAP
 
 if TYPE_CHECKING:
-    from factorgraph_loc.evaluation.result import RunResult
+    from factorgraph_loc.model.result import RunResult
 
 SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the rest is in the files
 
@@ -78,9 +78,9 @@ def run(
     json: Json = False,
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
-    from factorgraph_loc.estimators.registry import check_names
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.output import check_free, write_plots, write_run
+    from factorgraph_loc.fusion.registry import check_names
 
     check_names([estimator])
     check_free(out, overwrite=overwrite)  # now, not when all is computed
@@ -126,10 +126,10 @@ def compare(
     json: Json = False,
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
-    from factorgraph_loc.estimators.registry import check_names
     from factorgraph_loc.evaluation.tables import comparison_table, verdict
     from factorgraph_loc.experiments import compare as experiment
     from factorgraph_loc.experiments.run import RunConfig
+    from factorgraph_loc.fusion.registry import check_names
 
     names = parse_list(estimators)
     check_names(names)

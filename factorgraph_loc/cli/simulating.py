@@ -67,7 +67,7 @@ def simulate(
     """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc import api
-    from factorgraph_loc.files import file_name
+    from factorgraph_loc.files.models import file_name
     from factorgraph_loc.simulation import recorded_looks
 
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}

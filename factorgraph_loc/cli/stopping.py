@@ -28,7 +28,7 @@ class Stop(KeyboardInterrupt):
 def end(stop: KeyboardInterrupt) -> int:
     """Remove what is temporary and say in one line on stderr what ended the command, with the notes of the exception; the exit code
     that is due, 128 and the number of the signal."""
-    from factorgraph_loc.temporary import remove_own
+    from factorgraph_loc.files.temporary import remove_own
 
     remove_own()
     number = stop.number if isinstance(stop, Stop) else signal.SIGINT

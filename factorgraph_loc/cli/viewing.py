@@ -11,13 +11,13 @@ import typer
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.shipped import manifests
+from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.text import listed
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.particles import Particles
     from factorgraph_loc.exports.runs import StoredRun
-    from factorgraph_loc.log import Log
+    from factorgraph_loc.model.log import Log
 
 SAME = 1e-6  # m between the positions of a run and of the same run made again
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, lay_out, legend, styles
 from factorgraph_loc.evaluation.active import Row, cases, metres, policies, runs_of
-from factorgraph_loc.evaluation.figures import COLOURS, dress, empty, grid, lay_out, legend, styles
-from factorgraph_loc.world import World
+from factorgraph_loc.model.world import World
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.evaluation.pairing import pairs
-from factorgraph_loc.evaluation.scoring import MAX_GAP
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.trajectory import Trajectory
 from factors import positive, se2
 from factors.se2 import Array
 

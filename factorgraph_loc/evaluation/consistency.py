@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, legend, mark_events, with_pauses
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
+from factorgraph_loc.evaluation.figures import Track, mark_events, with_pauses
 from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.estimators.base import PosePrior
+from factorgraph_loc.model.belief import PosePrior
 from factors import se2
-from factors.odometry import Increment
+from factors.motion import Increment
 from factors.se2 import Array
 
 CELL = 0.05  # m

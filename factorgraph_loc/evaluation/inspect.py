@@ -14,17 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from factorgraph_loc.evaluation.inspect_camera import (
+from factorgraph_loc.evaluation.inspect_motion import motion_problems
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.summary import (
     ImageSummary,
     PixelSummary,
     camera_problems,
     summarize_images,
     summarize_pixels,
 )
-from factorgraph_loc.evaluation.inspect_motion import motion_problems
-from factorgraph_loc.evaluation.inspect_rfid import RfidSummary, rfid_problems, summarize_rfid
-from factorgraph_loc.log import BearingRangeStream, Log
-from factorgraph_loc.world import World
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.rfid.summary import RfidSummary, rfid_problems, summarize_rfid
 from factors import se2
 from factors.se2 import Array
 

@@ -10,10 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, VelocityStream, YawRateStream
-from factorgraph_loc.ticks import TICK_GAP
-from factors import bearing_range, se2
-from factors.odometry_chain import OdometryChain
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factors import se2
+from factors.landmarks import model as bearing_range
+from factors.odometry.chain import OdometryChain
 from factors.se2 import Array
 
 STEP = 0.05  # s between times and between shifts that are compared
@@ -71,7 +74,8 @@ def motion_problems(log: Log) -> list[str]:
 
 
 def _longest(t: Array) -> tuple[float, float]:
-    """Begin and end of the longest time without a gap of more than :data:`~factorgraph_loc.ticks.TICK_GAP` between stamps (N,)."""
+    """Begin and end of the longest time without a gap of more than :data:`~factorgraph_loc.model.ticks.TICK_GAP` between stamps
+    (N,)."""
     parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
     longest = max(parts, key=lambda part: float(part[-1] - part[0]))
     return float(longest[0]), float(longest[-1])

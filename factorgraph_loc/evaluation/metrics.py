@@ -17,17 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from factorgraph_loc.estimators.base import Diagnostics, Learnt
 from factorgraph_loc.evaluation import alignment, space
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
-from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.evaluation.scoring import MAX_GAP, RULE
 from factorgraph_loc.evaluation.warned import WARNINGS
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Integers, Trajectory
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.scoring import MAX_GAP, RULE
+from factorgraph_loc.model.trajectory import Trajectory
 from factors import positive, se2
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 FEWEST_SCORED = 10  # poses: figures of fewer tell nothing of a run
 RPE_DISTANCE = 1.0  # m

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.evaluation.scoring import MAX_GAP
-from factorgraph_loc.trajectory import Integers, Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
-from factors.se2 import Array
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factors.se2 import Array, Integers
 
 RATE = 10.0  # Hz, of poses that are scored
 TOLERANCE = 1e-3  # s, of stamps

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.evaluation.figures import COLOURS, Track, dress, empty, lay_out, legend, styles, way, with_pauses
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, lay_out, legend, styles
+from factorgraph_loc.evaluation.figures import Track, way, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
-from factorgraph_loc.log import Log
-from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,11 +10,12 @@ from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import pairs_in_space
-from factorgraph_loc.evaluation.scoring import MAX_GAP
-from factorgraph_loc.log import Log, SightingStream
-from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.camera.stream import SightingStream
 from factors import positive
-from factors.reprojection import linearize_in_space, mounted
+from factors.camera.model import linearize_in_space, mounted
 from factors.se2 import Array
 
 DOF = 6

@@ -19,20 +19,20 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc import __version__
+from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.evaluation.active import DIFFERENCES, difference_cells, differences, summary_cells
 from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
-from factorgraph_loc.evaluation.figures import save
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files import file_name, nearest, replacing, write_text, write_toml
-from factorgraph_loc.parquet_files import read_parquet
+from factorgraph_loc.files.models import file_name, nearest, replacing, write_text, write_toml
+from factorgraph_loc.files.parquet import read_parquet
+from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.temporary import sweep
 from factorgraph_loc.text import quoted, told
 
 CHUNK = 10  # runs of one process: to start one takes longer than a run

@@ -15,24 +15,25 @@ from typing import Any
 import polars as pl
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.estimators import registry
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
-from factorgraph_loc.evaluation.scoring import check_max_gap
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
-from factorgraph_loc.experiments.output import FILES, remove_run, write_run
+from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
-from factorgraph_loc.files import file_name, nearest, replacing, write_text
-from factorgraph_loc.log import Log
+from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
+from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import check_max_gap
+from factorgraph_loc.model.ticks import check_tick_gap
 from factorgraph_loc.processes import run_each
-from factorgraph_loc.temporary import sweep
 from factorgraph_loc.text import quoted
-from factorgraph_loc.ticks import check_tick_gap
 
 _ERROR = "error.txt"
 _BEGUN = "unfinished.txt"  # is there until a comparison is done, with a digest of what was asked for

@@ -7,13 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics, Estimator, PoseEstimate
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.experiments.images import CAMERA, OF_CAMERA
-from factorgraph_loc.files import FileModel
-from factorgraph_loc.log import BearingRangeStream, Log, RfidStream
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.model.belief import PoseEstimate
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 MOSTLY = 0.9  # of the time with estimates
 SHOWN = 5  # names in a warning

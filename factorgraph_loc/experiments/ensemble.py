@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.estimators.base import Status
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.pairing import thinned
-from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.belief import Status
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 

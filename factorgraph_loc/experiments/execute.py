@@ -19,7 +19,7 @@ from factorgraph_loc.text import told
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.log_source import LogSource
-    from factorgraph_loc.log import Log
+    from factorgraph_loc.model.log import Log
 
 Kind = Literal["error", "timeout", "memory", "killed", "vanished"]
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

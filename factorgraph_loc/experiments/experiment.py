@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.execute import Outcome
@@ -18,6 +17,7 @@ from factorgraph_loc.experiments.experiment_file import Experiment, read_experim
 from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan
 from factorgraph_loc.experiments.pool import execute
 from factorgraph_loc.experiments.store import State, Store
+from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.text import plain
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.scoring import MAX_GAP
 from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
-from factorgraph_loc.files import DEEPEST, FileModel, check_content, nearest, parse_model, read_toml
+from factorgraph_loc.files.models import DEEPEST, FileModel, check_content, nearest, parse_model, read_toml
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.ticks import LONGEST, SHORTEST, TICK_GAP
 from factorgraph_loc.text import listed, plain, quoted
-from factorgraph_loc.ticks import LONGEST, SHORTEST, TICK_GAP
 
 SIMULATION = "simulation"  # the first word of settings of simulated logs
 METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")

@@ -92,7 +92,7 @@ def _facts(log: Any) -> LogFacts:
 
 
 def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-    from factorgraph_loc.estimators import registry  # noqa: PLC0415
+    from factorgraph_loc.fusion import registry  # noqa: PLC0415
 
     effective = registry.settings_of(name, settings).model_dump(mode="json")
     return EstimatorFacts(effective, bool(registry.estimator_type(name).deterministic))

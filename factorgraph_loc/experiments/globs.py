@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import DEEPEST
+from factorgraph_loc.files.models import DEEPEST
 from factorgraph_loc.text import quoted
 
 VISITED = 100_000  # files and folders that a pattern may make us look at

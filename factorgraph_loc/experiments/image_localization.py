@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.calibration.camera_poses import PosedFrames, posed_frames
-from factorgraph_loc.calibration.image_localization import ImageLocalizer, Located
-from factorgraph_loc.calibration.point_mapping import PointReport, PointSettings, map_points
-from factorgraph_loc.calibration.triangulation import Cameras
-from factorgraph_loc.camera_settings import FrontendSettings
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.figures import COLOURS, grid, legend, save
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files import replacing, write_text
-from factorgraph_loc.log import FeatureStream, Log
-from factorgraph_loc.temporary import sweep
-from factorgraph_loc.vision.frontend import with_features
+from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
+from factorgraph_loc.mapping.image_localization import ImageLocalizer, Located
+from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points
+from factorgraph_loc.mapping.triangulation import Cameras
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
 if TYPE_CHECKING:

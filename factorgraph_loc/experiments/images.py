@@ -8,13 +8,14 @@ from time import perf_counter
 
 import numpy as np
 
-from factorgraph_loc.camera_settings import FrontendSettings
 from factorgraph_loc.errors import FglocError
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.log import FeatureStream, ImageStream, Log
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.world import World
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.settings import FrontendSettings
 
 CAMERA = "camera"
 OF_CAMERA = (CAMERA, "sightings")  # sensors that mean nothing without a camera in the rig
@@ -59,7 +60,7 @@ def prepare(
         return Prepared(log)
     if not takes_pixels(estimator):
         return Prepared(_set_aside(log, stream), _said(log, stream, estimator))
-    from factorgraph_loc.vision.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
+    from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
 
     started = perf_counter()
     found, warnings = with_features(log, frontend_of(log), progress)
@@ -72,7 +73,7 @@ def fill_cache(log: Log) -> None:
     What is wrong with the log is for the runs to tell.
     """
     if isinstance(log.streams.get(CAMERA), ImageStream) and log.rig.camera is not None:
-        from factorgraph_loc.vision.frontend import with_features  # noqa: PLC0415
+        from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415
 
         try:
             with_features(log, frontend_of(log))

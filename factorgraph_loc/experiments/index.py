@@ -9,13 +9,13 @@ from typing import Any
 
 import polars as pl
 
-from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
-from factorgraph_loc.files import replacing
-from factorgraph_loc.parquet_files import read_parquet
+from factorgraph_loc.files.bounded import kind
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.parquet import read_parquet
 
 INDEX = "results.parquet"
 SWEEP = "sweep."

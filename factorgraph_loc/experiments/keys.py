@@ -16,11 +16,11 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 import factorgraph_loc
-from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.scoring import RULE
 from factorgraph_loc.experiments.log_source import LogSource
-from factorgraph_loc.files import write_text
+from factorgraph_loc.files import bounded
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.model.scoring import RULE
 from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
@@ -30,8 +30,11 @@ OUTSIDE = (
     "cli",
     "calibration",
     "exports",
-    "localizer.py",
+    "live",
+    "mapping",
     "planning",
+    "sensors/odometry/calibration",
+    "sensors/rfid/calibration",
     "evaluation/inference.py",
     "evaluation/report",
     "experiments/cluster.py",

@@ -12,16 +12,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from factorgraph_loc.bounded import kind
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.globs import is_pattern, matching
-from factorgraph_loc.files import inside, read_toml
-from factorgraph_loc.shipped import manifests
+from factorgraph_loc.files.bounded import kind
+from factorgraph_loc.files.models import inside, read_toml
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.files.yaml import read_yaml
 from factorgraph_loc.text import quoted
-from factorgraph_loc.yaml_files import read_yaml
 
 if TYPE_CHECKING:
-    from factorgraph_loc.log import Log
+    from factorgraph_loc.model.log import Log
 
 RUN_FILE = "run.toml"
 NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
@@ -29,7 +29,7 @@ NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files th
 
 @dataclass(frozen=True)
 class RecordedSource:
-    """The log at place ``number`` of those that ``log`` stands for, as :func:`~factorgraph_loc.readers.load` takes it.
+    """The log at place ``number`` of those that ``log`` stands for, as :func:`~factorgraph_loc.io.readers.load` takes it.
 
     ``options``: of the reader, as JSON. ``rig``, ``world``: files in place of the log's own. ``data_root``: where the files of
     manifests are, by default the environment's FGLOC_DATA.
@@ -45,7 +45,7 @@ class RecordedSource:
 
     def load_all(self) -> list[Log]:
         """All logs that ``log`` stands for; InputError as of the reader."""
-        from factorgraph_loc.readers import load  # noqa: PLC0415
+        from factorgraph_loc.io.readers import load  # noqa: PLC0415
 
         rig, world, root = (None if name is None else Path(name) for name in (self.rig, self.world, self.data_root))
         options = json.loads(self.options)
@@ -84,7 +84,7 @@ class RecordedSource:
         content = read_toml(path)
         if content.get("path") is None:  # the data come with a library, whose version is in the key
             return
-        from factorgraph_loc.readers.manifests import find_data_root  # noqa: PLC0415
+        from factorgraph_loc.io.readers.manifests import find_data_root  # noqa: PLC0415
 
         beside = inside(path.parent, str(content["path"]), path).exists()  # one's own manifest, beside its log
         given = None if self.data_root is None else Path(self.data_root)

@@ -11,23 +11,24 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from factorgraph_loc.calibration import map_figure, mapping, tag_mapping
-from factorgraph_loc.calibration.camera_poses import posed_frames
-from factorgraph_loc.calibration.mapping import LandmarkMap
-from factorgraph_loc.calibration.point_mapping import PointReport, map_points
-from factorgraph_loc.calibration.tag_mapping import MadeTags
+from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import PosePrior
-from factorgraph_loc.evaluation.figures import save
 from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.files import replacing
-from factorgraph_loc.log import Log, StartPose
-from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.io.native.world_file import write_world
+from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
+from factorgraph_loc.mapping.camera_poses import posed_frames
+from factorgraph_loc.mapping.mapping import LandmarkMap
+from factorgraph_loc.mapping.point_mapping import PointReport, map_points
+from factorgraph_loc.mapping.tag_mapping import MadeTags
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
-from factorgraph_loc.vision.frontend import with_features
-from factorgraph_loc.world import World, write_world
 from factors import se2
 
 if TYPE_CHECKING:

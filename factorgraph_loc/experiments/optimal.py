@@ -8,20 +8,22 @@ from functools import partial
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.tags import KnownTags
 from factorgraph_loc.evaluation.grid_filter import GridFilter
 from factorgraph_loc.experiments.prior import resolve_prior
-from factorgraph_loc.log import IncrementStream, Log
-from factorgraph_loc.measurements import Odometry, RfidScan
-from factorgraph_loc.readers.simulated_odometry import ALONG, HEADING, LATERAL, RATE
-from factorgraph_loc.rig import OdometryUncertainty
-from factorgraph_loc.tag_map import extent
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Odometry
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
+from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import se2
-from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.rfid.detection import Looks, RfidLikelihood
 from factors.se2 import Array
 
 SENSORS = ("odometry", "rfid")
@@ -29,7 +31,7 @@ SENSORS = ("odometry", "rfid")
 
 def without_constants(log: Log, seed: int) -> Log:
     """The log with new odometry from its reference, and a rig that knows of no constant errors: it has only the white noise of
-    :func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry`."""
+    :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one to make odometry from")
     end = float(log.reference.t[-1])

@@ -14,35 +14,18 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Learnt
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.evaluation.plots import plot_run, remove_plots
-from factorgraph_loc.evaluation.result import RunResult
-from factorgraph_loc.files import file_name, write_text, write_toml
-from factorgraph_loc.log import Log
-from factorgraph_loc.temporary import sweep, temporary_folder
+from factorgraph_loc.files.models import file_name, write_text, write_toml
+from factorgraph_loc.files.temporary import sweep, temporary_folder
+from factorgraph_loc.io.results.layout import COVARIANCES, FILES
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.text import quoted
-from factorgraph_loc.trajectory import Trajectory, write_tum
 from factors.se2 import Array
-
-FILES = (
-    "final.tum",
-    "causal.tum",
-    "estimates.parquet",
-    "learnt.json",
-    "events.csv",
-    "config.toml",
-    "metrics.json",
-)  # the last says that all are there
-COVARIANCES = {
-    "cov_xx": (0, 0),
-    "cov_xy": (0, 1),
-    "cov_xh": (0, 2),
-    "cov_yy": (1, 1),
-    "cov_yh": (1, 2),
-    "cov_hh": (2, 2),
-}
 
 
 def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from factorgraph_loc.experiments.experiment_file import Limits
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store
+from factorgraph_loc.files.temporary import of_system, sweep
 from factorgraph_loc.processes import Child, ProcessDiedError, start
-from factorgraph_loc.temporary import of_system, sweep
 
 LOOK = 0.1  # s between looks at memory and time
 AGAIN = 0.5  # s after which a run that another process had claimed is asked for again

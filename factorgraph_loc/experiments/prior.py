@@ -7,12 +7,12 @@ import math
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import PosePrior, SpacePose
-from factorgraph_loc.estimators.space_pose import planar_estimate
-from factorgraph_loc.files import FARTHEST
-from factorgraph_loc.log import Log
+from factorgraph_loc.files.models import FARTHEST
+from factorgraph_loc.model.belief import PosePrior, SpacePose
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.slam.space_pose import planar_estimate
 from factorgraph_loc.text import quoted
-from factorgraph_loc.trajectory3 import Trajectory3
 
 # of a start read from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m

@@ -17,18 +17,6 @@ import numpy as np
 
 from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import (
-    ConcludingEstimator,
-    Estimator,
-    PoseEstimate,
-    PosePrior,
-    SpaceEstimator,
-    finds_heading,
-)
-from factorgraph_loc.estimators.guarded import Guard, sound, sound_space, sound_trajectory
-from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.evaluation.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.experiments.doubts import (
     check_free_map,
     dead_tags,
@@ -41,13 +29,21 @@ from factorgraph_loc.experiments.doubts import (
 )
 from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
 from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
-from factorgraph_loc.files import nearest
-from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.measurements import Measurement, Odometry, Tick
-from factorgraph_loc.readers.bounds import require_bounds, require_one_span
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
+from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
+from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.belief import PoseEstimate, PosePrior
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Measurement, Odometry, Tick
+from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
+from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import listed, quoted
-from factorgraph_loc.ticks import TICK_GAP, Ticks, check_tick_gap
-from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
@@ -91,7 +87,7 @@ def run(
     ``watch`` is given the time and the estimator after each tick, to look at what it believes.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or tells a pose that is not
-    finite or a covariance that is not positive, with the time and the measurement; see :mod:`factorgraph_loc.estimators.guarded`.
+    finite or a covariance that is not positive, with the time and the measurement; see :mod:`factorgraph_loc.fusion.guarded`.
     """
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
@@ -101,7 +97,7 @@ def run(
     settings = registry.settings_of(config.estimator, config.settings)
     check_free_map(log, sensors, config.estimator, settings)
     prior, prior_source = resolve_prior(log, config.prior)
-    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
+    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
         estimator = registry.create(config.estimator, setup, settings)

@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgraph_loc.evaluation.ensembles import first_held
-from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.trials import BEFORE, HOLD, JUMP, is_right
-from factorgraph_loc.log import cut, join
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
 

@@ -18,11 +18,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factorgraph_loc import bounded
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, Manifest, parse_stored
-from factorgraph_loc.temporary import sweep
+from factorgraph_loc.files import bounded
+from factorgraph_loc.files.temporary import sweep
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track

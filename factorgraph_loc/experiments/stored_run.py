@@ -18,12 +18,13 @@ import polars as pl
 from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.result import RunResult
-from factorgraph_loc.experiments.output import COVARIANCES, FILES, write_files
+from factorgraph_loc.experiments.output import write_files
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
-from factorgraph_loc.log import Log
-from factorgraph_loc.temporary import of_system, temporary_folder
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.files.temporary import of_system, temporary_folder
+from factorgraph_loc.io.results.layout import COVARIANCES, FILES
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.trajectory import Trajectory
 
 
 def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:

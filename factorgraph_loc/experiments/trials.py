@@ -9,9 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, Log, cut, join
+from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors import se2
 from factors.se2 import Array
 

@@ -31,7 +31,6 @@ def _import() -> None:
     """Load what takes seconds, so that no run pays for it."""
     import cv2  # noqa: PLC0415
 
-    import factorgraph_loc.estimators.smoother  # noqa: PLC0415
     import factorgraph_loc.experiments.stored_run  # noqa: F401, PLC0415
 
     cv2.setNumThreads(1)

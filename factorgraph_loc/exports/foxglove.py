@@ -22,9 +22,9 @@ from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.foxglove_schemas import OTHERS, SCHEMAS
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, SEEN, Colour, colours
-from factorgraph_loc.files import replacing
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 WORLD = "world"

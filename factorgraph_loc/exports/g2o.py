@@ -16,15 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics, LearntPoint
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.files import write_text
-from factorgraph_loc.log import MOTION, BearingRangeStream, Log
-from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import MOTION, Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.motion import Motion
 from factorgraph_loc.text import listed
-from factorgraph_loc.trajectory import Trajectory
-from factors.bearing_range import located, sigmas
-from factors.odometry import Increment
+from factors.landmarks.model import located, sigmas
+from factors.motion import Increment
 from factors.se2 import Array
 
 LEAST = 1e-12  # m^2 or rad^2: the least variance of an edge, as no information is infinite

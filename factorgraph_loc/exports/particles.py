@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Estimator
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.experiments.run import run as run_log
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 OF_PARTICLES = ("particle_filter", "switching")

@@ -11,9 +11,9 @@ import numpy as np
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import LIT, SEEN
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
-from factors import reprojection
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factors.camera import model as reprojection
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -23,10 +23,10 @@ from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, has_pictures, record_camera, times
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
-from factorgraph_loc.files import replacing
-from factorgraph_loc.log import Log
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -11,17 +11,17 @@ import numpy as np
 import polars as pl
 from pydantic import Field
 
-from factorgraph_loc.bounded import DATA, foreign, read_bytes
-from factorgraph_loc.columns import LATEST
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
-from factorgraph_loc.experiments.output import FILES
 from factorgraph_loc.experiments.stored_run import trajectory_of
-from factorgraph_loc.files import FileModel, parse_model, read_json, read_toml
-from factorgraph_loc.log import Log
+from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
+from factorgraph_loc.files.columns import LATEST
+from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
+from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import told
-from factorgraph_loc.trajectory import Trajectory
 from factors.se2 import Array
 
 COMPLETE = FILES[-1]  # written last: where it is, the others are

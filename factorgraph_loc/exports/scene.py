@@ -11,12 +11,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from factorgraph_loc.bounded import IMAGE, read_bytes
-from factorgraph_loc.evaluation import figures
-from factorgraph_loc.log import BearingRangeStream, ImageStream, Log, RfidStream, SightingStream
-from factorgraph_loc.measurements import PixelSightings
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.drawing import figures as drawing_figures
+from factorgraph_loc.files.bounded import IMAGE, read_bytes
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.vision.images import decoded
 from factors.se2 import Array
 
@@ -41,7 +44,7 @@ class Lights:
 
 def colours() -> Iterator[Colour]:
     """The colour of the first, second, ... run, as in the plots."""
-    for colour in itertools.cycle(figures.COLOURS[:-1]):  # the last is black, as is the ground of viewers
+    for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):  # the last is black, as is the ground of viewers
         red, green, blue = bytes.fromhex(colour[1:])
         yield red, green, blue
 

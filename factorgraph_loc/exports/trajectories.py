@@ -1,4 +1,4 @@
-"""Trajectories as files of KITTI; those of TUM are written by :func:`~factorgraph_loc.trajectory.write_tum`.
+"""Trajectories as files of KITTI; those of TUM are written by :func:`~factorgraph_loc.model.trajectory.write_tum`.
 
 A row of KITTI is the upper three rows of a pose (4, 4), row by row: A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous
 driving? The KITTI vision benchmark suite", CVPR 2012. The stamps are in a file of their own, one a row.
@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import write_text
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 TIMES_SUFFIX = ".times.txt"

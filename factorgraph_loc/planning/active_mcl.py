@@ -25,19 +25,20 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
-from factorgraph_loc.estimators import kld
-from factorgraph_loc.estimators.base import Belief, PoseEstimate, PosePrior, Status
-from factorgraph_loc.estimators.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
-from factorgraph_loc.estimators.filtering import Filter, FilterSettings, at_ticks
-from factorgraph_loc.estimators.landmarks import KnownLandmarks
-from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.tags import KnownTags
-from factorgraph_loc.measurements import BearingRange, RfidScan
+from factorgraph_loc.fusion import kld
+from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
+from factorgraph_loc.maps.free_space import CELL, FreeSpace
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.proximity import ProximitySensor
-from factorgraph_loc.simulation.free_space import CELL, FreeSpace
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors import se2
-from factors.odometry import Increment
+from factors.motion import Increment
 from factors.se2 import Array
 
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factors.se2 import Array
 
 

@@ -11,12 +11,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Belief, Estimator, Mode, PoseEstimate
-from factorgraph_loc.estimators.cloud import systematic
-from factorgraph_loc.estimators.guarded import Guard, sound
-from factorgraph_loc.files import nearest
-from factorgraph_loc.measurements import Measurement, RfidScan, Tick
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.fusion.cloud import systematic
+from factorgraph_loc.fusion.guarded import Guard, sound
+from factorgraph_loc.maps.free_space import CELL, FreeSpace, distance_to_walls, free_space
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate
+from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
@@ -24,17 +28,17 @@ from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_po
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.readers.simulated_odometry import RATE
-from factorgraph_loc.simulation.free_space import CELL, FreeSpace, distance_to_walls, free_space
+from factorgraph_loc.sensors.odometry.simulation import RATE
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation.plans import Plan, make_plan
-from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
+from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.simulate import generators
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.tag_map import tag_map
 from factorgraph_loc.text import quoted
-from factorgraph_loc.world import World
 from factors import se2
-from factors.rfid_likelihood import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
@@ -80,7 +84,7 @@ def run_active(
     start = _start(make_plan(simulation.world, of_world()), world, space, settings, of_start)
     robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
     sensors = ("odometry", "rfid", *(("bearing_range",) if world.landmarks else ()))
-    setup = registry.Setup(simulation.rig, world, sensors, of_estimator)
+    setup = model_setup.Setup(simulation.rig, world, sensors, of_estimator)
     guard = Guard(f"{estimator} on {simulation.name}")
     with guard:
         made = _estimator(estimator, setup, settings)
@@ -113,7 +117,7 @@ class _Loop:
         guard: Guard,
         estimator: Estimator,
         policy: Policy,
-        setup: registry.Setup,
+        setup: model_setup.Setup,
         space: FreeSpace,
         simulation: SimulationSettings,
         settings: ActiveSettings,
@@ -259,7 +263,7 @@ class _Loop:
         return np.asarray(se2.compose(self._robot.pose, path.poses))
 
 
-def _estimator(name: str, setup: registry.Setup, settings: ActiveSettings) -> Estimator:
+def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) -> Estimator:
     if name == "active_mcl":
         space = free_space(setup.world, max(settings.clearance - SLACK, 0.0))
         return ActiveMcl(setup, ActiveMclSettings(particles=settings.particles), space)

@@ -12,16 +12,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from factorgraph_loc.estimators.motion import propagate
+from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.planning.information import FINEST, POSITION, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
 from factorgraph_loc.planning.sensors import SPEED, Sensors
-from factorgraph_loc.simulation.sightings import crosses, in_sight
-from factors import bearing_range, odometry, reprojection, se2
-from factors.bearing_range import BearingRangeModel
-from factors.odometry import ChainState
-from factors.reprojection import CameraModel
-from factors.rfid_likelihood import Looks
+from factorgraph_loc.sensors.landmarks.simulation import in_sight
+from factors import se2
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
+from factors.landmarks import model as bearing_range
+from factors.landmarks.model import BearingRangeModel
+from factors.motion import ChainState, propagate
+from factors.odometry import model as odometry
+from factors.rfid.detection import Looks
 from factors.se2 import Array
 
 

@@ -19,15 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.cloud import pose_moments, systematic
-from factorgraph_loc.planning import expected_scans, expected_sightings
-from factorgraph_loc.planning.expected_scans import Places, ScanTables
+from factorgraph_loc.fusion.cloud import pose_moments, systematic
+from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
-from factorgraph_loc.simulation.free_space import FreeSpace
+from factorgraph_loc.sensors.landmarks import forecast as expected_sightings
+from factorgraph_loc.sensors.rfid import forecast as expected_scans
+from factorgraph_loc.sensors.rfid.forecast import Places, ScanTables
 from factorgraph_loc.text import quoted
-from factors.odometry import OdometryModel
-from factors.rfid_likelihood import RfidLikelihood
+from factors.odometry.model import OdometryModel
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 Array32 = NDArray[np.float32]

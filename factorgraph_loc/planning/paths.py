@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.simulation.free_space import CELL, FreeSpace, chain, dense, straightened
+from factorgraph_loc.maps.free_space import CELL, FreeSpace, chain, dense, straightened
 from factors import se2
 from factors.se2 import Array
 

@@ -18,18 +18,18 @@ from typing import Protocol
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Mode
-from factorgraph_loc.estimators.cloud import pose_moments
-from factorgraph_loc.files import nearest
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.fusion.cloud import pose_moments
+from factorgraph_loc.maps.free_space import FreeSpace
+from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.fisher import fisher_gain
 from factorgraph_loc.planning.information import expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.simulation.free_space import FreeSpace
 from factorgraph_loc.text import quoted
 from factors import se2
-from factors.rfid_likelihood import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation

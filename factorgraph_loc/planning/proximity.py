@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
+from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.planning.paths import DIRECTIONS, free_steps, straight
-from factorgraph_loc.simulation.free_space import FreeSpace
 from factors.se2 import Array
 
 SIGMA = 0.3  # m

@@ -7,20 +7,22 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from factorgraph_loc.measurements import BearingRange, IncrementOdometry, RfidScan
+from factorgraph_loc.maps.free_space import FreeSpace
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.readers import simulated_odometry as wheels
-from factorgraph_loc.simulation.free_space import FreeSpace
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
+from factorgraph_loc.sensors.odometry import simulation as wheels
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.simulation.sightings import sighting_stream
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
 from factors import se2
-from factors.bearing_range import BearingRangeModel
-from factors.rfid_likelihood import RfidLikelihood
+from factors.landmarks.model import BearingRangeModel
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 Report = IncrementOdometry | RfidScan | BearingRange
@@ -31,7 +33,7 @@ BETWEEN = 5  # parts of the way from one pose of a path to the next
 class SimulatedRobot:
     """The robot at its true place; see the module.
 
-    Its wheels err as :func:`~factorgraph_loc.readers.simulated_odometry.wheel_odometry` says: what it is told is what they report,
+    Its wheels err as :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry` says: what it is told is what they report,
     and what it does is what differs. Steps, inventory rounds and looks draw from sequences of their own, so that
     robots of one seed have the same luck as long as they drive alike.
     """

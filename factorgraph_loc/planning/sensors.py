@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.settings import PixelSettings, SightingSettings
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.world import World
-from factors.bearing_range import BearingRangeModel
-from factors.odometry import OdometryModel
-from factors.reprojection import CameraModel
-from factors.rfid_likelihood import RfidLikelihood
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factors.camera.model import CameraModel
+from factors.landmarks.model import BearingRangeModel
+from factors.odometry.model import OdometryModel
+from factors.rfid.detection import RfidLikelihood
 
 ROUNDS_PER_METRE, ROUNDS_PER_RADIAN = 4.0, 2.0  # of a robot with 2 rounds a second at 0.5 m/s, or at 1 rad/s in place
 SPEED = 0.5  # m/s, at which the odometry's noise that grows with time is taken

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from factorgraph_loc.files import FileModel
+from factorgraph_loc.files.models import FileModel
 
 Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]

@@ -1,7 +1,7 @@
 """Logs that are made, not recorded: worlds, drives through them, and what sensors would have reported."""
 
+from factorgraph_loc.sensors.rfid.recorded import recorded_looks
 from factorgraph_loc.simulation.filming import Film, film, with_images
-from factorgraph_loc.simulation.recorded import recorded_looks
 from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, named_settings, preset, read_settings
 from factorgraph_loc.simulation.simulate import simulate
 

@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import ImageStream, Log
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.processes import run_each
+from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.simulation.plans import make_plan
 from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene
@@ -21,8 +23,8 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.simulate import generators, ticks, with_sensors
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.trajectory import Trajectory
-from factors import reprojection, se2
+from factors import se2
+from factors.camera import model as reprojection
 from factors.se2 import Array
 
 # a PNG is five times as large and takes ten times as long; colours at full resolution, as features look at them

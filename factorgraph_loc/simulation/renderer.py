@@ -13,8 +13,8 @@ from factorgraph_loc.simulation import raycasting
 from factorgraph_loc.simulation.raycasting import Surroundings
 from factorgraph_loc.simulation.scene import LEVELS, Scene
 from factorgraph_loc.simulation.settings import ImageSettings
-from factors import reprojection
-from factors.reprojection import CameraModel
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 Image = NDArray[np.uint8]
@@ -29,7 +29,7 @@ NORMAL = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 
 class Renderer:
     """A camera of a ``model`` in a ``scene``. Poses are of the camera in the world: ``position`` (3,) and ``rotation`` (3, 3), as
-    of :func:`factors.reprojection.camera_pose` for a robot on the floor."""
+    of :func:`factors.camera.model.camera_pose` for a robot on the floor."""
 
     def __init__(self, scene: Scene, model: CameraModel, settings: ImageSettings | None = None) -> None:
         self.scene, self.model, self.settings = scene, model, settings or ImageSettings()

@@ -6,18 +6,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import FileModel, inside, nearest, parse_model, read_toml
-from factorgraph_loc.rfid_settings import Weight
-from factorgraph_loc.rig import Rig, placed, read_rig
+from factorgraph_loc.files.models import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.io.native.rig_file import placed, read_rig
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.simulation_units import Hertz
+from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings, PhaseSettings, RssiSettings
 from factorgraph_loc.text import listed, quoted
 
-Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
-Seconds = Annotated[float, Field(ge=0.0, le=1e5, description="s")]
-Hertz = Annotated[float, Field(ge=1e-3, le=100.0, description="1/s")]
-Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 MOST_TAGS = 10_000
 MOST_LOOKS = 50_000_000  # of a kind of sensor at tags, landmarks or points: all are in memory at once
 Surface = Literal["wall", "shelf", "floor"]
@@ -67,43 +67,6 @@ class DriveSettings(FileModel):
     clearance: Annotated[float, Field(ge=0.25, le=2.0, description="m")] = 0.3
 
 
-class PhaseSettings(FileModel):
-    """The phase that comes with a read: ``frequency`` of the carrier, noise ``sigma``, and a share of reads that are off by pi
-    (``flips``), as with most readers."""
-
-    frequency: Annotated[float, Field(ge=3e8, le=6e9, description="Hz")] = 920.625e6
-    sigma: Annotated[float, Field(ge=0.0, le=3.0, description="rad")] = 0.1
-    flips: Share = 0.2
-
-
-class RssiSettings(FileModel):
-    """How strong a read is: ``coefficients`` of :data:`factors.rfid_rssi.FEATURES`, and Student's noise of scale ``sigma`` with
-    ``dof`` degrees of freedom."""
-
-    coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
-    sigma: Annotated[float, Field(ge=0.0, le=30.0, description="dB")] = 2.0
-    dof: Annotated[float, Field(ge=0.1, le=100.0)] = 4.0
-
-
-class SightingSettings(FileModel):
-    """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
-    axis, and not through walls."""
-
-    rate: Hertz = 2.0
-    max_range: Metres = 6.0
-    field_of_view: Annotated[float, Field(ge=0.01, le=6.3, description="rad")] = 6.3
-
-
-class PixelSettings(FileModel):
-    """Which named points the camera identifies: at ``rate`` looks per second at most ``max_points`` of those in sight, chosen at
-    random, that are at most ``max_depth`` ahead. A share ``wrong`` of them is reported anywhere in the image."""
-
-    rate: Hertz = 5.0
-    max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
-    max_depth: Metres = 10.0
-    wrong: Share = 0.0
-
-
 class ImageSettings(FileModel):
     """Images of the rendered building: ``rate`` of them, ``exposure`` time, noise of the variance ``read_noise``^2 + ``shot_noise``
     times the value of a pixel (0 to 255), brightness that wanders by the share ``gain_drift`` over some ten seconds, and the
@@ -115,52 +78,6 @@ class ImageSettings(FileModel):
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
-
-
-class Fading(FileModel):
-    """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
-
-    duration: Annotated[float, Field(ge=1e-3, le=1000.0, description="s")] = 2.0
-    share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-
-
-class AntennaStop(FileModel):
-    """From ``time`` on an antenna reads nothing. Its rounds end too, unless ``rounds_go_on``, as with a broken cable."""
-
-    model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
-
-    antenna: str
-    time: Seconds
-    rounds_go_on: bool = False
-
-
-class ClockJump(FileModel):
-    """From ``time`` on the stamps of the reader are ``jump`` seconds later than they should be."""
-
-    time: Seconds
-    jump: Annotated[float, Field(ge=-60.0, le=60.0, description="s")]
-
-
-class Silence(FileModel):
-    """For ``duration`` seconds no tag is read."""
-
-    time: Seconds
-    duration: Seconds
-
-
-class FaultSettings(FileModel):
-    """What goes wrong with RFID. ``false_reads``: share of the reads that are of a tag and in a round drawn at random, beside those
-    of the model's floor. ``dead``: share of tags that are never read. ``misplaced``: share of tags that are ``misplaced_by``
-    metres off in the map."""
-
-    fading: Fading = Fading()
-    false_reads: Share = 0.0
-    dead: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    misplaced: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    misplaced_by: Metres = 1.0
-    antenna_stop: AntennaStop | None = None
-    clock_jump: ClockJump | None = None
-    silence: Silence | None = None
 
 
 class SimulationSettings(FileModel):

@@ -9,21 +9,23 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc import __version__
-from factorgraph_loc.log import Log, StartPose, Stream
-from factorgraph_loc.readers.simulated_odometry import wheel_odometry
-from factorgraph_loc.rfid_settings import SurveySettings
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.pixels import pixel_stream
-from factorgraph_loc.simulation.recorded import RecordedLooks
-from factorgraph_loc.simulation.rfid import draw_dead, draw_reads, read_probabilities, rfid_stream
-from factorgraph_loc.simulation.settings import FaultSettings, SimulationSettings
-from factorgraph_loc.simulation.sightings import sighting_stream
-from factorgraph_loc.simulation.signals import phases, strengths
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.simulation import pixel_stream
+from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
+from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
+from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factorgraph_loc.sensors.rfid.simulated_signals import phases, strengths
+from factorgraph_loc.sensors.rfid.simulation import draw_dead, draw_reads, read_probabilities, rfid_stream
+from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
 from factors import se2
 from factors.se2 import Array
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.simulation.free_space import SPACING, dense, free_space, shortest_path
+from factorgraph_loc.maps.free_space import SPACING, dense, free_space, shortest_path
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factorgraph_loc.simulation.settings import DriveSettings
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
 from factors import se2
 from factors.se2 import Array
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.plans import LOWEST_BOX, Plan, make_plan
 from factorgraph_loc.simulation.settings import WorldSettings
-from factorgraph_loc.world import Landmark, Tag, World
 from factors.se2 import Array
 
 STANDOFF = 0.02  # m, of a tag or point from the surface that it is on

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision import association_kernels as kernels
 from factorgraph_loc.vision.consensus import CameraPose, agreeing
+from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import distance_matrix
 from factorgraph_loc.vision.relocalization import located
-from factors import reprojection
-from factors.reprojection import CameraModel
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8

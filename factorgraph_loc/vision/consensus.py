@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from factors import positive, reprojection, reprojection_kernels
-from factors.reprojection import CameraModel
-from factors.reprojection_kernels import Lens
+from factors import positive
+from factors.camera import kernels as reprojection_kernels
+from factors.camera import model as reprojection
+from factors.camera.kernels import Lens
+from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 Truths = NDArray[np.bool_]

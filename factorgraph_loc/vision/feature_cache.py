@@ -12,9 +12,9 @@ from pathlib import Path
 
 import platformdirs
 
-from factorgraph_loc.bounded import DATA, read_bytes
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import replacing
+from factorgraph_loc.files.bounded import DATA, read_bytes
+from factorgraph_loc.files.models import replacing
 
 VARIABLE = "FGLOC_CACHE"  # of the environment: another folder than the user's
 LIMIT = 4 * 10**9  # bytes

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import nearest
+from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.colour_features import ColourExtractor
 from factorgraph_loc.vision.images import as_image, as_mask, is_blank

@@ -1,6 +1,6 @@
 """A planar robot's motion between two images, from what was followed from one to the other.
 
-Least squares of Sampson's error over the turn and the direction of the way (:mod:`factors.visual_odometry`), with Huber's
+Least squares of Sampson's error over the turn and the direction of the way (:mod:`factors.camera.visual_odometry`), with Huber's
 loss, from a robust start: of the motions that two matches each allow, the one that most of the matches agree with (Fischler and
 Bolles, CACM 24(6), 1981; two matches are enough in a plane: Ortin and Montiel, Robotica 19, 2001). How far the robot went is not
 seen: that stays as it was predicted, and the information along it is zero.
@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
-from factors.odometry import Increment
-from factors.reprojection import CameraModel, huber_weight
+from factors.camera.model import CameraModel, huber_weight
+from factors.camera.visual_odometry import RayPairs, from_epipole, nearness, sampson, translation
+from factors.motion import Increment
 from factors.se2 import Array
-from factors.visual_odometry import RayPairs, from_epipole, nearness, sampson, translation
 
 MIN_MATCHES = 8
 MIN_SHARE = 0.3  # of the matches that agree, else none is trusted

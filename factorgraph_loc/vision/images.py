@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.bounded import IMAGE, foreign, read_bytes
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.image_files import NO_IMAGE, image_size
-from factorgraph_loc.quiet import quiet
+from factorgraph_loc.files.bounded import IMAGE, foreign, read_bytes
+from factorgraph_loc.files.images import NO_IMAGE, image_size
+from factorgraph_loc.files.quiet import quiet
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]
@@ -77,7 +77,7 @@ def read_image(path: Path) -> Image:
 
 def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
     """The pixels of an image's file as OpenCV gives them with ``flags``; InputError if it is none, or one of more than
-    :data:`~factorgraph_loc.bounded.PIXELS` pixels, before memory is taken for them. OpenCV itself would take 2^30."""
+    :data:`~factorgraph_loc.files.bounded.PIXELS` pixels, before memory is taken for them. OpenCV itself would take 2^30."""
     image_size(content, source)
     with foreign(source, NO_IMAGE), quiet():
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)

@@ -15,9 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
-from factors import positive, reprojection, se2
-from factors.reprojection import CameraModel, huber_weight
-from factors.reprojection_factor import ReprojectionFactor
+from factors import positive, se2
+from factors.camera import model as reprojection
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel, huber_weight
 from factors.se2 import Array
 
 REACH = 3.0  # standard deviations of a pixel that an agreeing point may be off

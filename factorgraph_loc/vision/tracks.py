@@ -18,7 +18,7 @@ import numpy as np
 from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import Truths, match
-from factors.reprojection import CameraModel, undistorted
+from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array
 
 RADIUS = 0.25  # of the longer side of an image: how far a feature may move

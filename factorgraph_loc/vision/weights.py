@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_loc.files import replacing
+from factorgraph_loc.files.models import replacing
 from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.descriptor import VALUES
 from factors.se2 import Array

@@ -9,16 +9,16 @@ import numpy as np
 from benchmarking.report import Options, Report
 
 from active_benchmark.runs import SETTINGS, WORLDS
-from factorgraph_loc.estimators.registry import Setup
+from factorgraph_loc.maps.free_space import FreeSpace, free_space
+from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.information import SCANS, expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.robot import SimulatedRobot
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.free_space import FreeSpace, free_space
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.tag_map import tag_map
-from factors.rfid_likelihood import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood
 
 SEEDS = 10  # beliefs of each world
 FIRST = 2000  # seeds that no other section uses

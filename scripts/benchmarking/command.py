@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarking.report import Options
-from factorgraph_loc.files import read_text, write_text
+from factorgraph_loc.files.models import read_text, write_text
 
 TABLES = "<!-- tables -->\n"
 

@@ -18,20 +18,21 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factorgraph_loc.calibration.camera_poses import posed_frames
-from factorgraph_loc.calibration.point_mapping import map_points
 from factorgraph_loc.experiments.prior import REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA
-from factorgraph_loc.files import replacing
-from factorgraph_loc.log import FeatureStream, ImageStream, Log
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap, read_points, write_points
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.mapping.camera_poses import posed_frames
+from factorgraph_loc.mapping.point_mapping import map_points
+from factorgraph_loc.maps.points import PointMap, read_points, write_points
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera.frontend import FEATURE_CODE, TRACK_CODE, code_version
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.simulation.filming import JPEG
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.trajectory import Trajectory
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.found import decode, encode
-from factorgraph_loc.vision.frontend import FEATURE_CODE, TRACK_CODE, code_version
+from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.tracks import follow
 
 TAGS = 20

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from factorgraph_loc.experiments.images import frontend_of
-from factorgraph_loc.log import FeatureStream, ImageStream, Log
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.simulation.filming import JPEG
-from factorgraph_loc.vision.frontend import with_features
 
 EACH = 5  # images that are missing, truncated, or of another size
 BLACK, BLACK_FROM = 100, 40.0  # images, s

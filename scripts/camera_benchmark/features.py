@@ -12,7 +12,7 @@ from camera_benchmark.drives import COUNT, Drive, keep_features, log_of, map_of,
 from camera_benchmark.office import BEST, CONFIGS, FIRST
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import ACCURACY, Attempt, accuracy_cells, attempts, failures, succeeded
-from factorgraph_loc.log import FeatureStream
+from factorgraph_loc.sensors.camera.stream import FeatureStream
 
 SEEDS = 4
 DURATION = 300.0  # s

@@ -16,7 +16,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.statistics import differences
 from factorgraph_loc.experiments.ensemble import RunErrors, Series, run_errors
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 
 ACCURACY = (
     "causal [m]",

@@ -6,7 +6,7 @@ from benchmarking.report import Report
 
 from camera_benchmark.options import CameraOptions
 from factorgraph_loc.experiments.image_localization import evaluate_images, table, write_results
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.vision.features import EXTRACTORS
 
 COUNT = 1500

@@ -19,8 +19,8 @@ from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import NOTHING
 from factorgraph_loc.experiments.images import prepare
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.simulation import film, preset, simulate, with_images
-from factorgraph_loc.vision import frontend
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE
 

@@ -14,11 +14,11 @@ from matplotlib import pyplot as plt
 
 from camera_benchmark.options import CameraOptions
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.evaluation.space import reprojection_residuals, spread_of
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
 
 LEFT, RIGHT, TWIST = "sightings", "sightings_right", "twist"
 STEREO = (TWIST, LEFT, RIGHT)

@@ -13,15 +13,19 @@ from typing import Any
 import numpy as np
 from benchmarking.report import Options, Report
 
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.log import ImageStream, IncrementStream, Log, RfidStream, VelocityStream
-from factorgraph_loc.readers import rosbag, write_native
-from factorgraph_loc.readers.bag_export import write_bag
-from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import propose
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.io.bags import rosbag
+from factorgraph_loc.io.bags.export import write_bag
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import propose
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 KINDS = {"ROS 1": "bag", "ROS 2, mcap": "mcap", "ROS 2, sqlite3": "db3"}
 SECONDS, MESSAGES, MEGABYTES = 10.0, 20_000, 50.0  # at most, and at least a second

@@ -18,7 +18,7 @@ from numpy.random import Generator
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.errors import FglocError
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 from fuzzing.results import CHECKS, check_estimate, check_trajectory
 from fuzzing.seeds import drive
 from fuzzing.verdicts import WrongResultError, fault_of

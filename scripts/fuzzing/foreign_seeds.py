@@ -12,8 +12,8 @@ import numpy as np
 from scipy.io import savemat
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose
 from fuzzing.seeds import TAGS, WORLD_TABLES, drive, occupancy
 
 START = 1_700_000_000  # s since 1970

@@ -11,8 +11,8 @@ import numpy as np
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
-from factorgraph_loc.log import Log
-from factors.rfid import GridModel
+from factorgraph_loc.model.log import Log
+from factors.rfid.model import GridModel
 
 WORLD_TABLES = """
 walls = "hall.yaml"

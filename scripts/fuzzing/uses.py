@@ -21,7 +21,8 @@ from factorgraph_loc.exports.g2o import pose_graph, write_g2o
 from factorgraph_loc.exports.rerun_scene import write_rrd
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.exports.trajectories import write_kitti
-from factorgraph_loc.log import ImageStream, Log
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.simulation import named_settings
 from factorgraph_loc.vision.images import read_image
 from fuzzing import foreign_seeds, seeds

@@ -11,15 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import write_toml
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, Stream, VelocityStream, cut
-from factorgraph_loc.readers import load
-from factorgraph_loc.readers.registry import DEFAULT_RIG
-from factorgraph_loc.readers.simulated_odometry import wheel_odometry
-from factorgraph_loc.readers.space_poses import read_kitti
-from factorgraph_loc.readers.write import write_log
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.files.models import write_toml
+from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.io.readers.space_poses import read_kitti
+from factorgraph_loc.io.write import write_log
+from factorgraph_loc.model.log import Log, cut
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors import se2
 from factors.se2 import Array
 from recordings_benchmark.listed import Recording

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 from benchmarking.report import Options, Report, pooled, spread_cell
 
-from factorgraph_loc.calibration.rfid_learn import learn_rfid
-from factorgraph_loc.calibration.rfid_tempering import tempered
 from factorgraph_loc.evaluation.ensembles import first_held
 from factorgraph_loc.experiments.ensemble import RunErrors, run_errors, series
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.trials import HOLD, POSITION
-from factorgraph_loc.log import Log, cut
-from factorgraph_loc.readers import load
-from factorgraph_loc.rig import Rig, read_rig, write_rig
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import Log, cut
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
+from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 
 RUNS = (13, 16)
 SEEDS = 5

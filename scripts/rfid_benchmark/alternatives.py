@@ -9,25 +9,26 @@ from dataclasses import dataclass
 import numpy as np
 from benchmarking.report import Options, Report, pooled
 
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.estimators.problem import Problem
-from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.tags import KnownTags
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, Values, pose_key
 from factorgraph_loc.experiments.ensemble import Series, series
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log
-from factorgraph_loc.measurements import Odometry, RfidScan
+from factorgraph_loc.fusion.problem import Problem
+from factorgraph_loc.fusion.variables import ODOMETRY_KEY, Values, pose_key
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Odometry
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
-from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
-from factors.odometry import OdometryFactor
-from factors.rfid_factor import RfidFactor
-from factors.rfid_likelihood import Looks, RfidLikelihood
+from factors.odometry.model import OdometryFactor
+from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 
 SEEDS = 10

@@ -9,7 +9,7 @@ from benchmarking.report import Options, Report, pooled, ratio_cells
 
 from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, Series, run_ensemble
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation.settings import preset
 
 SEEDS = 10

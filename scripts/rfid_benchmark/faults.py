@@ -12,7 +12,7 @@ from benchmarking.report import Options, Report, pooled
 
 from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation.settings import preset
 from factors import se2
 

@@ -8,17 +8,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.calibration.triangulation import Cameras, Tracks
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, RfidStream, VelocityStream
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings, SurveySettings
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, Tag, World
+from factorgraph_loc.mapping.triangulation import Cameras, Tracks
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.vision.frame import CameraFrame
 from factors import se2
-from factors.reprojection import CameraModel, project
-from factors.rfid import LogisticModel
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factors.camera.model import CameraModel, project
+from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.model import LogisticModel
 
 STEP = 0.05  # s
 WORLD = World(

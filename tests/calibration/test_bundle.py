@@ -6,9 +6,9 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
-from factorgraph_loc.calibration.bundle import Known, adjust, marginals, pose3
-from factorgraph_loc.calibration.triangulation import Tracks, triangulate
-from factors.reprojection import recalibrated
+from factorgraph_loc.mapping.bundle import Known, adjust, marginals, pose3
+from factorgraph_loc.mapping.triangulation import Tracks, triangulate
+from factors.camera.model import recalibrated
 
 
 def prior(count, turn, shift):

@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.image_localization import ImageLocalizer, smooth_start
-from factorgraph_loc.calibration.steady_motion import SteadyMotion, change_of_velocity
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.mapping.image_localization import ImageLocalizer, smooth_start
+from factorgraph_loc.mapping.steady_motion import SteadyMotion, change_of_velocity
+from factorgraph_loc.maps.points import PointMap
 
 pytestmark = pytest.mark.kernels
 
@@ -139,6 +139,6 @@ def test_a_graph_that_cannot_be_solved_leaves_single_images(look, monkeypatch):
     def fails(*_, **__):
         raise RuntimeError("Indeterminant linear system")
 
-    monkeypatch.setattr("factorgraph_loc.calibration.bundle.adjust", fails)
+    monkeypatch.setattr("factorgraph_loc.mapping.bundle.adjust", fails)
     ones = [localizer.one(frame) for frame in sight.frames]
     assert localizer.all(sight.frames, T[:4], ones) == ones

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.noise import fit_noise
-from factorgraph_loc.calibration.windows import cut, integrated
-from factorgraph_loc.log import VelocityStream
-from factorgraph_loc.rig import OdometrySettings
-from factors.odometry import OdometryModel
-from factors.odometry_chain import OdometryChain
+from factorgraph_loc.sensors.odometry.calibration.noise import fit_noise
+from factorgraph_loc.sensors.odometry.calibration.windows import cut, integrated
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors.odometry.chain import OdometryChain
+from factors.odometry.model import OdometryModel
 
 
 def test_noise_is_that_of_the_robot(simulate):

@@ -8,18 +8,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.phase import fit_phase
-from factorgraph_loc.calibration.rssi import fit_rssi, rssi_nll
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import Log, RfidStream
-from factorgraph_loc.rfid_settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings, SurveySettings
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.calibration.phase import fit_phase
+from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi, rssi_nll
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import (
+    AntennaSettings,
+    PhaseSettings,
+    RfidSettings,
+    RssiSettings,
+    SurveySettings,
+)
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors import se2
-from factors.rfid_phase import SPEED_OF_LIGHT
-from factors.rfid_rssi import RssiReads, features
+from factors.rfid.phase import SPEED_OF_LIGHT
+from factors.rfid.strength import RssiReads, features
 from factors.se2 import Array
 
 SETTINGS = RfidSettings(

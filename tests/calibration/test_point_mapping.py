@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.calibration.bundle import pose3
-from factorgraph_loc.calibration.camera_poses import PosedFrames, posed_frames
-from factorgraph_loc.calibration.point_mapping import PointSettings, map_points
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.log import FeatureStream, Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
-from factorgraph_loc.world import World
-from factors.reprojection import camera_pose
+from factorgraph_loc.mapping.bundle import pose3
+from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
+from factorgraph_loc.mapping.point_mapping import PointSettings, map_points
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factors.camera.model import camera_pose
 
 ALL = PointSettings(distance=0.0, angle=0.0)
 

@@ -5,8 +5,8 @@ import pytest
 
 from factorgraph_loc.calibration.calibrate import calibrate
 from factorgraph_loc.calibration.report import document
-from factorgraph_loc.rfid_settings import BeamSettings, RfidSettings
-from factorgraph_loc.rig import read_rig, write_rig
+from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, RfidSettings
 
 
 def scores(tempering, ideal):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.rfid_choice import Kind, choose
-from factorgraph_loc.calibration.rfid_fit import FACING, Floor, features, fit_beam, fit_logistic
-from factorgraph_loc.calibration.rfid_grid import Axes, design_of, fit_grid
-from factorgraph_loc.calibration.rfid_pairs import Pairs, local, terms
-from factorgraph_loc.calibration.rfid_rounds import distinct, rounds_of
-from factorgraph_loc.rig import SurveySettings
-from factors.rfid import BeamModel, GridModel, LogisticModel, logits, probability
+from factorgraph_loc.model.rig import SurveySettings
+from factorgraph_loc.sensors.rfid.calibration.choice import Kind, choose
+from factorgraph_loc.sensors.rfid.calibration.fit import FACING, Floor, features, fit_beam, fit_logistic
+from factorgraph_loc.sensors.rfid.calibration.grid import Axes, design_of, fit_grid
+from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs, local, terms
+from factorgraph_loc.sensors.rfid.calibration.rounds import distinct, rounds_of
+from factors.rfid.model import BeamModel, GridModel, LogisticModel, logits, probability
 
 TRUTH = LogisticModel((4.0, -1.6, 0.08, -1.7, 0.26, -0.06, -0.6, -0.1, 1.9, 0.23, -0.15))
 FLOOR = Floor()
@@ -132,7 +132,7 @@ def test_rounds_of_one_place_are_put_together(read_tags):
 
 
 def test_pairs_lie_where_the_factors_see_them(read_tags):
-    from factors.rfid_likelihood import RfidLikelihood, TagArray  # noqa: PLC0415
+    from factors.rfid.detection import RfidLikelihood, TagArray  # noqa: PLC0415
 
     log = read_tags(seconds=60.0)
     rounds = rounds_of(log, log.rig.rfid)

@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration import rfid_learn
-from factorgraph_loc.calibration.phase import PhaseFit
-from factorgraph_loc.calibration.rfid_choice import Kind
-from factorgraph_loc.calibration.rfid_dead import dead_tags
-from factorgraph_loc.calibration.rfid_fit import Floor, fit_logistic
-from factorgraph_loc.calibration.rfid_learn import learn_rfid
-from factorgraph_loc.calibration.rfid_mounting import SURVEY_PLACES, Place, alternated, moved, with_offsets
-from factorgraph_loc.calibration.rfid_pairs import pairs_of
-from factorgraph_loc.calibration.rfid_rounds import rounds_of
-from factorgraph_loc.calibration.rfid_tags import misplaced
-from factorgraph_loc.calibration.rfid_tempering import independent_share, tempered
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.rfid_settings import GridSettings, PhaseSettings, SurveySettings
-from factorgraph_loc.rig import read_rig, write_rig
+from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
+from factorgraph_loc.sensors.rfid.calibration.choice import Kind
+from factorgraph_loc.sensors.rfid.calibration.dead import dead_tags
+from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_logistic
+from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
+from factorgraph_loc.sensors.rfid.calibration.mounting import SURVEY_PLACES, Place, alternated, moved, with_offsets
+from factorgraph_loc.sensors.rfid.calibration.pairs import pairs_of
+from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit
+from factorgraph_loc.sensors.rfid.calibration.rounds import rounds_of
+from factorgraph_loc.sensors.rfid.calibration.tags import misplaced
+from factorgraph_loc.sensors.rfid.calibration.tempering import independent_share, tempered
+from factorgraph_loc.sensors.rfid.settings import GridSettings, PhaseSettings, SurveySettings
 
 FLOOR = Floor()
 KIND = Kind("logistic", facing=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.robust import Constant, fit, folds, gains, is_worth
+from factorgraph_loc.fitting.robust import Constant, fit, folds, gains, is_worth
 
 SLOPE = Constant("slope", 0.0, 1.0, -10.0, 10.0)
 OFFSET = Constant("offset", 0.0, 1.0, -10.0, 10.0)

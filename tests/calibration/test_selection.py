@@ -8,8 +8,9 @@ import pytest
 from factorgraph_loc import api
 from factorgraph_loc.calibration import report
 from factorgraph_loc.calibration.calibrate import calibrate
-from factorgraph_loc.rfid_settings import BeamSettings, SurveySettings
-from factorgraph_loc.rig import BearingRangeSettings, Rig
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, SurveySettings
 
 SECONDS = 100.0
 KEYS = ("causal.position_rmse", "final.position_rmse")

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.calibration.tag_looks import tag_looks
-from factorgraph_loc.calibration.tag_mapping import map_tags
-from factorgraph_loc.calibration.tag_search import merged, search
-from factorgraph_loc.calibration.tag_slam import INTERVAL, _keyframes
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import PosePrior
-from factorgraph_loc.log import Log
-from factorgraph_loc.rfid_settings import SurveySettings
+from factorgraph_loc.mapping.tag_looks import tag_looks
+from factorgraph_loc.mapping.tag_mapping import map_tags
+from factorgraph_loc.mapping.tag_search import merged, search
+from factorgraph_loc.mapping.tag_slam import INTERVAL, _keyframes
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
-from factorgraph_loc.world import Tag, World
 from factors import se2
-from factors.rfid import Antenna, BeamModel, LogisticModel, RfidModel
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel
 
 SMALL = {"world": {"width": 7.0, "depth": 6.5, "tags": 8}, "drive": {"duration": 60.0}}
 SIDEWAYS = (Antenna(z=1.0, yaw=np.pi / 2.0), Antenna(z=1.0, yaw=-np.pi / 2.0))

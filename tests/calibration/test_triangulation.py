@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.calibration.triangulation import Cameras, Tracks, directions, parallax, reproject, triangulate
+from factorgraph_loc.mapping.triangulation import Cameras, Tracks, directions, parallax, reproject, triangulate
 
 
 def test_without_noise_the_points_come_back(look):

@@ -9,15 +9,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.log import ImageStream, IncrementStream, Log
-from factorgraph_loc.readers import load, write_native
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
-from factors.reprojection import camera_pose
+from factors.camera.model import camera_pose
 
 Fgloc = Callable[..., Result]
 SECONDS = 60.0

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from factorgraph_loc.rig import read_rig
+from factorgraph_loc.io.native.rig_file import read_rig
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,19 @@ import json
 import numpy as np
 import pytest
 
-from factorgraph_loc.log import IncrementStream, Log, RfidStream
-from factorgraph_loc.readers.native import write_native
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import Rig, read_rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.io.native.native import write_native
+from factorgraph_loc.io.native.rig_file import read_rig
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
-from factors.rfid import BeamModel
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.model import BeamModel
 
 SIDES = {"left": np.pi / 2, "right": -np.pi / 2}
 

@@ -16,10 +16,10 @@ import pytest
 from factorgraph_loc import __version__
 from factorgraph_loc.cli import show
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.base import Learnt, LearntPoint
 from factorgraph_loc.evaluation.tables import COLUMNS, comparison_cells, comparison_table
 from factorgraph_loc.experiments.run import run
-from factorgraph_loc.trajectory import Trajectory, read_tum, write_tum
+from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.trajectory import Trajectory, read_tum, write_tum
 
 RUN_FILES = {
     "final.tum",

@@ -8,8 +8,8 @@ import pytest
 import shellingham
 
 from factorgraph_loc.cli import completion
-from factorgraph_loc.estimators.registry import ESTIMATORS
-from factorgraph_loc.readers import manifests
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.fusion.registry import ESTIMATORS
 from factorgraph_loc.simulation import PRESETS
 
 FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]

@@ -10,12 +10,14 @@ from evo.tools import file_interface
 from factorgraph_loc.cli.options import LogOptions
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log, TwistStream
-from factorgraph_loc.readers import load
-from factorgraph_loc.rig import Rig, TwistSettings
-from factorgraph_loc.trajectory import read_tum
-from factorgraph_loc.trajectory3 import Trajectory3
-from factorgraph_loc.world import World
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import read_tum
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.sensors.twist.stream import TwistStream
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from factorgraph_loc.cli.features import ALL
-from factorgraph_loc.vision.competitors import DETECTORS
-from factorgraph_loc.vision.feature_evaluation import FEATURES
+from factorgraph_loc.evaluation.features.competitors import DETECTORS
+from factorgraph_loc.evaluation.features.feature_evaluation import FEATURES
 from factorgraph_loc.vision.features import EXTRACTORS
 
 NAMES = "sift,orb,fast_hessian"

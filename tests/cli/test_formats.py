@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers import load
-from factorgraph_loc.world import read_world
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import load
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "formats.md").read_text()

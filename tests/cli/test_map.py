@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorgraph_loc.log import BearingRangeStream, Log, StartPose, VelocityStream
-from factorgraph_loc.readers import write_native
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World, read_world
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
 
 SPEED, TURN, SECONDS = 0.4, 0.25, 60.0

@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import read_world
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
 
 WALL = 3.0  # m, where the picture hangs
 

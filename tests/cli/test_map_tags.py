@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorgraph_loc.readers import write_native
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
-from factorgraph_loc.world import Tag, World, read_world
 
 SETTINGS = {"world": {"width": 7.0, "depth": 6.5, "tags": 8}, "drive": {"duration": 40.0}}
 

@@ -13,12 +13,16 @@ from typer.testing import CliRunner
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.tables import comparison_table
-from factorgraph_loc.files import read_toml, write_toml
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log
-from factorgraph_loc.readers import write_native
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.files.models import read_toml, write_toml
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 
 ANY = st.text(st.characters(), max_size=60) | st.sampled_from(["n" * 300, "a $x^{$ b", "[/red]{x}:smile:", "../../up"])
 RIG = Rig(sensors=("odometry", "bearing_range"), bearing_range=BearingRangeSettings(range_sigma=0.1))

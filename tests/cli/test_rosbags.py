@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 
 EXAMPLE = Path(__file__).parents[2] / "scripts" / "example_bag"
 

@@ -53,7 +53,7 @@ def test_exit_codes(raised, code, said, debug, monkeypatch, capsys):
     def describe(_):
         raise raised
 
-    monkeypatch.setattr("factorgraph_loc.readers.describe", describe)
+    monkeypatch.setattr("factorgraph_loc.io.readers.describe", describe)
     monkeypatch.setattr("sys.argv", ["fgloc", "datasets", *(["--debug"] if debug else [])])
     with pytest.raises(SystemExit) as left:
         main()

@@ -3,7 +3,7 @@
 import cv2
 import pytest
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.simulation import film, preset, simulate
 
 

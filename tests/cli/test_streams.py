@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.log import IncrementStream, Log
-from factorgraph_loc.readers import write_native
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.world import World
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 
 NAME = "Gärtnerstraße ± 廊下 🤖"
 FGLOC = f"{sys.executable} -c 'from factorgraph_loc.cli.main import main; main()'"

@@ -11,7 +11,7 @@ pytest.importorskip("rerun")
 def run_folder(short_log, tmp_path_factory):
     from factorgraph_loc.experiments.output import write_run  # noqa: PLC0415
     from factorgraph_loc.experiments.run import RunConfig, run  # noqa: PLC0415
-    from factorgraph_loc.readers import load  # noqa: PLC0415
+    from factorgraph_loc.io.readers import load  # noqa: PLC0415
 
     (log,) = load(str(short_log))
     out = tmp_path_factory.mktemp("view") / "ekf"

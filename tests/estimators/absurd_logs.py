@@ -11,9 +11,11 @@ import factorgraph_loc as fgloc
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, IncrementStream, Log, StartPose
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise
-from factorgraph_loc.world import Landmark
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factors import se2
 
 SECONDS = 4.0

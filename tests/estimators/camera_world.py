@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.log import FeatureStream, Log, SightingStream, VelocityStream
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
-from factors import reprojection, se2
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.vision.frame import CameraFrame
+from factors import se2
+from factors.camera import model as reprojection
 
 ODOMETRY_STEP = 0.05  # s
 HALF = 4.0  # m: the room is a square of twice that

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import landmark_world
 import pytest
 
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 
 
 @pytest.fixture(scope="session")

@@ -4,19 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
-from factorgraph_loc.rig import (
-    BearingRangeSettings,
-    BearingRangeUncertainty,
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
     OdometryUncertainty,
-    Rig,
 )
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range, se2
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors import se2
+from factors.landmarks import model as bearing_range
 
 ODOMETRY_STEP = 0.05  # s
 RANGE_SIGMA, BEARING_SIGMA, SIGHT = 0.1, 0.03, 5.0

@@ -7,10 +7,11 @@ import numpy as np
 from camera_world import simulate as simulate_room
 from camera_world import with_frames
 
-from factorgraph_loc.log import YawRateStream, cut
-from factorgraph_loc.readers import load
-from factorgraph_loc.rfid_settings import PhaseSettings, RssiSettings
-from factorgraph_loc.rig import ImuSettings
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.sensors.odometry.settings import ImuSettings
+from factorgraph_loc.sensors.odometry.stream import YawRateStream
+from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RssiSettings
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 

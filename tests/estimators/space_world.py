@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.log import FeatureStream, Log, RightSightingStream, SightingStream, TwistStream
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig, TwistSettings
-from factorgraph_loc.trajectory3 import Trajectory3
-from factorgraph_loc.world import World
-from factors.reprojection import linearize_in_space
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream, SightingStream
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.sensors.twist.stream import TwistStream
+from factorgraph_loc.vision.frame import CameraFrame
+from factors.camera.model import linearize_in_space
 
 STEP, SECONDS, SIGMA = 0.1, 8.0, 2.0
 SHIFT, TURN = (0.02, 0.03, 0.04), (0.03, 0.02, 0.05)

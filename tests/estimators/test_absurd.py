@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.smoother import Smoother
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import IncrementStream, StartPose
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise
+from factorgraph_loc.fusion.smoother import Smoother
+from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),

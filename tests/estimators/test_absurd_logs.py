@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from absurd_logs import FAULTS, require_sound, verdict, whole
 
-from factorgraph_loc.localizer import Localizer
+from factorgraph_loc.live.localizer import Localizer
 
 # fewer particles than anybody takes, and so less to go on
 SMALL = {"particles": 60, "smoothing_trajectories": 15, "min_particles": 20}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.ancestors import draw_ancestors, transition_log_density
+from factorgraph_loc.fusion.ancestors import draw_ancestors, transition_log_density
 
 
 @pytest.mark.parametrize("size", [0, 2])

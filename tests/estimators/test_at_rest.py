@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log, VelocityStream
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
-from factorgraph_loc.world import World
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 NONE = GrowthSettings()
 BY_DISTANCE = OdometryNoise(

@@ -6,18 +6,27 @@ import numpy as np
 import pytest
 from camera_world import CAMERA, frame, room, simulate, weave, with_camera, with_frames, with_views
 
-from factorgraph_loc.camera_settings import CameraUncertainty
-from factorgraph_loc.estimators.base import Diagnostics, PosePrior
-from factorgraph_loc.estimators.registry import Setup, create, settings_of
-from factorgraph_loc.estimators.seen_points import KnownPoints, Predicted, lifted, pixel_update
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import SightingStream, cut, join
-from factorgraph_loc.measurements import CameraFrame, IncrementOdometry, PixelSightings, Tick
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import NOTHING, GrowthSettings, OdometryNoise, OdometrySettings, Rig
-from factorgraph_loc.world import World
-from factors import reprojection, se2
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.variable import NOTHING
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.camera.sensor import KnownPoints, Predicted, lifted, pixel_update
+from factorgraph_loc.sensors.camera.settings import CameraUncertainty
+from factorgraph_loc.sensors.camera.stream import SightingStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.vision.frame import CameraFrame
+from factors import se2
+from factors.camera import model as reprojection
 
 CONFIGS = {
     "ekf": RunConfig("ekf"),

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.clock_check import ClockCheck
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.measurements import IncrementOdometry
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.camera.clock_check import ClockCheck
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 
 STEP, EVERY = 0.1, 2  # s between rows of the odometry, rows between images
 NOISE = 0.1  # rad per sqrt(s)

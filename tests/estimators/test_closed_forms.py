@@ -3,20 +3,24 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import PosePrior
-from factorgraph_loc.estimators.registry import Setup, create, settings_of
-from factorgraph_loc.measurements import BearingRange, IncrementOdometry, Tick
-from factorgraph_loc.rig import (
-    BearingRangeSettings,
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
     OdometryUncertainty,
-    Rig,
 )
-from factorgraph_loc.world import Landmark, World
 from factors import se2
-from factors.bearing_range import log_likelihood
+from factors.landmarks.model import log_likelihood
 
 # Landmarks so far ahead that range measures x and bearing measures heading: the problem along x is linear and Gaussian.
 FAR = World(landmarks={"far": Landmark(x=1e4, y=0.0)})

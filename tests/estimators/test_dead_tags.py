@@ -11,12 +11,15 @@ import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log, cut, join
-from factorgraph_loc.measurements import Odometry, RfidScan, VelocityOdometry
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.measurement import Odometry
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.world import Tag, World
 
 SENSORS = ("odometry", "rfid")
 ESTIMATORS = ["smoother", "batch", "particle_filter", "switching"]

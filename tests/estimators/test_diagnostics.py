@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics, PoseEstimate, gaussian_belief
-from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, cut, join
-from factorgraph_loc.measurements import RfidScan
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.model.belief import PoseEstimate, gaussian_belief
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.simulation import named_settings
 from factorgraph_loc.simulation import simulate as simulated
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.solvers import FullHistory, Window
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import StartPose, VelocityStream
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.fusion.solvers import FullHistory, Window
+from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
 
 CONFIGS = {

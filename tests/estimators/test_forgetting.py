@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.estimators.kept import Kept
-from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.experiments.prior import resolve_prior
-from factorgraph_loc.measurements import Odometry, Tick
+from factorgraph_loc.fusion.kept import Kept
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.model.measurement import Odometry, Tick
+from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.simulation import named_settings, simulate
 
 CASES = [

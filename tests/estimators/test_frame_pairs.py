@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.frame_pairs import FramePairs
-from factorgraph_loc.estimators.graph_parts import Keyframe
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.world import World
-from factors import reprojection, se2
-from factors.odometry import ChainState, Increment
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.model.world import World
+from factorgraph_loc.slam.frame_pairs import FramePairs
+from factors import se2
+from factors.camera import model as reprojection
+from factors.motion import ChainState, Increment
 from tests.estimators import camera_world
 
 MODEL = camera_world.CAMERA.model()

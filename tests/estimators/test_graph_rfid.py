@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import registry
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import Log, RfidStream, cut, join
-from factorgraph_loc.measurements import IncrementOdometry, RfidScan, Tick
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 
@@ -171,7 +175,7 @@ def test_what_the_map_or_the_rig_lacks_is_counted() -> None:
 def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:
     log = office()
     sensors = ("odometry", "rfid")
-    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(1))
+    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(1))
     smoother = registry.create("smoother", setup, registry.settings_of("smoother", {}))
     assert smoother.belief().particles is None
     scans = 0

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from factorgraph_loc.estimators.graph_parts import Keyframe
-from factorgraph_loc.estimators.local_bundle import bundled
-from factorgraph_loc.estimators.new_points import sightings_of
-from factors import reprojection, se2
-from factors.odometry import ChainState, Increment
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.slam.local_bundle import bundled
+from factorgraph_loc.slam.new_points import sightings_of
+from factors import se2
+from factors.camera import model as reprojection
+from factors.motion import ChainState, Increment
 from tests.estimators import camera_world
 
 MODEL = camera_world.CAMERA.model()

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import loop_closure
-from factorgraph_loc.estimators.graph_parts import Keyframe
-from factorgraph_loc.estimators.loop_closure import Image, LoopClosure, OldPoints
-from factorgraph_loc.estimators.variables import point_key, pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.fusion.variables import point_key, pose_key
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.slam import loop_closure
+from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factors import se2
 from tests.estimators import camera_world
 from tests.estimators.test_slam_points import rmse, with_features

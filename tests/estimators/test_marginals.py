@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators import smoother
-from factorgraph_loc.estimators.marginals import IndeterminateError, covariances
-from factorgraph_loc.estimators.problem import Problem
-from factorgraph_loc.estimators.solvers import Window
-from factorgraph_loc.estimators.variables import ODOMETRY_KEY, pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.fusion import smoother
+from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
+from factorgraph_loc.fusion.problem import Problem
+from factorgraph_loc.fusion.solvers import Window
+from factorgraph_loc.fusion.variables import ODOMETRY_KEY, pose_key
 from factors.graph import VectorPriorFactor
 
 STEP = np.array(((1.0, 0.0, 0.03), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0)))

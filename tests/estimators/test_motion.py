@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.motion import Motion, propagate
-from factorgraph_loc.measurements import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.rig import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings
+from factors.motion import propagate
 
 RIG = Rig(imu=ImuSettings(bias=0.1))
 

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.new_points import (
+from factorgraph_loc.slam.new_points import (
     FEWEST,
     MAX_WAITING,
     NewPoints,
@@ -16,10 +16,10 @@ from factorgraph_loc.estimators.new_points import (
     sightings_of,
     triangulate,
 )
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel, mounting, predict
+from factors.camera.native import PointSightings
 from factors.graph import jacobian_factor
-from factors.point_sighting import PointSightings
-from factors.reprojection import CameraModel, mounting, predict
-from factors.reprojection_factor import ReprojectionFactor
 from factors.se2 import Array
 
 MODEL = CameraModel(

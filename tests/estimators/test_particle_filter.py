@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.estimators.base import PosePrior
-from factorgraph_loc.estimators.cloud import Cloud, largest_share, systematic
-from factorgraph_loc.estimators.particle_filter import ParticleFilter, ParticleFilterSettings
-from factorgraph_loc.estimators.registry import Setup
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, cut, join
-from factorgraph_loc.readers import load
-from factorgraph_loc.rig import BearingRangeUncertainty
+from factorgraph_loc.fusion.cloud import Cloud, largest_share, systematic
+from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeUncertainty
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors import se2
 
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")

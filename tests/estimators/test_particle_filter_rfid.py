@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import cut, join
-from factorgraph_loc.measurements import RfidScan, VelocityOdometry
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
-from factorgraph_loc.world import Tag, World
 from factors import se2
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
 
 SENSORS = ("odometry", "rfid")
 KNOWN = RunConfig("particle_filter", {"particles": 1500, "smooth": False}, SENSORS)
@@ -48,7 +51,7 @@ def scan(t, *reads, antennas=("ahead",)):
 
 def alone(world, rfid, particles, **settings):
     """The filter with one antenna and no motion."""
-    setup = registry.Setup(Rig(rfid=rfid), world, SENSORS, np.random.default_rng(1))
+    setup = model_setup.Setup(Rig(rfid=rfid), world, SENSORS, np.random.default_rng(1))
     return registry.create(
         "particle_filter", setup, registry.settings_of("particle_filter", {"particles": particles, **settings})
     )

@@ -6,15 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import cut, join
-from factorgraph_loc.measurements import RfidScan, VelocityOdometry
-from factorgraph_loc.rfid_settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.world import Tag, World
 
 READS = ("odometry", "rfid")
 FREQUENCY = 9.2e8  # Hz
@@ -126,7 +129,9 @@ def alone(tag, phase, covariance, particles=500):
         rssi=STRENGTH.model_copy(update={"tempering": 1.0}),
         phase=PHASE.model_copy(update=phase),
     )
-    setup = registry.Setup(Rig(rfid=rfid), World(tags={"a": tag}), (*READS, "rssi", "phase"), np.random.default_rng(1))
+    setup = model_setup.Setup(
+        Rig(rfid=rfid), World(tags={"a": tag}), (*READS, "rssi", "phase"), np.random.default_rng(1)
+    )
     out = registry.create(
         "particle_filter", setup, registry.settings_of("particle_filter", {"particles": particles, "smooth": False})
     )

@@ -9,14 +9,15 @@ import pytest
 from short_logs import frames, late, office, plaza, room, with_gyro
 from space_world import carried
 
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.registry import ESTIMATORS
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import ImageStream, cut
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.readers import load
-from factorgraph_loc.world import World
+from factorgraph_loc.fusion.registry import ESTIMATORS
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream
 
 READS = ("odometry", "rfid")
 FEW = {"particles": 150, "min_particles": 100, "smooth": False}

@@ -7,8 +7,9 @@ import pytest
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, VelocityStream
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.landmarks import KnownLandmarks
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.relocalization import Relocalizer, _apart
-from factorgraph_loc.estimators.track_monitor import TrackMonitor
-from factorgraph_loc.log import BearingRangeStream
-from factorgraph_loc.measurements import BearingRange
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.landmarks.finder import Relocalizer, _apart
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.monitor import TrackMonitor
+from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.motion import Motion
 from factors import se2
 
 

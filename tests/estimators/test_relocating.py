@@ -8,8 +8,9 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, cut, join
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),

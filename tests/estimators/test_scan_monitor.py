@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.estimators.scan_monitor import ScanMonitor
+from factorgraph_loc.sensors.rfid.monitor import ScanMonitor
 
 VARIANCE = 4.0
 

@@ -5,15 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import kld
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.motion import Motion
-from factorgraph_loc.estimators.seeker import Seeker
-from factorgraph_loc.measurements import VelocityOdometry
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import GrowthSettings, OdometryNoise, OdometrySettings, Rig
+from factorgraph_loc.fusion import kld
+from factorgraph_loc.fusion.search import Seeker
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
 
 NOISE = OdometryNoise(
     along=GrowthSettings(per_distance=0.01),

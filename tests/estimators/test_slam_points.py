@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.estimators.solvers import FullHistory
-from factorgraph_loc.estimators.variables import pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import FeatureStream, VelocityStream
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.fusion.solvers import FullHistory
+from factorgraph_loc.fusion.variables import pose_key
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
 from tests.estimators import camera_world
 

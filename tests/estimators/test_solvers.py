@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.solvers import FullHistory, Window, read_all
-from factorgraph_loc.estimators.summary import Summary
-from factorgraph_loc.estimators.variables import pose_key
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.rig import OdometryUncertainty
+from factorgraph_loc.fusion.solvers import FullHistory, Window, read_all
+from factorgraph_loc.fusion.summary import Summary
+from factorgraph_loc.fusion.variables import pose_key
+from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
 from tests.estimators import camera_world
 

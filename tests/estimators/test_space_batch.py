@@ -8,14 +8,15 @@ from scipy.stats import chi2
 from space_world import RIG, SIGMA, carried, with_features
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.registry import Setup, create, settings_of
 from factorgraph_loc.evaluation import space
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import cut
-from factorgraph_loc.measurements import Tick
-from factorgraph_loc.readers import load
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.setup import Setup
 
 
 def estimated(log, name, sensors=None, **settings):

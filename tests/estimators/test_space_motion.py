@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import space_motion
-from factorgraph_loc.estimators.space_motion import Displacement, Origin, RobotState, TwistChain, exp
-from factorgraph_loc.rig import TwistSettings
-from factors.odometry import Increment
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.slam import space_motion
+from factorgraph_loc.slam.space_motion import Displacement, Origin, RobotState, TwistChain, exp
+from factors.motion import Increment
 
 ROBOT = RobotState(
     np.array((1.0, -2.0, 0.3)), exp(np.array((0.2, -0.1, 0.7))), np.array((0.3, 0.1, -0.2)), np.array((0.5, -0.4, 0.6))

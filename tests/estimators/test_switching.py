@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import PosePrior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.measurements import RfidScan, Tick
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model import setup as model_setup
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 from factors import se2
@@ -34,7 +36,7 @@ def scan(t, *tags):
 
 
 def made(log, sensors=BOTH, **settings):
-    setup = registry.Setup(log.rig, log.world, sensors, np.random.default_rng(0))
+    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(0))
     return registry.create("switching", setup, registry.settings_of("switching", settings))
 
 

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics
-from factorgraph_loc.estimators.registry import Setup
-from factorgraph_loc.estimators.tag_signals import TagSignals
-from factorgraph_loc.estimators.tags import KnownTags
-from factorgraph_loc.estimators.waiting_scans import WaitingScans
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.measurements import RfidScan
-from factorgraph_loc.rfid_settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.sensor import WaitingScans
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
+from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.world import Tag, World
 
 SENSORS = ("odometry", "rfid", "rssi", "phase")
 STRENGTH = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0)

@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics, PosePrior
-from factorgraph_loc.estimators.known_position import KnownPosition
-from factorgraph_loc.estimators.motion import Motion
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, cut
-from factorgraph_loc.measurements import IncrementOdometry
-from factorgraph_loc.readers import load
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.fusion.known_position import KnownPosition
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.odometry.motion import Motion
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate as simulated
-from factorgraph_loc.trajectory import Trajectory
 from factors import se2
 
 CONFIGS = {

@@ -5,18 +5,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import robust_update as robust_update_module
-from factorgraph_loc.estimators import tags
-from factorgraph_loc.estimators.robust_update import linearized_update, robust_update
-from factors import rfid_kernels, se2
-from factors.bearing_range import BearingRangeModel
-from factors.bearing_range import predict as predict_landmarks
-from factors.bearing_range_factor import BearingRangeFactor
-from factors.reprojection import CameraModel, camera_pose, predict
-from factors.reprojection_factor import ReprojectionFactor
-from factors.rfid import Antenna, BeamModel, RfidModel
-from factors.rfid_factor import RfidFactor
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
+from factors import se2
+from factors import update as robust_update_module
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel, camera_pose, predict
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import BearingRangeModel
+from factors.landmarks.model import predict as predict_landmarks
+from factors.rfid import kernels as rfid_kernels
+from factors.rfid import update as rfid_update
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.factor import RfidFactor
+from factors.rfid.model import Antenna, BeamModel, RfidModel
+from factors.update import linearized_update, robust_update
 
 CLOSE = 1e-8  # standard deviations
 
@@ -90,8 +91,8 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
         looks = Looks(np.tile(offset, (3, 1)), np.arange(3), np.full(3, 2), hits)
         start, covariance = se2.compose(pose, se2.exp(scale * rng.standard_normal(3))), spread(rng, 3, scale)
         factors = [RfidFactor(likelihood, looks)]
-        found = tags.updated(factors, start, covariance, iterations)
-        expected = tags.scored_update(factors, start, covariance, iterations)
+        found = rfid_update.updated(factors, start, covariance, iterations)
+        expected = rfid_update.scored_update(factors, start, covariance, iterations)
         sigmas = np.sqrt(np.diag(expected.covariance))
         close(found.pose, expected.pose, sigmas)
         close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))

@@ -16,7 +16,7 @@ import pytest
 from scipy.signal import lfilter
 
 from factorgraph_loc.evaluation.report import RunFiles, Scene
-from factorgraph_loc.evaluation.scoring import MAX_GAP, RULE
+from factorgraph_loc.model.scoring import MAX_GAP, RULE
 
 
 class Chromium:

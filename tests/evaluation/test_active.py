@@ -14,7 +14,8 @@ from factorgraph_loc.evaluation.active import (
     summary_cells,
 )
 from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.map import Tag
 
 
 def row(policy, seed, metres, *, world="hall", localized=True, **changes):

@@ -8,12 +8,13 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from scipy.stats import chi2
 
-from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.evaluation.alignment import align, align_points, free_map_figures
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
 from factors import se2
 
 FRAME = np.array((4.0, -3.0, 2.5))  # of the world in the estimate's frame

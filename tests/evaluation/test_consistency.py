@@ -5,10 +5,10 @@ import pytest
 
 from factorgraph_loc.evaluation.consistency import WINDOW, consistency, running_mean
 from factorgraph_loc.evaluation.figures import Track
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 
 T = np.arange(600) * 0.1
 BAND = "95 % band (of the single NEES, of the mean NIS)"

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import PosePrior
-from factorgraph_loc.estimators.motion import propagate
 from factorgraph_loc.evaluation.grid_filter import GridFilter
+from factorgraph_loc.model.belief import PosePrior
 from factors import se2
-from factors.odometry import Increment
+from factors.motion import Increment, propagate
 
 LOW, HIGH = np.array((-1.0, -1.0)), np.array((5.0, 3.0))
 

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.inspect import find_suspects, inspect
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors.landmarks import model as bearing_range
 
 PLACES = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0), "d": (0.0, 8.0), "e": (5.0, -3.0)}
 SETTINGS = BearingRangeSettings(

@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.evaluation import inspect_camera
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.log import ImageStream, Log, SightingStream, VelocityStream
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.world import World
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera import summary as inspect_camera
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 CAMERA = CameraSettings(
     width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}

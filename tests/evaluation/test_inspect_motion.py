@@ -7,12 +7,18 @@ import pytest
 
 from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.evaluation.inspect_motion import motion_problems
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream, YawRateStream
-from factorgraph_loc.readers.checks import look_over
-from factorgraph_loc.rig import BearingRangeSettings, OdometrySettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range, se2
+from factorgraph_loc.io.look_over import look_over
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream, YawRateStream
+from factors import se2
+from factors.landmarks import model as bearing_range
 
 SETTINGS = BearingRangeSettings(range_sigma=0.1, bearing_sigma=0.03)
 PLACES = {"a": (0.0, 0.0), "b": (6.0, 1.0), "c": (3.0, 7.0)}

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.log import Log, RfidStream, VelocityStream
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 ANTENNAS = ("left", "right")
 

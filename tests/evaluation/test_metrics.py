@@ -8,14 +8,15 @@ from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
-from factorgraph_loc.estimators.base import Diagnostics, Learnt
 from factorgraph_loc.evaluation.alignment import FIGURES
 from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
-from factorgraph_loc.evaluation.result import RunResult, Timings
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factors import se2
 
 TIMINGS = Timings(np.array([0.5]), np.array([2.0]), 1.0, 10.0, 0.1, 100.0)

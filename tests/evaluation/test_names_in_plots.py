@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.evaluation.figures import drawing, grid, lay_out, legend, save
-from factorgraph_loc.files import file_name
+from factorgraph_loc.drawing.figures import drawing, grid, lay_out, legend, save
+from factorgraph_loc.files.models import file_name
 
 NAMES = ["a $x^{$ b", "$$", r"\frac$", "n" * 3000, "", "_hidden", "a_b\\c", "two\nlines" * 50, "\x1b[31m", "廊下", "🤖"]
 NAMES += ["\u202e", "caf\udce9", "{x}", "[red]", "'\"<&>"]

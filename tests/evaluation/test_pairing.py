@@ -7,7 +7,7 @@ import pytest
 
 from factorgraph_loc.evaluation.metrics import accuracy, errors
 from factorgraph_loc.evaluation.pairing import pairs, pauses, thinned
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import Trajectory
 
 RADIUS, TURN = 2.0, 0.4  # m, rad/s
 

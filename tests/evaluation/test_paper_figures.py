@@ -7,10 +7,11 @@ import pytest
 
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.paper_figures import deviations, fusion
-from factorgraph_loc.log import Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.map import Tag
 
 
 @pytest.fixture

@@ -12,12 +12,17 @@ from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.paper_figures import deviations, fusion
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
-from factorgraph_loc.readers import write_native
-from factorgraph_loc.rfid_settings import SurveySettings
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, Tag, World
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
 
 
 def width(path: Path) -> int:

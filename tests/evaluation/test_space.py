@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.evaluation import space
-from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import Trajectory3
 
 T = np.arange(0.0, 2.0, 0.05)
 TURN, SHIFT = np.array((0.0, 0.02, 0.0)), np.array((0.03, 0.0, 0.04))

@@ -7,13 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.estimators.base import Diagnostics, Learnt, PoseEstimate
-from factorgraph_loc.files import FileModel
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
-from factorgraph_loc.rig import BearingRangeSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model.belief import PoseEstimate
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 
 @pytest.fixture
@@ -108,7 +114,7 @@ def small_disk(tmp_path):
 def fake(monkeypatch):
     """The class of the estimator that is registered as ``fake``; ``fake.made`` is the last one made."""
     monkeypatch.setitem(
-        sys.modules, "factorgraph_loc.estimators.fake", SimpleNamespace(Fake=Fake, FakeSettings=FakeSettings)
+        sys.modules, "factorgraph_loc.fusion.fake", SimpleNamespace(Fake=Fake, FakeSettings=FakeSettings)
     )
-    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("factorgraph_loc.estimators.fake", "Fake", "FakeSettings"))
+    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("factorgraph_loc.fusion.fake", "Fake", "FakeSettings"))
     return Fake

@@ -9,11 +9,11 @@ import pytest
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments import active
 from factorgraph_loc.experiments.active import ROW, jobs_of, run_job, run_jobs, seek
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import SimulationSettings, preset
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
 
 OFFICE = preset("office")
 WALLS = ((0.0, 0.0, 5.0, 0.0), (0.0, 0.0, 0.0, 5.0))

@@ -7,8 +7,8 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.compare import compare
-from factorgraph_loc.experiments.output import FILES
 from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.io.results.layout import FILES
 
 
 def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import FeatureStream, SightingStream
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
+from factorgraph_loc.vision.frame import CameraFrame
 
 NO_POINTS = "straight: the map has no points that a camera could find: give --world"
 STAMPS = np.array([0.3, 0.7])

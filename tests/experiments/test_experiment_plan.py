@@ -14,7 +14,7 @@ from factorgraph_loc.experiments import facts, globs, keys
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
-from factorgraph_loc.readers import write_native
+from factorgraph_loc.io.readers import write_native
 
 
 @pytest.fixture
@@ -275,8 +275,8 @@ def test_a_file_is_read_again_only_if_it_has_changed(tmp_path, monkeypatch):
 
 def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run():
     script = (
-        "import sys, factorgraph_loc.experiments.stored_run, factorgraph_loc.readers, factorgraph_loc.simulation\n"
-        "from factorgraph_loc.estimators import registry\n"
+        "import sys, factorgraph_loc.experiments.stored_run, factorgraph_loc.io.readers, factorgraph_loc.simulation\n"
+        "from factorgraph_loc.fusion import registry\n"
         "for name in registry.ESTIMATORS: registry.estimator_type(name)\n"
         "print(*sys.modules)"
     )

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from factorgraph_loc.experiments.image_localization import Outcome, evaluate_images, table, write_results
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 
 
 def outcome(position, degrees):

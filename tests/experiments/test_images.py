@@ -6,16 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import images
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import ImageStream, SightingStream
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.vision import frontend
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.sensors.camera import frontend
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.vision.settings import FrontendSettings
 
 CAMERA = CameraSettings(
     width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}

@@ -9,10 +9,11 @@ import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import LearntPoint
-from factorgraph_loc.experiments.output import FILES, write_run
+from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.trajectory import read_tum
+from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.trajectory import read_tum
 
 COLUMNS = [
     "kind",

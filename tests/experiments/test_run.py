@@ -11,9 +11,11 @@ import pytest
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import BearingRangeStream, StartPose, VelocityStream
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 
 def test_order_of_what_is_fed(log, fake):
@@ -232,7 +234,7 @@ def test_same_seed_same_result(log):
 
 def test_one_thread_is_asked_for_before_numpy():
     code = (
-        "import sys, os; from factorgraph_loc.experiments.threads import use_one_thread; use_one_thread();"
+        "import sys, os; from factorgraph_loc.threads import use_one_thread; use_one_thread();"
         "assert 'numpy' not in sys.modules; print(os.environ['OPENBLAS_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])"
     )
     clean = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Diagnostics
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.doubts import dead_tags
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.log import RfidStream
-from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.world import Tag
 
 ALL = ("odometry", "rfid", "rssi", "phase")
 

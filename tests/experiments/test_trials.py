@@ -5,16 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.estimators.base import Diagnostics, Learnt
-from factorgraph_loc.evaluation.result import RunResult, Timings
 from factorgraph_loc.experiments import trials
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.experiments.trials import kidnapping_trials, start_trials
-from factorgraph_loc.log import BearingRangeStream, Log, VelocityStream
-from factorgraph_loc.rig import BearingRangeSettings, GrowthSettings, OdometryNoise, OdometrySettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range, se2
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors import se2
+from factors.landmarks import model as bearing_range
 
 CIRCLE = {"a": (4.0, 0.5), "b": (0.3, 4.2), "c": (-3.8, -0.4), "d": (-0.2, -4.5), "e": (3.0, 3.4)}
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import LearntPoint
 from factorgraph_loc.exports.g2o import pose_graph, write_g2o
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 from factors import se2
 
 SENSORS = ("odometry", "bearing_range")

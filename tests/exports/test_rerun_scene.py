@@ -13,10 +13,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.runs import find_runs, read_runs
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
-from factors import reprojection
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factors.camera import model as reprojection
 
 rr = pytest.importorskip("rerun")
 from rerun.chunk import RrdReader  # noqa: E402

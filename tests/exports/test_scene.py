@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
-from factorgraph_loc.log import ImageStream
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera.stream import ImageStream
 
 
 def test_tags_are_lit_from_when_the_antenna_had_them(log):

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.exports.trajectories import matrices, write_kitti
-from factorgraph_loc.trajectory import write_tum
-from factorgraph_loc.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory import write_tum
+from factorgraph_loc.model.trajectory3 import Trajectory3
 
 
 def test_evo_reads_poses_of_kitti(log, tmp_path):

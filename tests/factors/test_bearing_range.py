@@ -7,7 +7,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.bearing_range import (
+from factors.graph import custom_factor, jacobian_factor, read_pose
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import (
     BearingRangeModel,
     jacobians,
     located,
@@ -21,8 +23,6 @@ from factors.bearing_range import (
     whitened,
     whitened_all,
 )
-from factors.bearing_range_factor import BearingRangeFactor
-from factors.graph import custom_factor, jacobian_factor, read_pose
 
 place = st.floats(-8.0, 8.0)
 poses = st.tuples(place, place, st.floats(-3.1, 3.1)).map(np.array)

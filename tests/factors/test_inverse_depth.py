@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factors import inverse_depth
-from factors.reprojection import CameraModel, linearize_in_space, mounting
+from factors.camera import inverse_depth
+from factors.camera.model import CameraModel, linearize_in_space, mounting
 
 MODEL = CameraModel(
     fx=410.0, fy=415.0, cx=320.0, cy=240.0, width=640, height=480, distortion=(-0.06, 0.01, 4e-4, -3e-4)

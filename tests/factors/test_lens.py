@@ -7,14 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from factors.reprojection import (
-    CameraModel,
-    folded,
-    linearize_in_space,
-    project,
-    rays,
-    undistorted,
-)
+from factors.camera.model import CameraModel, folded, linearize_in_space, project, rays, undistorted
 
 STEP = 1e-6
 lenses = st.builds(

@@ -10,19 +10,19 @@ from hypothesis import strategies as st
 
 from factors import se2
 from factors.graph import read_pose
-from factors.odometry import (
+from factors.motion import Increment
+from factors.odometry.chain import OdometryChain
+from factors.odometry.model import (
     LEAST_HEADING,
     LEAST_POSITION,
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
     Growth,
-    Increment,
     OdometryFactor,
     OdometryModel,
     between_factor,
     recalibrated,
 )
-from factors.odometry_chain import OdometryChain
 
 NOISY = OdometryModel(
     along=Growth(0.1, 0.02, 0.01), lateral=Growth(0.03, 0.01, 0.0), heading=Growth(0.05, 0.1, 0.002), direction=0.1

@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from factors import odometry_kernels, se2
-from factors.odometry import (
+from factors import se2
+from factors.motion import ChainState
+from factors.odometry import kernels as odometry_kernels
+from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
-    ChainState,
     Growth,
     OdometryModel,
     recalibrated,

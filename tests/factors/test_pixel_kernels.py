@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors import pixel_kernels, reprojection, se2
-from factors.reprojection import CameraModel, camera_pose, mounting, predict
-from factors.reprojection_factor import ReprojectionFactor
+from factors import se2
+from factors.camera import model as reprojection
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel, camera_pose, mounting, predict
 
 MODEL = CameraModel(
     500.0,

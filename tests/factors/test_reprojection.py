@@ -8,8 +8,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from factors import reprojection, se2
-from factors.reprojection import (
+from factors import se2
+from factors.camera import model as reprojection
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import (
     FORWARD,
     PARAMETERS,
     TIME_OFFSET,
@@ -27,7 +29,6 @@ from factors.reprojection import (
     predict,
     recalibrated,
 )
-from factors.reprojection_factor import ReprojectionFactor
 
 STEP = 1e-6
 turn = st.floats(-0.5, 0.5)

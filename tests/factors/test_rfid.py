@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factors.rfid import BeamModel, GridModel, LogisticModel, bake, logits, probability
+from factors.rfid.model import BeamModel, GridModel, LogisticModel, bake, logits, probability
 
 COEFFICIENTS = (3.9, -1.5, 0.06, -1.7, 0.25, -0.06, -0.6, -0.1, 1.9, 0.23, -0.16)
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.rfid import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
-from factors.rfid_factor import RfidFactor
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray, together
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray, together
+from factors.rfid.factor import RfidFactor
+from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
 
 COEFFICIENTS = (3.0, -1.2, 0.02, -1.5, 0.2, -0.06, -0.6, 0.4, 0.9, 0.1, -0.16)
 MODELS: dict[str, DetectionModel] = {

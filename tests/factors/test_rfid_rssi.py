@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from factors import se2
-from factors.rfid import Antenna
-from factors.rfid_likelihood import TagArray
-from factors.rfid_rssi import RssiLikelihood, RssiModel, RssiReads, features
+from factors.rfid.detection import TagArray
+from factors.rfid.model import Antenna
+from factors.rfid.strength import RssiLikelihood, RssiModel, RssiReads, features
 from factors.se2 import Array
 
 ANTENNAS = (Antenna(-0.2, -0.3, 1.0, -1.5, 0.1), Antenna(0.1, 0.2, 0.5, 0.7))

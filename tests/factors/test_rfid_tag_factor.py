@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from factors import se2
-from factors.rfid import Antenna, BeamModel, LogisticModel, RfidModel, bake
-from factors.rfid_likelihood import Looks, RfidLikelihood, TagArray
-from factors.rfid_tag_factor import ROWS, RfidTagFactor
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
+from factors.rfid.tag_factor import ROWS, RfidTagFactor
 
 LOGISTIC = LogisticModel((3.0, -0.8, -0.1, -1.5, 0.2, -0.1, -0.4, 0.8, 0.1, -0.05, 0.1))
 GRID = bake(LOGISTIC, 5.0, 0.25, heights=(-1.0, 0.0, 1.0), facings=9)

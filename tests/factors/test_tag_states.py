@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factors.tag_states import TagStates, log_odds
+from factors.rfid.tag_states import TagStates, log_odds
 
 
 def test_silences_add_up_and_one_read_revives() -> None:

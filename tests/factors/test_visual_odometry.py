@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from factors import se2
-from factors.reprojection import CameraModel, mounting, predict
+from factors.camera.model import CameraModel, mounting, predict
+from factors.camera.visual_odometry import RayPairs, VisualOdometryFactor, from_epipole, nearness, sampson, translation
 from factors.se2 import Array
-from factors.visual_odometry import RayPairs, VisualOdometryFactor, from_epipole, nearness, sampson, translation
 
 MODEL = CameraModel(
     500.0,

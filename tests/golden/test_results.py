@@ -17,7 +17,7 @@ from regression.scenarios import SCENARIOS
 from regression.tolerances import TOLERANCE, beyond_processors
 
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.rig import GrowthSettings
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings
 
 CASES = [(name, label) for name, scenario in SCENARIOS.items() for label in scenario.cases()]
 MOST_BYTES = 1_000_000

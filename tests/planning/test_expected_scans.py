@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.planning import expected_scans
+from factorgraph_loc.sensors.rfid import forecast as expected_scans
 from factors import se2
-from factors.rfid import Antenna, BeamModel, LogisticModel, RfidModel, bake
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 
 ANTENNAS = tuple(Antenna(0.2 * math.cos(a), 0.2 * math.sin(a), 1.2, a) for a in (0.0, 1.6, -2.0))
 FACING_MODEL = LogisticModel((2.0, -0.9, -0.05, -3.0, 0.2, 0.1, -0.4, 1.0, 0.2, 0.0, 0.0))

@@ -6,16 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.planning import expected_sightings
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.fisher import expected_covariance
 from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.settings import RACKHAM_RIG, SightingSettings
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factorgraph_loc.sensors.landmarks import forecast as expected_sightings
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.simulation.settings import RACKHAM_RIG
+from factors.landmarks import model as bearing_range
+from factors.rfid.detection import RfidLikelihood, TagArray
 
 RIG = Rig.model_validate(RACKHAM_RIG)
 MEAN = np.array((1.0, 2.0, 0.7))

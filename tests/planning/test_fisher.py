@@ -6,16 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.fisher import expected_covariance, expected_information, fisher_gain
 from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
-from factorgraph_loc.world import Landmark, Tag, World
-from factors import bearing_range, reprojection, se2
-from factors.odometry import ChainState, Growth, OdometryModel, relative_motion
+from factors import se2
+from factors.camera import model as reprojection
+from factors.landmarks import model as bearing_range
+from factors.motion import ChainState
+from factors.odometry.model import Growth, OdometryModel, relative_motion
 
 RIG = Rig.model_validate(RACKHAM_RIG)
 NOISE = OdometryModel(along=Growth(0.02), lateral=Growth(0.01), heading=Growth(0.03))

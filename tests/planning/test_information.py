@@ -7,6 +7,8 @@ import pytest
 from scipy import stats
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.maps.free_space import free_space
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.information import (
     CELL,
     expected_gain,
@@ -15,16 +17,14 @@ from factorgraph_loc.planning.information import (
     particle_entropy,
 )
 from factorgraph_loc.planning.paths import Path, look_around, primitives
-from factorgraph_loc.rfid_settings import RfidSettings
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.free_space import free_space
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.tag_map import tag_map
-from factorgraph_loc.world import World
 from factors import se2
-from factors.odometry import Growth, OdometryModel
-from factors.rfid import Antenna, BeamModel, RfidModel
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factors.odometry.model import Growth, OdometryModel
+from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.model import Antenna, BeamModel, RfidModel
 
 SPREAD = np.array(((0.8, 0.3, 0.01), (0.3, 0.5, -0.02), (0.01, -0.02, 0.05)))
 ALL = ("x", "y", "heading")

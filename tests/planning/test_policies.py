@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators.base import Mode
-from factorgraph_loc.files import parse_model
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.maps.free_space import free_space
+from factorgraph_loc.model.belief import Mode
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import look_around, primitives, waypoint_paths
 from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
-from factorgraph_loc.rfid_settings import RfidSettings
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.simulation.free_space import free_space
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
-from factorgraph_loc.world import World
-from factors.rfid_likelihood import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray
 
 SIDE = 40.0
 SPACE = free_space(

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from factorgraph_loc.maps.free_space import CELL, free_space
 from factorgraph_loc.planning.proximity import SIGMA, TEMPERING, UNEXPECTED, ProximitySensor
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.free_space import CELL, free_space
 from factorgraph_loc.simulation.worlds import make_world
 
 SIGHT, CLEARANCE = 3.0, 0.35

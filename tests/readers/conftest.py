@@ -12,8 +12,8 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import Log
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import Log
 
 RUN = """\
 name = "hall"

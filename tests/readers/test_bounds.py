@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.columns import (
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import (
     BEARING_RANGE,
     IMU,
     INCREMENTS,
@@ -20,10 +21,10 @@ from factorgraph_loc.columns import (
     STAMP,
     VELOCITIES,
 )
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import IncrementStream, StartPose
-from factorgraph_loc.readers import load
-from factorgraph_loc.readers.bounds import require_bounds, require_one_span
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
+from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 
 UNIX = 1_700_000_000_000_000_000
 ROW = {"landmark": "A", "antenna": "left", "epc": "E1", "file": "a.png", "duration": 1.0}

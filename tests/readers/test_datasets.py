@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.log import Log
-from factors import reprojection
+from factorgraph_loc.model.log import Log
+from factors.camera import model as reprojection
 
 SENSOR = """\
 #Default imu sensor yaml file

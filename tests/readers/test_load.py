@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.readers import READERS, describe, load, manifests, read_manifest, verify
-from factorgraph_loc.readers.registry import reader
-from factorgraph_loc.rig import read_rig
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.io.native.rig_file import read_rig
+from factorgraph_loc.io.readers import READERS, describe, load, read_manifest, verify
+from factorgraph_loc.io.readers.registry import reader
 
 MANIFEST = 'title = "t"\nreader = "mrclam"\npath = "set"\nlicence = "none"\norigin = "here"\n'
 

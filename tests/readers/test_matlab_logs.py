@@ -6,8 +6,8 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.readers import load
-from factorgraph_loc.readers.matlab import read_arrays
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.io.readers.matlab import read_arrays
 
 
 def plaza(**changes):

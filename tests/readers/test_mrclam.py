@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 
 
 @pytest.fixture

@@ -12,20 +12,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.log import (
-    BearingRangeStream,
-    IncrementStream,
-    Log,
-    StartPose,
-    VelocityStream,
-    YawRateStream,
-)
-from factorgraph_loc.readers import load, write_native
-from factorgraph_loc.readers.native import RunFile
-from factorgraph_loc.rig import BearingRangeSettings, ImuSettings, Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Landmark, World, read_world
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.io.native.native import RunFile
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.settings import ImuSettings
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 
 
 def test_what_is_read(native, one):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import FeatureStream, ImageStream, SightingStream, TwistStream
-from factorgraph_loc.readers import write_native
+from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, SightingStream
+from factorgraph_loc.sensors.twist.stream import TwistStream
 
 CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
 PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"

@@ -7,11 +7,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.log import Log, RfidStream, VelocityStream, cut
-from factorgraph_loc.readers import load, write_native
-from factorgraph_loc.rfid_settings import AntennaSettings, RfidSettings
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.model.log import Log, cut
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 READS = "t_ns,antenna,epc,rssi,phase,frequency\n"
 INVENTORIES = "t_ns,antenna,duration\n"

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 
 T0 = 1_673_511_856_000_000  # us
 TAGS = "epc,label,x_m,y_m,z_m,facing_deg\nE-1,A1,1.0,-2.0,1.5,90\nE-2,A2,3.0,-1.0,0.5,-90\n"

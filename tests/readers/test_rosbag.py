@@ -10,10 +10,12 @@ import pytest
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.readers import bag_file, load, rosbag
-from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import propose
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.io.bags import file as bag_file
+from factorgraph_loc.io.bags import rosbag
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import propose
+from factorgraph_loc.io.readers import load
 from factors import se2
 
 T0 = 1_700_000_000_000_000_000

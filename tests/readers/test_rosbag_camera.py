@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from rosbag_drive import MS, T0, add_frames, transform
 
-from factorgraph_loc.readers.bag_camera import Images
-from factors.reprojection import mounting
+from factorgraph_loc.io.bags.camera import Images
+from factors.camera.model import mounting
 
 
 def add_image(made, t_ns, pixels, encoding, padding=0, kind=np.uint8):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
 
-from factorgraph_loc.readers import bag_unpacking
-from factorgraph_loc.readers.bag_unpacking import unpacked
+from factorgraph_loc.io.bags import unpacking as bag_unpacking
+from factorgraph_loc.io.bags.unpacking import unpacked
 
 zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 T0 = 1_700_000_000_000_000_000

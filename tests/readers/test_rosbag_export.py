@@ -8,26 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.log import (
-    BearingRangeStream,
-    ImageStream,
-    IncrementStream,
-    Log,
-    RfidStream,
-    SightingStream,
-    StartPose,
-    TwistStream,
-    VelocityStream,
-    YawRateStream,
-)
-from factorgraph_loc.readers import load, rosbag
-from factorgraph_loc.readers.bag_export import write_bag
-from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import propose
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import Tag, World
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.io.bags import rosbag
+from factorgraph_loc.io.bags.export import write_bag
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import propose
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.twist.stream import TwistStream
 
 T0 = 1_700_000_000_123_456_789
 SUFFIXES = [".bag", ".mcap", ".db3"]

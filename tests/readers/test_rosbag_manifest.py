@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.readers.bag_file import open_bag
-from factorgraph_loc.readers.bag_manifest import manifest_of, manifest_text, propose, read_fields, remarks
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose, read_fields, remarks
 
 T0 = 1_700_000_000_000_000_000
 

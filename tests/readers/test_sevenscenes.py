@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
 
 
 def write_pose(path, pose):

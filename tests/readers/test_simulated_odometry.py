@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.readers.simulated_odometry import wheel_odometry
-from factorgraph_loc.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
 from factors import se2
 
 

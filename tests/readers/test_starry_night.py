@@ -5,9 +5,10 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.measurements import PixelSightings, Twist
-from factorgraph_loc.readers import load
-from factors import reprojection
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.twist.measurement import Twist
+from factors.camera import model as reprojection
 
 FOCAL, CU, CV, BASELINE = 480.0, 320.0, 240.0, 0.24
 # a camera that looks back along the vehicle's x axis with the vehicle's z axis down

@@ -11,13 +11,14 @@ from camera_benchmark.faults import cells, said
 from camera_benchmark.faulty import Given
 from camera_benchmark.report import NOTHING, Attempt, accuracy_cells, paired, ratio_cell
 
-from factorgraph_loc.camera_settings import CameraSettings
 from factorgraph_loc.experiments.ensemble import RunErrors, Series
-from factorgraph_loc.log import ImageStream, Log
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.world import World
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream
 
 COUNT = 60
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from factorgraph_loc.estimators.registry import settings_of
 from factorgraph_loc.experiments.experiment_file import SIMULATION, nested, read_experiment
-from factorgraph_loc.shipped import manifests
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.settings import merged
 

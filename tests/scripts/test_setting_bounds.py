@@ -8,17 +8,17 @@ from limits_tables import FILES, numbers_of, tables
 
 from factorgraph_loc.calibration.consistency import inflated
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.estimators import registry
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.rig import (
-    BearingRangeSettings,
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
     OdometryUncertainty,
-    Rig,
 )
-from factorgraph_loc.world import World
 
 NUMBERS = [
     pytest.param(*number, id=f"{file}-{number[0]}") for file, kind in FILES.items() for number in numbers_of(kind)

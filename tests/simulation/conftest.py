@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation import preset, simulate
 
 Make = Callable[..., Log]

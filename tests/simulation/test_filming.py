@@ -6,7 +6,7 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.simulation import film, preset, simulate, with_images
-from factors import reprojection
+from factors.camera import model as reprojection
 
 SETTINGS = {"drive": {"duration": 8.0}, "world": {"tags": 20}, "images": {"rate": 2.5}}
 

@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factorgraph_loc.measurements import RfidScan
-from factorgraph_loc.rig import Rig
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.simulation import draw_dead, draw_reads, read_probabilities
+from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.simulation.rfid import draw_dead, draw_reads, read_probabilities
-from factorgraph_loc.simulation.settings import FaultSettings
-from factorgraph_loc.tag_map import tag_map
-from factors.rfid import BeamModel
+from factors.rfid.model import BeamModel
 
 TIMES = np.arange(1, 2001) * 0.5
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.sensors.rfid.recorded import FAR, SCALES
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset, recorded_looks, simulate
-from factorgraph_loc.simulation.recorded import FAR, SCALES
-from factorgraph_loc.tag_map import tag_map
-from factors.rfid_likelihood import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.renderer import Renderer
 from factorgraph_loc.simulation.scene import ROOM_HEIGHT, make_scene
 from factorgraph_loc.simulation.settings import ImageSettings
-from factorgraph_loc.world import Tag
-from factors import reprojection
-from factors.reprojection import CameraModel
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
 
 MODEL = preset("office").rig.camera.model()
 BARREL = dataclasses.replace(MODEL, distortion=(-0.25, 0.05, 2e-3, -1e-3))

@@ -7,13 +7,15 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.prior import resolve_prior
-from factorgraph_loc.files import parse_model
-from factorgraph_loc.rig import write_rig
+from factorgraph_loc.files.models import parse_model
+from factorgraph_loc.io.native.rig_file import write_rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factorgraph_loc.simulation import PRESETS, SimulationSettings, named_settings, read_settings, simulate
-from factorgraph_loc.simulation.settings import SightingSettings
-from factorgraph_loc.simulation.sightings import sighting_stream
-from factorgraph_loc.world import Landmark, World
-from factors import bearing_range, se2
+from factors import se2
+from factors.landmarks import model as bearing_range
 
 SEEDS = range(40)
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.maps.free_space import distance_to_walls
+from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.model.world import World
 from factorgraph_loc.simulation import PRESETS, preset
-from factorgraph_loc.simulation.free_space import distance_to_walls
 from factorgraph_loc.simulation.settings import DriveSettings
-from factorgraph_loc.simulation.sightings import crosses
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
-from factorgraph_loc.world import World
 from factors import se2
 
 

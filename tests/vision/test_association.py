@@ -6,13 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings
-from factorgraph_loc.measurements import CameraFrame
-from factorgraph_loc.points import PointMap
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import CameraPose, agreeing, compatible
+from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import found_on_floor, located
-from factors import reprojection, se2
+from factors import se2
+from factors.camera import model as reprojection
 
 CAMERA = CameraSettings(
     fx=500.0, fy=500.0, cx=319.5, cy=239.5, distortion=(-0.1, 0.01, 0.001, -0.001), x=0.15, z=0.9, pitch=-0.05

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.vision.competitors import BOX_SIGMA, BOX_XY, DETECTORS, OCTAVES, box_hessian, hessian
-from factorgraph_loc.vision.repeatability import repeatability
-from factorgraph_loc.vision.sequences import find_sequences
+from factorgraph_loc.evaluation.features.competitors import BOX_SIGMA, BOX_XY, DETECTORS, OCTAVES, box_hessian, hessian
+from factorgraph_loc.evaluation.features.repeatability import repeatability
+from factorgraph_loc.evaluation.features.sequences import find_sequences
 
 NAMES = sorted(DETECTORS)
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.vision.competitors import DETECTORS
-from factorgraph_loc.vision.feature_evaluation import (
+from factorgraph_loc.evaluation.features.competitors import DETECTORS
+from factorgraph_loc.evaluation.features.feature_evaluation import (
     Feature,
     RankedMatches,
     evaluate,
@@ -15,10 +15,10 @@ from factorgraph_loc.vision.feature_evaluation import (
     mutual_matches,
     rank,
 )
+from factorgraph_loc.evaluation.features.homography import project
+from factorgraph_loc.evaluation.features.sequences import SCALE, Sequence, find_sequences
 from factorgraph_loc.vision.features import Keypoints, extractor
-from factorgraph_loc.vision.homography import project
 from factorgraph_loc.vision.matching import RATIO, match
-from factorgraph_loc.vision.sequences import SCALE, Sequence, find_sequences
 
 SHAPE = (480, 640)
 HALF = np.array(((0.5, 0.0, 80.0), (0.0, 0.5, 60.0), (0.0, 0.0, 1.0)))

@@ -6,10 +6,11 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.markers import Marker
-from factorgraph_loc.readers import load
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.maps.markers import Marker
 from factorgraph_loc.vision.fiducials import find_markers
-from factors import reprojection, se2
+from factors import se2
+from factors.camera import model as reprojection
 
 FAMILIES = {"tag36h11": cv2.aruco.DICT_APRILTAG_36h11, "4x4_50": cv2.aruco.DICT_4X4_50}
 CELL, QUIET = 20, 40  # px of a bit of the marker's picture, and of white around it

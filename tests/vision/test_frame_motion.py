@@ -6,8 +6,8 @@ from scipy import stats
 
 from factorgraph_loc.vision.frame_motion import FrameMotion, frame_motion
 from factors import se2
-from factors.odometry import Increment
-from factors.reprojection import CameraModel, mounting, predict
+from factors.camera.model import CameraModel, mounting, predict
+from factors.motion import Increment
 from factors.se2 import Array
 
 MODEL = CameraModel(

@@ -10,15 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.log import FeatureStream, ImageStream, Log
-from factorgraph_loc.rig import Rig
-from factorgraph_loc.vision import frontend
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera import frontend
+from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
-from factorgraph_loc.vision.frontend import with_features
-from factorgraph_loc.world import World
+from factorgraph_loc.vision.settings import FrontendSettings
 
 ORB = FrontendSettings(feature="orb", count=100)
 SIZE = (160, 120)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.camera_settings import CameraSettings, FrontendSettings
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.vision.live import LiveFrontend
+from factorgraph_loc.sensors.camera.live import LiveFrontend
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import follow
 
 CAMERA = CameraSettings(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5).model()

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.vision.features import Keypoints, extractor
-from factorgraph_loc.vision.homography import project
-from factorgraph_loc.vision.repeatability import (
+from factorgraph_loc.evaluation.features.homography import project
+from factorgraph_loc.evaluation.features.repeatability import (
     OVERLAP_ERROR,
     RADIUS,
     SCALE_RATIO,
@@ -18,7 +17,8 @@ from factorgraph_loc.vision.repeatability import (
     repeatability,
     shared_area,
 )
-from factorgraph_loc.vision.sequences import find_sequences
+from factorgraph_loc.evaluation.features.sequences import find_sequences
+from factorgraph_loc.vision.features import Keypoints, extractor
 
 SHAPE = (480, 640)
 SHAPES = (SHAPE, SHAPE)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.vision.homography import project, view
-from factorgraph_loc.vision.sequences import (
+from factorgraph_loc.evaluation.features.homography import project, view
+from factorgraph_loc.evaluation.features.sequences import (
     OTHER,
     ROTATION,
     ROTATIONS,

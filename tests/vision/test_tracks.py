@@ -6,7 +6,7 @@ import pytest
 
 from factorgraph_loc.vision import tracks as tracking
 from factorgraph_loc.vision.tracks import follow, pairs
-from factors.reprojection import CameraModel, project, undistorted
+from factors.camera.model import CameraModel, project, undistorted
 
 pytestmark = pytest.mark.kernels
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factorgraph_loc.evaluation.features.sequences import find_sequences
+from factorgraph_loc.evaluation.features.weight_learning import learn_weights
 from factorgraph_loc.vision.descriptor import VALUES
-from factorgraph_loc.vision.sequences import find_sequences
-from factorgraph_loc.vision.weight_learning import learn_weights
 from factorgraph_loc.vision.weights import OWN_SCALE, SHARE, learn, save, shipped
 
 

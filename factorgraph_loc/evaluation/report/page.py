@@ -18,16 +18,16 @@ import polars as pl
 import tomli_w
 
 from factorgraph_loc import __version__
+from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag, text
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import charts, tables
-from factorgraph_loc.evaluation.report.markup import Html, data, figure, join, table, tag, text
 from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
 from factorgraph_loc.evaluation.report.reading import Reading, RunFiles, read_runs
 from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results, score
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
-from factorgraph_loc.files import write_text
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
 
 SHOWN = 8  # variants that are visible at first

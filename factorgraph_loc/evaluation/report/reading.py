@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from factorgraph_loc.drawing.markup import Html, data
 from factorgraph_loc.evaluation.inference import mean_nees_band
 from factorgraph_loc.evaluation.report import tracks
-from factorgraph_loc.evaluation.report.markup import Html, data
 from factorgraph_loc.evaluation.report.results import Results, Row, score
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import KINDS, Series

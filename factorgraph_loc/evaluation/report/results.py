@@ -10,8 +10,8 @@ import polars as pl
 
 from factorgraph_loc.evaluation.inference import SIGNIFICANT, ByLog, Contrast, Pooled, contrast, holm, least_p, pooled
 from factorgraph_loc.evaluation.report.metrics import Metric
-from factorgraph_loc.evaluation.scoring import RULE
 from factorgraph_loc.evaluation.warned import label_of
+from factorgraph_loc.model.scoring import RULE
 
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log

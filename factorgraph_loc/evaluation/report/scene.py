@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from factorgraph_loc.evaluation.pairing import pauses
-from factorgraph_loc.files import write_text
-from factorgraph_loc.log import Log
-from factorgraph_loc.tag_map import tag_map
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.se2 import Array
 
 _POSES = 1500  # of the reference, in all

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from factorgraph_loc.evaluation.report.markup import Html, join, tag
+from factorgraph_loc.drawing.markup import Html, join, tag
 from factorgraph_loc.evaluation.report.results import SCORED, Comparison, Results, score
 from factorgraph_loc.evaluation.report.tables import p_value, uncertainty
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS

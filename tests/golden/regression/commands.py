@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from factorgraph_loc.readers import describe
+from factorgraph_loc.io.readers import describe
 from regression.differences import Difference
 from regression.records import DIGITS, Record, read_records, write_records
 from regression.scenarios import SCENARIOS, ActiveScenario, Scenario

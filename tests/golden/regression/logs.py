@@ -17,14 +17,16 @@ import space_world
 from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
 
-from factorgraph_loc.camera_settings import CameraUncertainty
-from factorgraph_loc.log import FeatureStream, Log, RightSightingStream, TwistStream, cut, join
-from factorgraph_loc.markers import Marker, corner_points
-from factorgraph_loc.points import PointMap
-from factorgraph_loc.readers import load
-from factorgraph_loc.rig import TwistSettings
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.maps.markers import Marker, corner_points
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraUncertainty
+from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.sensors.twist.stream import TwistStream
 from factorgraph_loc.simulation import preset, simulate
-from factorgraph_loc.world import World
 
 SECONDS = 12.0  # of a drive among landmarks
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import camera_world
 from short_logs import with_signals
 
-from factorgraph_loc.log import Log, cut, join
+from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.simulation import preset, simulate
 from regression.scenarios import (
     FINDERS,

@@ -11,15 +11,18 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.estimators.base import Belief, Diagnostics, Estimator, Learnt
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.result import RunResult
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.files import write_text
-from factorgraph_loc.log import Log
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.model.belief import Belief
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.planning.active_run import ActiveRun
-from factorgraph_loc.trajectory import Trajectory
-from factorgraph_loc.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 CAUSAL, FINAL, IN_SPACE, SUMS, LEARNT = 10, 6, 4, 4, 12  # rows that are held, at most

@@ -11,7 +11,7 @@ import absurd_logs
 import short_logs
 
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.log import Log
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.planning.closed_loop import run_active
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation import preset

@@ -1,1 +1,0 @@
-"""The estimators, behind one interface (:mod:`factorgraph_loc.estimators.base`)."""

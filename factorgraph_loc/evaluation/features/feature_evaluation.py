@@ -1,0 +1,242 @@
+"""Features on sequences of images with known homographies: how well they repeat, match, and tell the homography.
+
+Matching score and recall against 1 - precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27,
+2005, section 3; a match is right where the regions of its points overlap
+(:mod:`~factorgraph_loc.evaluation.features.repeatability`). Mean
+average accuracy of the homography: Jin et al., "Image Matching across Wide Baselines", IJCV 129, 2021, section 4, with the error
+at the image's corners.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.features.competitors import DETECTORS
+from factorgraph_loc.evaluation.features.homography import corner_error
+from factorgraph_loc.evaluation.features.repeatability import (
+    OVERLAP_ERROR,
+    Repeatability,
+    Shapes,
+    Truths,
+    common,
+    overlaps,
+    pair_errors,
+    repeatability,
+)
+from factorgraph_loc.evaluation.features.sequences import Sequence
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.text import quoted
+from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
+from factorgraph_loc.vision.images import Image
+from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neighbours, resolution
+from factors.se2 import Array
+
+THRESHOLDS = np.arange(1.0, 11.0)  # px, of the homography's error
+FEATURES = ("colour", "sift", "orb", "fast_hessian", "harris_laplace", "hessian_laplace")
+
+_INLIER = 3.0  # px, of the robust fit
+_CONFIDENCE, _ITERATIONS = 0.9999, 10_000
+
+Matched = tuple[Integers, Integers, Array]  # indices in the first and the second image, ratio of distances
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature under evaluation: ``find`` gives the points of an image, and their descriptors if it has any."""
+
+    name: str
+    find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
+
+
+@dataclass(frozen=True)
+class MatchScores:
+    """How the descriptors of a pair of images match; NaN for detectors, which have none.
+
+    ``matching_score``: right mutual matches over the smaller number of features in the common part; ``matches``: mutual ones with
+    a ratio below :data:`RATIO`, ``precision``: share of them that is right; ``average_precision``: area below precision over
+    recall; ``homography_error`` [px]: at the corners, of the homography fitted to them, infinite if there is none; ``accuracy``:
+    share of :data:`THRESHOLDS` that it is within. What has no matches has scores of 0.
+    """
+
+    matches: int = 0
+    matching_score: float = np.nan
+    precision: float = np.nan
+    average_precision: float = np.nan
+    homography_error: float = np.nan
+    accuracy: float = np.nan
+
+
+@dataclass(frozen=True)
+class PairScores:
+    """The scores of one feature on the first image of a sequence and its image number ``image``.
+
+    ``change`` and ``amount`` are those of the sequence; ``features`` were found in the image, and described, in ``milliseconds``.
+    """
+
+    feature: str
+    sequence: str
+    change: str
+    image: int
+    amount: float
+    features: int
+    milliseconds: float
+    found: Repeatability
+    matched: MatchScores
+
+    def row(self) -> dict[str, Any]:
+        """All of it by name, as a row of a table."""
+        content = asdict(self)
+        return {**content, **content.pop("found"), **content.pop("matched")}
+
+
+@dataclass(frozen=True, eq=False)
+class RankedMatches:
+    """Mutual nearest neighbours of a pair of images, the clearest first.
+
+    ``ratio`` (M,): of the distances to the nearest and the second nearest; ``right`` (M,): whether it is; ``possible``: as many
+    right ones as a perfect matcher could find.
+    """
+
+    ratio: Array
+    right: Truths
+    possible: int
+
+    def curve(self) -> tuple[Array, Array]:
+        """Recall (M,) and 1 - precision (M,), with one more match from each to the next."""
+        correct = np.cumsum(self.right)
+        return correct / max(self.possible, 1), 1.0 - correct / np.arange(1, len(self.right) + 1)
+
+    def average_precision(self) -> float:
+        """Sum of the precision at each right match, over ``possible``; 0 where nothing could be matched."""
+        precision = 1.0 - self.curve()[1]
+        return float(np.sum(precision[self.right]) / max(self.possible, 1))
+
+
+def feature(name: str, count: int) -> Feature:
+    """The feature or detector of that name, at most ``count`` points an image; InputError if there is none."""
+    if name not in EXTRACTORS and name not in DETECTORS:
+        raise InputError(f"feature {quoted(name)} is not known{nearest(name, [*EXTRACTORS, *DETECTORS])}")
+    if name in EXTRACTORS:
+        return Feature(name, extractor(name, count).detectAndCompute)
+    if count < 1:
+        raise InputError(f"feature {name}: count is {count}, expected at least 1")
+    detector = DETECTORS[name](count)
+    return Feature(name, lambda image: (detector.detect(image), None))
+
+
+def evaluate(
+    sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
+) -> Iterator[tuple[PairScores, RankedMatches | None]]:
+    """Scores of a feature on each pair of a sequence, with the ranked matches if it has descriptors.
+
+    Each image is taken on one thread; ``progress`` is called after it.
+    """
+    with _one_thread():
+        what.find(sequence.first)  # what is compiled or allocated at first use is no part of the time
+        (keypoints, descriptors), _ = _timed(what, sequence.first)
+        progress()
+        for k, (image, homography) in enumerate(zip(sequence.others, sequence.homographies, strict=True)):
+            (others, others_described), milliseconds = _timed(what, image)
+            shapes = (sequence.first.shape, image.shape)
+            again = repeatability(keypoints, others, homography, shapes)
+            ranked, matched = None, MatchScores()
+            if descriptors is not None and others_described is not None:
+                matches = mutual_matches(descriptors, others_described)
+                ranked = rank(keypoints, others, matches, homography, shapes)
+                matched = _match_scores(keypoints, others, matches, ranked, homography, shapes)
+            about = (what.name, sequence.name, sequence.change, k + 2, sequence.amounts[k])
+            yield PairScores(*about, len(others), milliseconds, again, matched), ranked
+            progress()
+
+
+def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
+    """Mutual nearest neighbours of two sets of descriptors, bits (``uint8``) or vectors.
+
+    Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 0 where
+    there is no second, 1 where another is as near. Those with a ratio below r, r up to 1, are what
+    :func:`~factorgraph_loc.vision.matching.match` gives for r.
+    """
+    none = np.empty(0, dtype=np.int64)
+    if len(first) == 0 or len(second) == 0:
+        return none, none, np.empty(0)
+    binary = first.dtype == np.uint8
+    distances = distance_matrix(first, second, binary=binary)
+    there = nearest_neighbours(distances, resolution(first, binary=binary))
+    back = nearest_neighbours(distances.T, resolution(second, binary=binary))
+    i = np.flatnonzero(back.index[there.index] == np.arange(len(first)))
+    j = there.index[i]
+    best, runner_up = (values[i].astype(float) for values in (there.best, there.second))
+    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=there.alone[i] & back.alone[j])
+
+
+def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Array, shapes: Shapes) -> RankedMatches:
+    """Which matches are right: both points lie in the common part of the images, and their regions overlap."""
+    i, j, ratio = matches
+    in_first, in_second = common(first, second, homography, shapes)
+    right = in_first[i] & in_second[j] & (pair_errors(first[i], second[j], homography) < OVERLAP_ERROR)
+    pairs = overlaps(first[in_first], second[in_second], homography)
+    close = pairs.error < OVERLAP_ERROR
+    size = (int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))
+    graph = csr_array((np.ones(int(np.count_nonzero(close))), (pairs.first[close], pairs.second[close])), shape=size)
+    possible = int(np.count_nonzero(maximum_bipartite_matching(graph) >= 0)) if min(size) else 0
+    order = np.argsort(ratio, kind="stable")
+    return RankedMatches(ratio[order], right[order], possible)
+
+
+def homography_error(first: Array, second: Array, truth: Array, shape: tuple[int, ...]) -> float:
+    """Error [px] at the corners of the first image, of ``shape``, of a homography fitted robustly to matched points (M, 2).
+
+    Infinite if they give none.
+    """
+    if len(first) < 4:
+        return np.inf
+    estimate, _ = cv2.findHomography(
+        first, second, cv2.USAC_MAGSAC, _INLIER, maxIters=_ITERATIONS, confidence=_CONFIDENCE
+    )
+    return np.inf if estimate is None else corner_error(np.asarray(estimate, dtype=float), truth, shape)
+
+
+def _match_scores(
+    first: Keypoints, second: Keypoints, matches: Matched, ranked: RankedMatches, homography: Array, shapes: Shapes
+) -> MatchScores:
+    i, j, ratio = matches
+    clear = ratio < RATIO
+    clear_right = int(np.count_nonzero(ranked.right[ranked.ratio < RATIO]))
+    error = homography_error(first.points[i[clear]], second.points[j[clear]], homography, shapes[0])
+    in_both = min(int(np.count_nonzero(inner)) for inner in common(first, second, homography, shapes))
+    return MatchScores(
+        int(np.count_nonzero(clear)),
+        int(np.count_nonzero(ranked.right)) / max(in_both, 1),
+        clear_right / max(int(np.count_nonzero(clear)), 1),
+        ranked.average_precision(),
+        error,
+        float(np.mean(error <= THRESHOLDS)),
+    )
+
+
+def _timed(what: Feature, image: Image) -> tuple[tuple[Keypoints, Descriptors | None], float]:
+    """What a feature finds in an image, and the milliseconds it took."""
+    started = time.perf_counter()
+    found = what.find(image)
+    return found, 1e3 * (time.perf_counter() - started)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV on one thread while the block lasts: times are comparable only so."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)

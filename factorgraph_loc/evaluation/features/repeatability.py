@@ -1,0 +1,214 @@
+"""How well points of a scene are found again in another image of it.
+
+A point stands for a disc; the homography makes an ellipse of it in the other image, and two regions correspond where they
+overlap. Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4: repeatability is the number of
+one-to-one correspondences over the smaller number of regions in the part of the scene that both images show. Both regions of
+a pair are magnified until the one in the first image has a radius of 30 px: else large regions would overlap however badly they
+are placed.
+
+What this is lenient about, the other scores ask: the size of a region, and its place in units of the size (``strict``); the
+place in pixels of the first image (``near``); how much of the image the regions that are found again cover, each being a Gaussian
+whose standard deviation is the size of its point (``non_redundant``: Rey-Otero, Delbracio, Morel, "Comparing Feature Detectors:
+A Bias in the Repeatability Criteria", ICIP 2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from factorgraph_loc.evaluation.features.homography import inside, invert, jacobians, project
+from factorgraph_loc.vision.features import Integers, Keypoints
+from factors.se2 import Array
+
+OVERLAP_ERROR = 0.4
+RADIUS = 30.0  # px, of a region of the first image after magnification
+MEASUREMENT = 3.0  # radius of the area that describes a point, in units of half its size
+SCALE_RATIO = 1.2  # the most by which sizes may differ in the strict score
+NEAR = 3.0  # px
+
+_NODES = 64  # of the integration over a disc
+_SAMPLES = 48  # points that stand for one Gaussian
+_CHUNK = 20_000
+
+Truths = NDArray[np.bool_]
+Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both images
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Scores of a pair of images, 0 to 1.
+
+    ``regions``: the smaller number of them in the common part; where there is none, all scores are 0.
+    """
+
+    regions: int
+    repeatability: float
+    strict: float
+    non_redundant: float
+    near: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Pairs of regions that may correspond: ``first`` (M,), ``second`` (M,) their indices, ``error`` (M,) overlap error, ``ratio``
+    (M,) of their sizes in the first image, second over first."""
+
+    first: Integers
+    second: Integers
+    error: Array
+    ratio: Array
+
+    def best(self, chosen: Truths) -> Candidates:
+        """The one-to-one pairs among ``chosen`` (M,): the best first, then the best of what is left."""
+        pairs = one_to_one(self.first[chosen], self.second[chosen], self.error[chosen])
+        rows = np.flatnonzero(chosen)[pairs]
+        return Candidates(self.first[rows], self.second[rows], self.error[rows], self.ratio[rows])
+
+
+def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
+    """The scores of points found in two images of ``shapes`` (height, width, ...); ``homography`` maps the first to the second.
+
+    Points with several orientations are one region, except where redundancy is asked for: there each of them counts as found.
+    """
+    in_first, in_second = common(first, second, homography, shapes)
+    first, second = first[in_first], second[in_second]
+    points = min(len(first), len(second))
+    first, second = distinct(first), distinct(second)
+    count = min(len(first), len(second))
+    if count == 0:
+        return Repeatability(0, 0.0, 0.0, 0.0, 0.0)
+    pairs = overlaps(first, second, homography)
+    again = pairs.best(pairs.error < OVERLAP_ERROR)
+    own = overlaps(first, second, homography, magnified=False)
+    alike = np.maximum(own.ratio, 1.0 / own.ratio) < SCALE_RATIO
+    strict = own.best((own.error < OVERLAP_ERROR) & alike)
+    found = first[again.first]
+    covered = distinct_count(found.points, found.sizes)
+    near = _near(first, second, homography)
+    return Repeatability(count, len(again.first) / count, len(strict.first) / count, covered / points, near / count)
+
+
+def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
+    """Which points of each image lie in the part of the scene that both show."""
+    back = invert(homography)
+    return (
+        inside(project(homography, first.points), shapes[1]),
+        inside(project(back, second.points), shapes[0]),
+    )
+
+
+def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
+    """All pairs of points in the common part whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
+
+    ``magnified``: to :data:`RADIUS`, with the distance of the centres in pixels as it is; else the radius of a region is
+    :data:`MEASUREMENT` times half the size of its point.
+    """
+    if len(first) == 0 or len(second) == 0:
+        none = np.empty(0, dtype=np.int64)
+        return Candidates(none, none, np.empty(0), np.empty(0))
+    mapped = project(invert(homography), second.points)
+    # regions that share more than half of one of them, and are symmetric and convex, have their centres in each other
+    reach = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
+    near = cKDTree(mapped).query_ball_point(first.points, reach)
+    i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
+    j = np.concatenate([np.asarray(row, dtype=np.int64) for row in near])
+    ratio = _sizes_in_first(second, homography)[j] / first.sizes[i]
+    alike = np.maximum(ratio, 1.0 / ratio) ** 2 < 1.0 / (1.0 - OVERLAP_ERROR)
+    i, j, ratio = i[alike], j[alike], ratio[alike]
+    return Candidates(i, j, pair_errors(first[i], second[j], homography, magnified=magnified), ratio)
+
+
+def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Array:
+    """Overlap error (N,) of point n of ``first`` with point n of ``second``: 1 - intersection / union, as in :func:`overlaps`; 1
+    for points that the homography sends to infinity."""
+    back = invert(homography)
+    radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
+    # in units of that radius the first region is the unit disc
+    centre = (project(back, second.points) - first.points) / radius[:, None]
+    local = jacobians(back, second.points) * (second.sizes / first.sizes)[:, None, None]
+    ellipse = local @ local.transpose(0, 2, 1)
+    known = np.isfinite(centre).all(axis=1) & np.isfinite(ellipse).all(axis=(1, 2))
+    error = np.ones(len(first))
+    for rows in np.array_split(np.flatnonzero(known), 1 + len(first) // _CHUNK):
+        area = np.pi * np.sqrt(np.linalg.det(ellipse[rows]))
+        shared = shared_area(centre[rows], ellipse[rows])
+        error[rows] = 1.0 - shared / (np.pi + area - shared)
+    return error
+
+
+def shared_area(centres: Array, ellipses: Array) -> Array:
+    """Areas (N,) that the unit disc shares with ellipses {c + x : x^T S^-1 x <= 1}: ``centres`` c (N, 2), ``ellipses`` S (N, 2, 2).
+
+    The vertical chords of both are intersected at nodes that lie close where the disc is short; good to 0.006.
+    """
+    angles = (np.arange(_NODES) + 0.5) * np.pi / _NODES - np.pi / 2.0
+    x, half = np.sin(angles), np.cos(angles)
+    xx, xy, yy = ellipses[:, 0, 0, None], ellipses[:, 0, 1, None], ellipses[:, 1, 1, None]
+    u = x - centres[:, :1]
+    # chord of the ellipse at u: middle S_xy u / S_xx, half length sqrt(det S (S_xx - u^2)) / S_xx
+    middle = centres[:, 1:] + xy * u / xx
+    length = np.sqrt(np.maximum((xx * yy - xy**2) * (xx - u**2), 0.0)) / xx
+    chords = np.minimum(half, middle + length) - np.maximum(-half, middle - length)
+    return np.asarray(np.maximum(chords, 0.0) @ half * np.pi / _NODES)
+
+
+def one_to_one(first: Integers, second: Integers, error: Array) -> Integers:
+    """Rows of pairs, the least ``error`` first, such that no index of ``first`` or of ``second`` is there twice."""
+    taken_first: set[int] = set()
+    taken_second: set[int] = set()
+    rows = []
+    order = np.argsort(error, kind="stable")
+    for row, i, j in zip(order.tolist(), first[order].tolist(), second[order].tolist(), strict=True):
+        if i not in taken_first and j not in taken_second:
+            taken_first.add(i)
+            taken_second.add(j)
+            rows.append(row)
+    return np.array(rows, dtype=np.int64)
+
+
+def distinct_count(points: Array, sigmas: Array) -> float:
+    """How many of ``points`` (N, 2) there are without those that repeat others: the volume below the maximum of Gaussians of
+    volume 1 around them, of standard deviations ``sigmas`` (N,) (Rey-Otero et al., 2015, section 3).
+
+    N for points far from each other, 1 for N times the same. Computed as the share of each Gaussian in which it is the highest,
+    by a fixed pattern of points drawn from it.
+    """
+    n = len(points)
+    k = np.arange(_SAMPLES) + 0.5
+    radius, angle = np.sqrt(-2.0 * np.log(1.0 - k / _SAMPLES)), k * np.pi * (3.0 - np.sqrt(5.0))
+    pattern = np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))
+    height = -2.0 * np.log(sigmas)
+    total = 0
+    for i in range(n):
+        at = points[i] + sigmas[i] * pattern
+        squared = ((at[:, None] - points) ** 2).sum(axis=2) / sigmas**2
+        logs = height - 0.5 * squared
+        # of equal ones the first counts
+        total += int(np.count_nonzero(np.argmax(logs, axis=1) == i))
+    return total / _SAMPLES
+
+
+def distinct(keypoints: Keypoints) -> Keypoints:
+    """Each place and size once, in the order of the points."""
+    rows = np.column_stack((keypoints.points, keypoints.sizes))
+    _, index = np.unique(rows, axis=0, return_index=True)
+    return keypoints[np.sort(index)]
+
+
+def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
+    """The sizes of the second image's points, seen in the first: of the disc of the same area."""
+    areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
+    return np.asarray(second.sizes * np.sqrt(areas))
+
+
+def _near(first: Keypoints, second: Keypoints, homography: Array) -> int:
+    """One-to-one pairs that lie within :data:`NEAR` of each other in the first image, whatever their sizes."""
+    mapped = project(invert(homography), second.points)
+    near = cKDTree(mapped).query_ball_point(first.points, NEAR)
+    i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
+    j = np.concatenate([np.asarray(row, dtype=np.int64) for row in near])
+    return len(one_to_one(i, j, np.linalg.norm(first.points[i] - mapped[j], axis=1)))

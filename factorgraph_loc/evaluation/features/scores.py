@@ -1,0 +1,270 @@
+"""Features on several sequences of images: their scores as tables, files and pictures (figure 3 of the paper among them)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as Several
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.features.feature_evaluation import Feature, RankedMatches, evaluate
+from factorgraph_loc.evaluation.features.sequences import OTHER, Sequence
+from factorgraph_loc.evaluation.tables import markdown
+from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.vision.matching import RATIO
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FILES = ("table.md", "pairs.parquet", "matches.parquet", "figure3.png", "matching.png")
+OURS = "colour"
+HOMOGRAPHY = 5.0  # px, within which a homography is called found in the table
+
+# of the table; column: figure of the rows, digits
+COLUMNS = {
+    "features": ("features", 0),
+    "repeatability": ("repeatability", 3),
+    "strict": ("strict", 3),
+    "non-redundant": ("non_redundant", 3),
+    "within 3 px": ("near", 3),
+    "matching score": ("matching_score", 3),
+    f"precision at {RATIO:g}": ("precision", 3),
+    "average precision": ("average_precision", 3),
+    "H mAA": ("accuracy", 3),
+    f"H < {HOMOGRAPHY:g} px": ("homography_found", 2),
+    "time [ms]": ("milliseconds", 1),
+}
+_MARKERS = ("o", "s", "^", "v", "D", "P", "X")
+_PANELS = 3  # beside each other
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class FeatureScores:
+    """``rows``: one a feature and pair of images, as :class:`~factorgraph_loc.evaluation.features.feature_evaluation.PairScores`
+    names them.
+
+    ``ranked``: the ranked matches of each row, None for detectors.
+    """
+
+    rows: list[Row]
+    ranked: list[RankedMatches | None]
+
+    def names(self) -> list[str]:
+        """The features, in the order of the rows."""
+        return list(dict.fromkeys(row["feature"] for row in self.rows))
+
+    def sequences(self) -> list[str]:
+        """The names of the sequences, in the order of the rows."""
+        return list(dict.fromkeys(row["sequence"] for row in self.rows))
+
+    def of(self, name: str, sequences: Several[str]) -> list[int]:
+        """The places of the rows of one feature on some sequences."""
+        return [i for i, r in enumerate(self.rows) if r["feature"] == name and r["sequence"] in sequences]
+
+
+def evaluate_all(
+    sequences: Several[Sequence], features: Several[Feature], progress: Callable[[float, float], None]
+) -> FeatureScores:
+    """The scores of each feature on each sequence; ``progress`` is told how many images are done, of how many."""
+    scores = FeatureScores([], [])
+    total = len(features) * sum(1 + len(sequence.others) for sequence in sequences)
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    for sequence in sequences:
+        for feature in features:
+            for pair, ranked in evaluate(sequence, feature, step):
+                row = pair.row()
+                # detectors have no homography, which is not the same as not to find it
+                error = row["homography_error"]
+                row["homography_found"] = error if np.isnan(error) else float(error < HOMOGRAPHY)
+                scores.rows.append(row)
+                scores.ranked.append(ranked)
+    return scores
+
+
+def check_free(out: Path, *, overwrite: bool) -> None:
+    """InputError if ``out`` is no folder to write to, or holds such results already."""
+    sweep(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is not a folder")
+    if not overwrite and (there := [name for name in FILES if (out / name).exists()]):
+        raise InputError(f"{out}: has {there[0]} already; choose another folder or give --overwrite")
+
+
+def write_scores(scores: FeatureScores, out: Path) -> None:
+    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, all ranked matches, and both pictures."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_text(out / "table.md", tables(scores))
+        frame = pl.DataFrame(scores.rows).drop("homography_found")
+        unknown = (pl.col(pl.Float64).is_nan()) | (pl.col(pl.Float64).is_infinite())
+        _write_parquet(frame.with_columns(pl.when(~unknown).then(pl.col(pl.Float64))), out / "pairs.parquet")
+        _write_parquet(_matches(scores), out / "matches.parquet")
+        for name, draw in (("figure3.png", figure3), ("matching.png", recall_curves)):
+            with replacing(out / name) as temporary:
+                save(draw(scores), temporary)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and lines of a table: each feature, mean over the pairs of ``sequences`` (None: of all), of times the median; a dash
+    where a feature has no such score."""
+    chosen = scores.sequences() if sequences is None else sequences
+    lines = []
+    for name in scores.names():
+        rows = [scores.rows[i] for i in scores.of(name, chosen)]
+        lines.append([name, *(_cell([row[key] for row in rows], key, digits) for key, digits in COLUMNS.values())])
+    return ["feature", *COLUMNS], lines
+
+
+def tables(scores: FeatureScores) -> str:
+    """The summary over all, and for each sequence the repeatability of each pair, as markdown."""
+    parts = [
+        f"Mean over {len(scores.of(scores.names()[0], scores.sequences()))} pairs of images\n",
+        markdown(*summary(scores)),
+    ]
+    for sequence in scores.sequences():
+        rows = [row for row in scores.rows if row["sequence"] == sequence]
+        amounts = list(dict.fromkeys((row["image"], row["amount"]) for row in rows))
+        header = ["repeatability", *(f"{amount:.3g}" for _, amount in amounts)]
+        lines = [
+            [name, *(f"{row['repeatability']:.3f}" for row in rows if row["feature"] == name)]
+            for name in scores.names()
+        ]
+        parts += [f"\n{sequence}, {rows[0]['change']}\n", markdown(header, lines)]
+    return "\n".join(parts)
+
+
+def figure3(scores: FeatureScores) -> Any:
+    """Repeatability over the change between the images, a row of panels for each sequence.
+
+    Left the competitors, right the colour features, if they were evaluated, over the range of the competitors. Photographs that
+    were warped alike are averaged.
+    """
+    groups = _groups(scores)
+    others = [name for name in scores.names() if name != OURS]
+    both = OURS in scores.names() and bool(others)
+    figure, axes = grid(len(groups), 1 + both, 4.2 * len(groups) + 1.2, "Repeatability (overlap error below 40 %)")
+    for row, (title, members) in zip(axes, groups.items(), strict=True):
+        left = {name: _means(scores, name, members) for name in (others or scores.names())}
+        for name, (x, y) in left.items():
+            row[0].plot(x, y, label=_label(name), **_style(name, scores.names()))
+        if both:
+            x = next(iter(left.values()))[0]
+            values = np.array([y for _, y in left.values()])
+            row[1].fill_between(x, values.min(axis=0), values.max(axis=0), color="0.88", label="range of the others")
+            row[1].plot(*_means(scores, OURS, members), label=OURS, **_style(OURS, scores.names()))
+        for axis in row:
+            axis.set_title(title)
+            axis.set_ylim(0.0, 1.0)
+            axis.set_xlabel(scores.rows[scores.of(scores.names()[0], members)[0]]["change"])
+        row[0].set_ylabel("repeatability")
+    legend(figure, axes.flat)
+    return figure
+
+
+def recall_curves(scores: FeatureScores) -> Any:
+    """Recall over 1 - precision of all pairs of a group together, the threshold being the ratio of distances."""
+    groups = _groups(scores)
+    columns = min(_PANELS, len(groups))
+    rows = -(-len(groups) // columns)
+    figure, axes = grid(
+        rows, columns, 5.0 * rows + 1.2, "Mutual nearest neighbours, by a threshold on the ratio of distances"
+    )
+    for axis, (title, members) in zip(axes.flat, groups.items(), strict=False):
+        axis.set_title(title)
+        axis.set_xlim(0.0, 1.0)
+        axis.set_ylim(0.0, 1.0)
+        axis.set_xlabel("1 - precision")
+        axis.set_ylabel("recall")
+        for name in scores.names():
+            ranked = [r for i in scores.of(name, members) if (r := scores.ranked[i]) is not None]
+            if ranked:
+                _curve(axis, ranked, label=_label(name), **_style(name, scores.names(), markers=False))
+    for axis in axes.flat[len(groups) :]:
+        axis.set_visible(False)
+    legend(figure, axes.flat)
+    return figure
+
+
+def _curve(axis: Axes, ranked: Several[RankedMatches], **style: Any) -> None:
+    ratio = np.concatenate([r.ratio for r in ranked])
+    order = np.argsort(ratio, kind="stable")
+    right = np.concatenate([r.right for r in ranked])[order]
+    recall, false = RankedMatches(ratio[order], right, sum(r.possible for r in ranked)).curve()
+    axis.plot(false, recall, **style)
+
+
+def _groups(scores: FeatureScores) -> dict[str, list[str]]:
+    """Sequences to be drawn together, by title: photographs warped by the same amounts, every other one alone."""
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    first = scores.names()[0]
+    for sequence in scores.sequences():
+        rows = [scores.rows[i] for i in scores.of(first, [sequence])]
+        change = rows[0]["change"]
+        amounts = tuple(row["amount"] for row in rows)
+        groups.setdefault((change, amounts, sequence if change == OTHER else ""), []).append(sequence)
+    titles = [
+        names[0] if len(names) == 1 else f"{len(names)} photographs, {names[0].split()[-1]}"
+        for names in groups.values()
+    ]
+    return dict(zip(titles, groups.values(), strict=True))
+
+
+def _means(scores: FeatureScores, name: str, sequences: Several[str]) -> tuple[list[float], list[float]]:
+    """Amounts of change in rising order, and the mean repeatability at each."""
+    rows = [scores.rows[i] for i in scores.of(name, sequences)]
+    amounts = sorted({row["amount"] for row in rows})
+    return amounts, [float(np.mean([r["repeatability"] for r in rows if r["amount"] == x])) for x in amounts]
+
+
+def _style(name: str, names: Several[str], *, markers: bool = True) -> dict[str, Any]:
+    # the same look in all panels and both pictures
+    i = names.index(name)
+    style = {"color": COLOURS[i % len(COLOURS)], "linewidth": 2.0}
+    return style | {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 7} if markers else style
+
+
+def _label(name: str) -> str:
+    return "DoG (sift)" if name == "sift" else name
+
+
+def _cell(values: Several[float], key: str, digits: int) -> str:
+    if np.isnan(values).all():
+        return "-"
+    # the first calls of a process and a busy machine make outliers
+    middle = np.median(values) if key == "milliseconds" else np.mean(values)
+    return f"{middle:.{digits}f}"
+
+
+def _matches(scores: FeatureScores) -> pl.DataFrame:
+    """Every mutual match: feature, sequence, image, ratio of distances, whether it is right."""
+    frames = [
+        pl.DataFrame({"ratio": r.ratio, "right": r.right}).select(
+            *(pl.lit(row[key]).alias(key) for key in ("feature", "sequence", "image")), "ratio", "right"
+        )
+        for row, r in zip(scores.rows, scores.ranked, strict=True)
+        if r is not None
+    ]
+    schema = {"feature": pl.String, "sequence": pl.String, "image": pl.Int32, "ratio": pl.Float64, "right": pl.Boolean}
+    return pl.concat([pl.DataFrame(schema=schema), *(frame.cast({"image": pl.Int32}) for frame in frames)])
+
+
+def _write_parquet(frame: pl.DataFrame, path: Path) -> None:
+    with replacing(path) as temporary:
+        frame.write_parquet(temporary)

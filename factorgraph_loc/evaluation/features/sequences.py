@@ -1,0 +1,164 @@
+"""Images of one flat scene with known homographies: folders as those of Oxford, or one photograph warped by known amounts.
+
+Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005: ``img1`` to ``imgN`` and the homographies
+``H1to2p`` to ``H1toNp`` from the first image to each other one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence as Several
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.features.homography import View, read_homography, view
+from factorgraph_loc.vision.images import Image, read_image
+from factors.se2 import Array
+
+ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # by how much a photograph is made smaller
+ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
+MIN_WARPED = 128  # px a side: a fourth of it must still have features
+
+SCALE, ROTATION, VIEWPOINT, OTHER = "scale change", "rotation [degrees]", "viewpoint (tilt)", "image"
+_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # from where on a sequence is about this
+_SUFFIXES = ("", ".txt", ".xml")
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """A first image, and others with the homographies (3, 3) [px] that lead to them from the first.
+
+    ``change``: what differs between the images; ``amounts``: how much of it is in each of the others.
+    """
+
+    name: str
+    first: Image
+    others: tuple[Image, ...]
+    homographies: tuple[Array, ...]
+    change: str
+    amounts: tuple[float, ...]
+
+
+def find_sequences(paths: Several[Path]) -> list[Sequence]:
+    """The sequences of ``paths``: folders of one sequence, folders of such folders, and photographs, which are warped.
+
+    InputError for what is none of these, or is damaged.
+    """
+    found: list[Sequence] = []
+    for path in paths:
+        if path.is_file():
+            found += warped(read_image(path), path)
+        elif path.is_dir():
+            folders = [path] if _images(path) else sorted(p for p in path.iterdir() if p.is_dir() and _images(p))
+            if not folders:
+                raise InputError(f"{path}: has no images, expected img1, img2, ... or folders with such images")
+            found += [read_sequence(folder) for folder in folders]
+        else:
+            raise InputError(f"{path}: there is no such image or folder")
+    names = [one.name for one in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{twice[0]}: several sequences have that name, expected one each")
+    return found
+
+
+def read_sequence(folder: Path) -> Sequence:
+    """The sequence in a folder; InputError names the file that is missing or damaged."""
+    paths = _images(folder)
+    if sorted(paths) != list(range(1, len(paths) + 1)) or len(paths) < 2:
+        missing = next(k for k in range(1, max(paths, default=0) + 2) if k not in paths)
+        raise InputError(f"{folder}: has no img{missing}, expected img1, img2, ... without gaps")
+    first = read_image(paths[1])
+    others, homographies = [], []
+    for k in range(2, len(paths) + 1):
+        candidates = [folder / f"H1to{k}p{suffix}" for suffix in _SUFFIXES]
+        file = next((candidate for candidate in candidates if candidate.exists()), None)
+        if file is None:
+            raise InputError(f"{folder}: has no homography H1to{k}p (plain text, .txt, or .xml of OpenCV) for img{k}")
+        others.append(read_image(paths[k]))
+        homographies.append(read_homography(file, first.shape))
+    change, amounts = _change([view(h, first.shape) for h in homographies])
+    return Sequence(folder.resolve().name, first, tuple(others), tuple(homographies), change, amounts)
+
+
+def warped(photograph: Image, source: Path) -> list[Sequence]:
+    """A photograph made smaller by :data:`ZOOMS`, and turned by :data:`ROTATIONS`.
+
+    What is made smaller, by means over areas, lies in the middle of the mirrored photograph: a camera farther away sees more of
+    the surroundings, so that the same number of points falls on less of the scene. Of turned images the square is kept that has
+    no border in any of them; the first image is the same square. InputError, naming ``source``, if the photograph is too small.
+    """
+    height, width = photograph.shape[:2]
+    if min(height, width) < MIN_WARPED:
+        expected = f"at least {MIN_WARPED} px a side of a photograph that is to be warped"
+        raise InputError(f"{source}: has {width} x {height} px, expected {expected}")
+    name = f"{source.resolve().parent.name}/{source.stem}"
+    return [_zoomed(photograph, f"{name} zoomed"), _rotated(photograph, f"{name} rotated")]
+
+
+def _zoomed(photograph: Image, name: str) -> Sequence:
+    height, width = photograph.shape[:2]
+    others, homographies = [], []
+    for zoom in ZOOMS:
+        size = (round(width / zoom), round(height / zoom))
+        small = np.asarray(cv2.resize(photograph, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        left, top = (width - size[0]) // 2, (height - size[1]) // 2
+        whole = photograph[:, ::-1].copy()
+        whole[top : top + size[1], left : left + size[0]] = small
+        others.append(whole)
+        # (0, 0) is the centre of a pixel, not its corner
+        x, y = size[0] / width, size[1] / height
+        shift = (0.5 * (x - 1.0) + left, 0.5 * (y - 1.0) + top)
+        homographies.append(np.array(((x, 0.0, shift[0]), (0.0, y, shift[1]), (0.0, 0.0, 1.0))))
+    return Sequence(name, photograph, tuple(others), tuple(homographies), SCALE, ZOOMS)
+
+
+def _rotated(photograph: Image, name: str) -> Sequence:
+    height, width = photograph.shape[:2]
+    side = int(min(height, width) / np.sqrt(2.0))
+    centre, middle = np.array((width - 1.0, height - 1.0)) / 2.0, (side - 1.0) / 2.0
+
+    def turned(degrees: float) -> tuple[Image, Array]:
+        """The square turned, and the map from the photograph to it."""
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        matrix = np.eye(3)
+        matrix[:2, :2] = ((c, -s), (s, c))
+        matrix[:2, 2] = middle - matrix[:2, :2] @ centre
+        image = cv2.warpAffine(
+            photograph, matrix[:2], (side, side), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
+        return np.asarray(image, dtype=np.uint8), matrix
+
+    first, to_first = turned(0.0)
+    back = np.linalg.inv(to_first)
+    pairs = [turned(degrees) for degrees in ROTATIONS]
+    homographies = tuple(matrix @ back for _, matrix in pairs)
+    return Sequence(name, first, tuple(image for image, _ in pairs), homographies, ROTATION, ROTATIONS)
+
+
+def _images(folder: Path) -> dict[int, Path]:
+    """The files ``imgK.*`` of a folder by K; InputError if there are several of one K."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = re.fullmatch(r"img(\d+)\.\w+", path.name)
+        if match and path.is_file():
+            k = int(match[1])
+            if k in found:
+                raise InputError(f"{folder}: has both {found[k].name} and {path.name}, expected one img{k}")
+            found[k] = path
+    return found
+
+
+def _change(views: Several[View]) -> tuple[str, tuple[float, ...]]:
+    """What a sequence is about, from the geometry of its pairs; blur and light leave none, then images are counted."""
+    zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
+    if max(v.tilt for v in views) > _TILTED:
+        return VIEWPOINT, tuple(v.tilt for v in views)
+    if max(zooms) > _SCALED:
+        return SCALE, tuple(zooms)
+    if max(abs(v.rotation) for v in views) > _TURNED:
+        return ROTATION, tuple(float(np.degrees(abs(v.rotation))) for v in views)
+    return OTHER, tuple(float(k) for k in range(2, len(views) + 2))

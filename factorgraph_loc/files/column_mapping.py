@@ -1,0 +1,274 @@
+"""Tables as other programs write them, by a mapping: which of their columns is what, and in which unit.
+
+CSV with any separator, with a header or without, or JSON lines. Only text is read here; what it means is the caller's business.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.columns import LATEST, Column, require_span
+from factorgraph_loc.files.csv_cells import Cells
+from factorgraph_loc.files.models import FileModel, nearest, parse_json, read_text
+from factorgraph_loc.text import listed, quoted, told, well_formed
+from factors.se2 import Array
+
+JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
+COMMENT = ("#", "//")
+SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
+ISO = "iso"
+MOST_DIGITS = 20  # of a stamp before its decimal point
+LEAST_UNIT = 1e-12  # of ours, and the largest is its reciprocal
+
+EpcCase = Literal["as written", "upper", "lower"]
+
+
+class ColumnMapping(FileModel):
+    """``columns``: the column of the file for each of our fields; in JSON lines the keys that lead to it, ``event.epc``; without a
+    ``header`` its number from 1. ``units`` by field: the name of a unit, or what to multiply with. ``decimal``: the mark that
+    spreadsheets of some countries write."""
+
+    file: str
+    columns: dict[str, str]
+    units: dict[str, str | float] = Field(default_factory=dict)
+    separator: Literal[",", ";", "\t", " "] = ","
+    decimal: Literal[".", ","] = "."
+    header: bool = True
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """N rows of a file, by our ``fields``; ``passed``: objects of JSON lines that have nothing of them and are left out."""
+
+    cells: Cells
+    mapping: ColumnMapping
+    fields: tuple[str, ...]
+    passed: int = 0
+
+    @property
+    def path(self) -> Path:
+        return self.cells.path
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Where the rows (N,) stand in the file, as an editor counts lines."""
+        return np.array(self.cells.rows, dtype=np.int64)
+
+    def texts(self, field: str) -> Sequence[str]:
+        """The cells (N) of a field as they stand there."""
+        return self.cells.columns[self.mapping.columns[field]]
+
+    def numbers(self, field: str, column: Column) -> Array:
+        """A field (N,), what ``column`` describes, in its unit; NaN where it is empty."""
+        name = self.mapping.columns[field]
+        cells = self.cells
+        if self.mapping.decimal == ",":
+            plain = [text.replace(",", ".") for text in cells.columns[name]]
+            cells = Cells(cells.path, cells.rows, {name: plain})
+        return cells.numbers(name, column, self._unit(field, column.units))
+
+    def stamps(self, field: str, offset: float = 0.0) -> NDArray[np.int64]:
+        """A field (N,) as nanoseconds; ``offset`` [s] is added. Times of the day without a zone are UTC."""
+        unit = self.mapping.units.get(field)
+        if unit not in {*SECONDS, ISO}:
+            expected = f"one of {', '.join(SECONDS)} or {ISO}"
+            raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}: units.{field}")
+        column, shift = self.mapping.columns[field], round(offset * 1e9)
+        out = np.empty(len(self.cells.rows), dtype=np.int64)
+        for i, text in enumerate(self.cells.columns[column]):
+            try:
+                stamp = iso_nanoseconds(text) if unit == ISO else self._decimal(text, SECONDS[str(unit)])
+                if abs(stamp + shift) > LATEST:
+                    raise OverflowError
+            except (ValueError, ArithmeticError):
+                most = LATEST / 10 ** SECONDS.get(str(unit), 0)
+                expected = f"a number of {unit} in {-most:g} to {most:g}"
+                if unit == ISO:
+                    expected = "a date and time, 2026-01-31T12:00:00.5Z"
+                raise bad_field(self.path, column, text, expected, row=self.cells.rows[i]) from None
+            out[i] = stamp + shift
+        require_span([(self.path, self.cells.rows, out)])
+        return out
+
+    def _decimal(self, text: str, power: int) -> int:
+        """A decimal number times ten to ``power``, rounded, without the errors of floating point."""
+        number = Decimal(text.replace(self.mapping.decimal, "."))
+        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # before all of its digits are written out
+            raise OverflowError
+        return round(number.scaleb(power))
+
+    def _unit(self, field: str, units: Mapping[str, float]) -> str | float:
+        unit = self.mapping.units.get(field, next(iter(units)))
+        if unit in units if isinstance(unit, str) else LEAST_UNIT <= abs(unit) <= 1.0 / LEAST_UNIT:
+            return unit
+        expected = f"one of {', '.join(units)}, or a number of them, at least {LEAST_UNIT:g}"
+        raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}")
+
+
+def read_mapped(
+    path: Path, mapping: ColumnMapping, shapes: Sequence[Collection[str]], optional: Collection[str] = ()
+) -> Mapped:
+    """The rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some that are ``optional``.
+
+    A column of an optional field may be missing in the file. InputError names file, row and column of what is wrong.
+    """
+    given = set(mapping.columns)
+    known = set(optional).union(*shapes)
+    if unknown := sorted(given - known):
+        raise InputError(f"{path}: there is no field {quoted(unknown[0])} to map{nearest(unknown[0], sorted(known))}")
+    if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
+        expected = " or ".join(", ".join(shape) for shape in shapes)
+        raise InputError(f"{path}: columns maps {listed(sorted(given))}, expected {expected}")
+    if stray := sorted(set(mapping.units) - given):
+        raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
+    needed = [column for field, column in mapping.columns.items() if field not in optional]
+    if path.suffix.lower() in JSON_SUFFIXES:
+        cells, passed = _read_json_lines(path, mapping, needed)
+    else:
+        cells, passed = _read_csv(path, mapping, needed), 0
+    if not cells.rows:
+        raise InputError(f"{path}: holds no rows")
+    return Mapped(cells, mapping, tuple(f for f, column in mapping.columns.items() if column in cells.columns), passed)
+
+
+def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
+    """EPCs in the letters in which log and map are compared."""
+    if case == "as written":
+        return list(epcs)
+    return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]
+
+
+def iso_nanoseconds(text: str) -> int:
+    """A date and time of ISO 8601 as nanoseconds since 1970; without a zone it is UTC. ValueError for anything else."""
+    # datetime itself keeps microseconds only
+    fraction = re.search(r"[.,](\d+)", text)
+    whole = text.replace(fraction.group(0), "", 1) if fraction else text
+    moment = datetime.fromisoformat(whole.strip())
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    digits = fraction.group(1) if fraction else ""
+    return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
+
+
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cells:
+    numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
+    comments, content = _split_comments(numbered)
+    if not content:
+        raise InputError(f"{path}: holds no rows")
+    parsed = _cells_of(path, content, mapping.separator)
+    first_row, first = next(parsed)
+    if not mapping.header:
+        header = [str(i) for i in range(1, len(first) + 1)]
+    else:
+        named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
+        # a comment of as many names as there are columns is the header, unless the first row has the names
+        in_comment = set(needed) <= set(named) or (len(named) == len(first) and not set(needed) <= set(first))
+        header = named if in_comment else first
+    _require_columns(path, needed, header, first_row)
+    rows, table = [], []
+    body = parsed if header is first else _chained((first_row, first), parsed)
+    for row, parts in body:
+        if len(parts) != len(header):
+            raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
+        rows.append(row)
+        table.append(parts)
+    wanted = [column for column in mapping.columns.values() if column in header]
+    return Cells(path, rows, {column: [parts[header.index(column)] for parts in table] for column in wanted})
+
+
+def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
+    """The comments before the first row, without their marks, for the last may be the header; and the rows."""
+    content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
+    until = content[0][0] if content else 0
+    comments = [(row, line.lstrip().lstrip("#/").strip()) for row, line in lines if row < until]
+    return comments, content
+
+
+def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
+    if separator == " ":  # columns between any number of blanks
+        yield from ((row, line.split()) for row, line in lines)
+        return
+    reader = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True, strict=True)
+    try:
+        for parts in reader:
+            yield lines[reader.line_num - 1][0], [part.strip() for part in parts]
+    except csv.Error as error:
+        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
+
+
+def _chained(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    yield first
+    yield from rest
+
+
+def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], row: int) -> None:
+    for column in needed:
+        if column not in header:
+            raise InputError(f"{path}:{row}: has no column {quoted(column)}, it has {listed(header)}")
+        if list(header).count(column) > 1:
+            raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
+
+
+def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, int]:
+    """The objects of JSON lines, one or a list of them in a line, that have all the columns ``needed``."""
+    rows: list[int] = []
+    columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
+    passed, seen = 0, dict.fromkeys(columns, False)
+    keys: list[str] = []
+    for row, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        for entry in _objects(path, row, line):
+            found = {column: _at(entry, column) for column in columns}
+            keys = keys or sorted(_paths(entry))
+            seen |= {column: True for column, value in found.items() if value is not None}
+            if any(found[column] is None for column in needed):
+                passed += 1
+                continue
+            rows.append(row)
+            for column, value in found.items():
+                if isinstance(value, (dict, list)):
+                    raise bad_field(path, column, value, "a number or a text", row=row)
+                columns[column].append("" if value is None else well_formed(str(value)))
+    for column in needed:
+        if passed and not seen[column]:
+            raise InputError(f"{path}: no object has {quoted(column)}, the first has {listed(keys)}")
+    return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), passed
+
+
+def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:
+    content = parse_json(line, f"{path}:{row}")
+    entries = content if isinstance(content, list) else [content]
+    if not all(isinstance(entry, dict) for entry in entries):
+        raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
+    return entries
+
+
+def _at(entry: Mapping[str, Any], keys: str) -> Any:
+    """What stands below keys that are joined by dots; None if nothing does."""
+    value: Any = entry
+    for key in keys.split("."):
+        if not isinstance(value, Mapping) or key not in value:
+            return None
+        value = value[key]
+    return value
+
+
+def _paths(entry: Mapping[str, Any], before: str = "") -> Iterator[str]:
+    for key, value in entry.items():
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{before}{key}.")
+        else:
+            yield before + key

@@ -1,0 +1,293 @@
+"""Reading what people write, and writing so that nothing is half-written."""
+
+import difflib
+import gc
+import hashlib
+import json
+import math
+import os
+import re
+import tomllib
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import date, time
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import bounded
+from factorgraph_loc.files.temporary import temporary_file
+from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
+
+LONGEST_FILE = 100  # bytes of a file's name that is made from another
+DEEPEST = 64  # tables or lists within each other, and parts of a key
+MANY = 1000  # names that a misspelt one is compared to: each takes its time
+MOST_ENTRIES = 1_000_000  # of all tables and lists of a file
+MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
+
+
+class FileModel(BaseModel):
+    """Base of everything that people write in TOML: frozen, and no key that we do not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with other values, numbers beyond the bounds of their field at the bound: what is computed cannot make settings
+        that could not be read again."""
+        return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
+
+    @classmethod
+    def bounded(cls, **values: Any) -> Self:
+        """One of computed values, numbers beyond the bounds of their field at the bound."""
+        return cls(**{key: _within(cls, key, value) for key, value in values.items()})
+
+
+Model = TypeVar("Model", bound=BaseModel)
+FARTHEST = 1e7  # m: northings of UTM go so far
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
+
+
+def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
+    """The least and the largest number that pydantic's ``metadata`` of a field allow; infinite where there is no bound."""
+    low, high = -math.inf, math.inf
+    for entry in metadata:
+        for part in getattr(entry, "metadata", (entry,)):
+            low = max(low, getattr(part, "ge", low), math.nextafter(getattr(part, "gt", -math.inf), math.inf))
+            high = min(high, getattr(part, "le", high), math.nextafter(getattr(part, "lt", math.inf), -math.inf))
+    return low, high
+
+
+def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
+    """``value`` of a field, a number at the nearest bound if it lies beyond; NaN stays."""
+    field = kind.model_fields.get(name)
+    if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    low, high = bounds(field.metadata)
+    return low if value < low else high if value > high else value
+
+
+def read_text(path: Path, limit: int = bounded.DATA) -> str:
+    """The content of a text file of at most ``limit`` bytes, its line ends as they are; InputError if it is missing, larger, no
+    regular file or not UTF-8."""
+    try:
+        return bounded.read_bytes(path, limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, has more
+    than :data:`MOST_ENTRIES`, or a date or an integer of more than 64 bits, of which no file of ours has any."""
+    return parse_toml(read_text(path, bounded.SETTINGS), path)
+
+
+def parse_toml(text: str, source: object) -> dict[str, Any]:
+    """The content of a text in TOML; InputError as of :func:`read_toml`."""
+    for row, line in enumerate(text.split("\n"), start=1):
+        # the time that tomllib takes grows with the square of the parts
+        if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
+            raise InputError(f"{plain(source)}:{row}: a key has more than {DEEPEST} parts")
+    with bounded.foreign(source, "is not TOML"):
+        content = tomllib.loads(text)
+    check_content(content, source)
+    return content
+
+
+def check_content(content: dict[str, Any], source: object) -> None:
+    """InputError for what none of our files has: what is nested deeper than :data:`DEEPEST`, more than :data:`MOST_ENTRIES`, a
+    date, an integer of more than 64 bits, text that is none in UTF-8, or what is no value of TOML at all."""
+    for key, value in _leaves(content, source):
+        if isinstance(value, int) and abs(value) >= 2**63:
+            raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
+        if isinstance(value, date | time):
+            raise InputError(
+                f"{plain(source)}: {plain(key)} is a date or time, expected a number, or text between quotes"
+            )
+        if not isinstance(value, str | int | float):
+            raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, expected a number or text")
+        if isinstance(value, str) and not is_utf8(value):
+            raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, which is not text in UTF-8")
+
+
+def is_utf8(text: str) -> bool:
+    """Whether a text can be written into a file."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file; InputError as of :func:`read_toml`, and for NaN, infinity and keys that are there twice."""
+    return parse_json(read_text(path, bounded.SETTINGS), path)
+
+
+def parse_json(text: str, source: object) -> Any:
+    """The value of a text in JSON; InputError as of :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
+    try:  # there may be a million lines of it: bounded.foreign takes longer
+        content = _JSON.decode(text)
+    except RecursionError as error:
+        raise InputError(f"{source}: is not JSON: it is nested too deep") from error
+    except ValueError as error:
+        raise InputError(f"{source}: is not JSON: {told(error)}") from error
+    if text.count("[") + text.count("{") > DEEPEST or len(text) > MOST_ENTRIES:
+        deque(_leaves(content, source), maxlen=0)
+    return content
+
+
+def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
+    """``content`` as a model of ``kind``; InputError names ``source``, the key, the value and what is expected."""
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        # a misspelt key is also a missing one: the spelling is what the user can act on
+        with _without_collection():
+            first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+        key = plain(".".join(str(part) for part in first["loc"]))
+        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        if first["type"] == "extra_forbidden":
+            hint = nearest(str(first["loc"][-1]), known_keys(kind, first["loc"][:-1]))
+            raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
+        if first["type"] == "missing":
+            raise InputError(f"{source}: {key} is missing{more}") from error
+        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):  # too much for a line
+            table = f"{key}: " if key else ""
+            raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
+        expected = first["msg"][0].lower() + first["msg"][1:]
+        raise InputError(f"{source}: {key} is {quoted(first['input'])}: {expected}{more}") from error
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Without looks for garbage, which take ten times as long as to make a million dictionaries."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
+    """The keys that the model below ``path`` takes; empty where that is not a model."""
+    parts = iter(path)
+    for part in parts:
+        if isinstance(part, int):  # the place in a list of models
+            continue
+        field = kind.model_fields.get(str(part))
+        nested = field.annotation if field is not None else None
+        if get_origin(nested) is dict:
+            next(parts, None)  # the key within the dict
+        options = [nested, *get_args(nested)]
+        models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
+        if not models:
+            return []
+        kind = models[0]
+    return list(kind.model_fields)
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """A hint for a misspelt word: the nearest known one, else all of them."""
+    short = [name for name in known if len(name) <= NAME][:MANY]
+    matches = difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
+    if matches:
+        return f": did you mean {plain(matches[0])}?"
+    return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
+
+
+def inside(root: Path, name: str, source: object) -> Path:
+    """The path ``name`` below ``root``, its links followed, where a file or folder is or could be.
+
+    InputError if it leaves ``root``, by dots, as an absolute path or by a link, or if it is what is neither a regular file nor a
+    folder; NoFileNameError if no file can have that name. Every path that a file names goes through here.
+    """
+    try:
+        path = Path(os.path.realpath(root / name))
+        leaves = not path.is_relative_to(os.path.realpath(root))
+    except (OSError, ValueError) as error:  # NUL, or half of a pair of UTF-16
+        raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
+    if leaves:
+        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}")
+    kind = bounded.kind(path, source)
+    if kind not in ("", "a file", "a folder"):
+        raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")
+    return path
+
+
+def file_name(name: str) -> str:
+    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore. Of more than 100 bytes
+    the first stay, with a digest of the whole name, so that long names that differ go on doing so."""
+    safe = re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
+    if len(safe.encode()) <= LONGEST_FILE:
+        return safe
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return f"{safe.encode()[: LONGEST_FILE - 9].decode(errors='ignore')}-{digest}"
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path``; what is written to it takes the place of ``path`` when the block ends well."""
+    with temporary_file(path) as temporary:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file at once or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names need not be UTF-8
+
+
+def write_toml(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a TOML file at once or not at all."""
+    write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\{found[0]}", tomli_w.dumps(content)))
+
+
+def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
+    """All values that are neither tables, lists nor floats, each with its key; InputError where they are nested too deep, or where
+    there are too many of all."""
+    waiting = [("", content, 0)]
+    count = 0
+    while waiting:
+        key, value, depth = waiting.pop()
+        if not isinstance(value, dict | list):
+            yield key, value
+        elif depth == DEEPEST:
+            raise InputError(f"{source}: {plain(key)} lies more than {DEEPEST} tables or lists deep")
+        else:
+            count += len(value)
+            bounded.require_size(source, "the number of its values", count, MOST_ENTRIES)
+            entries = value.items() if isinstance(value, dict) else ((key, entry) for entry in value)
+            waiting += [(name, entry, depth + 1) for name, entry in entries if type(entry) is not float]
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a number has {len(digits)} digits, expected at most {MOST_DIGITS}")
+    return int(digits)
+
+
+def _constant(name: str) -> float:
+    raise ValueError(f"{name} is no number in JSON")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {quoted(twice)} is there twice")
+    return found
+
+
+_JSON = json.JSONDecoder(parse_int=_integer, parse_constant=_constant, object_pairs_hook=_object)

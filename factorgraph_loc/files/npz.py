@@ -1,0 +1,45 @@
+"""Arrays of numbers in ``.npz`` files of numpy, without pickles; their declared sizes are checked before memory is taken."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from factorgraph_loc.files.bounded import foreign, opened, require_size
+
+MEMBERS = 100  # arrays of a file
+SUFFIX = ".npy"
+
+
+def read_npz(path: Path, limit: int) -> dict[str, NDArray[Any]]:
+    """The arrays by name, of ``limit`` bytes at most in all; InputError if it is no such file, or holds anything but numbers."""
+    with opened(path, limit) as file, foreign(path, "is not a file of arrays (.npz)"), zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        require_size(path, "its number of arrays", len(members), MEMBERS)
+        require_size(path, "its size in bytes when unpacked", sum(m.file_size for m in members), limit)
+        # no more than file_size is unpacked of a member, whatever it holds
+        return {m.filename.removesuffix(SUFFIX): _array(archive.read(m)) for m in members}
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    """The array in an ``.npy`` file; ValueError if it declares more or less than there is."""
+    file = io.BytesIO(content)
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"an array is of version {version}, expected 1.0 or 2.0")
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, by_columns, kind = read_header(file)
+    if kind.kind not in "fiub" or kind.itemsize > 8:
+        raise ValueError(f"an array is of {kind}, expected numbers")
+    start = file.tell()
+    if len(shape) > 32 or any(n < 0 for n in shape) or math.prod(shape) * kind.itemsize != len(content) - start:
+        raise ValueError(f"an array declares the shape {shape} and holds {len(content) - start} bytes")
+    values = np.frombuffer(content, dtype=kind, offset=start)
+    return values.reshape(shape, order="F" if by_columns else "C").copy()

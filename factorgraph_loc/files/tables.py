@@ -1,0 +1,128 @@
+"""The tables of the native format: CSV with a header, or Parquet with the same columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.columns import LATEST, STAMP, TABLES, Column
+from factorgraph_loc.files.csv_cells import Shape, read_cells, shape_of
+from factorgraph_loc.files.parquet import read_parquet, text_column
+from factors.se2 import Array, Integers
+
+COLUMNS = {
+    table.name: {column.name: column for other in TABLES if other.name == table.name for column in other.columns}
+    for table in TABLES
+}
+NAMES = {c.name: c.doc for table in TABLES for c in table.columns if c.kind in ("name", "file")}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of N rows: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN where empty; ``names`` by column, N texts.
+
+    ``rows`` (N,): where each stands in ``path``, as an editor counts lines (Parquet: rows from 1).
+    """
+
+    path: Path
+    rows: Integers
+    t_ns: Integers
+    numbers: dict[str, Array]
+    names: dict[str, list[str]]
+
+
+def read_table(path: Path, sensor: str, shapes: Sequence[Shape]) -> Table:
+    """Read CSV or Parquet with the columns of one of ``shapes``, in any order; other columns are not looked at.
+
+    InputError names file, row and field of what is missing, is not a number, or lies outside the bounds of the sensor's column.
+    """
+    columns = COLUMNS[sensor]
+    return _read_parquet(path, columns, shapes) if path.suffix == ".parquet" else _read_csv(path, columns, shapes)
+
+
+def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
+    """Write columns of equal length to CSV or Parquet, as the suffix says; NaN becomes an empty field. Numbers keep all digits."""
+    series = [pl.Series(name, column, dtype=_kind(name)) for name, column in columns.items()]
+    frame = pl.DataFrame([s.fill_nan(None) if s.dtype.is_float() else s for s in series])
+    if path.suffix == ".parquet":
+        frame.write_parquet(path)
+    else:
+        frame.write_csv(path)
+
+
+def _kind(column: str) -> type[pl.DataType]:
+    if column in {STAMP.name, "inventory"}:
+        return pl.Int64
+    return pl.String if column in NAMES else pl.Float64
+
+
+def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
+    cells, shape = read_cells(path, shapes)
+    return Table(
+        path,
+        np.array(cells.rows, dtype=np.int64),
+        _stamps(path, cells.rows, cells.columns[STAMP.name]),
+        {name: cells.numbers(name, columns[name]) for name in shape if name not in NAMES and name != STAMP.name},
+        {name: _texts(path, cells.rows, name, cells.columns[name]) for name in shape if name in NAMES},
+    )
+
+
+def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Integers:
+    try:
+        stamps = np.array([int(cell) for cell in cells], dtype=np.int64)
+    except (ValueError, OverflowError):
+        i = next(i for i, cell in enumerate(cells) if not _is_stamp(cell))
+        raise bad_field(path, STAMP.name, cells[i], STAMP.expected, row=rows[i]) from None
+    STAMP.require(path, rows, stamps)
+    return stamps
+
+
+def _is_stamp(cell: str) -> bool:
+    try:
+        return abs(int(cell)) <= LATEST
+    except ValueError:
+        return False
+
+
+def _texts(path: Path, rows: Sequence[int], name: str, cells: Sequence[str | None]) -> list[str]:
+    texts = []
+    for row, cell in zip(rows, cells, strict=True):
+        if not cell:
+            raise bad_field(path, name, cell, NAMES[name], row=row)
+        texts.append(cell)
+    return texts
+
+
+def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
+    frame = read_parquet(path)
+    shape = shape_of(path, frame.columns, shapes)
+    rows = np.arange(1, frame.height + 1, dtype=np.int64)
+    if not frame[STAMP.name].dtype.is_integer():
+        raise InputError(f"{path}: {STAMP.name} is of type {frame[STAMP.name].dtype}, expected integers, nanoseconds")
+    stamps = frame[STAMP.name].cast(pl.Int64, strict=False)
+    if missing := np.flatnonzero(stamps.is_null().to_numpy()).tolist():
+        raise bad_field(
+            path, STAMP.name, frame[STAMP.name][missing[0]], "a whole number of nanoseconds", row=missing[0] + 1
+        )
+    t_ns = stamps.to_numpy().copy()
+    STAMP.require(path, rows, t_ns)
+    numbers = {}
+    for name in shape:
+        if name in NAMES or name == STAMP.name:
+            continue
+        column = frame[name]
+        if not column.dtype.is_numeric() and column.dtype != pl.Null:
+            raise InputError(f"{path}: {name} is of type {column.dtype}, expected numbers")
+        infinite = np.flatnonzero(~column.cast(pl.Float64).is_finite().fill_null(True).to_numpy())
+        if len(infinite):
+            i = int(infinite[0])
+            raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
+        numbers[name] = column.cast(pl.Float64).to_numpy().copy()
+        columns[name].require(path, rows, numbers[name])
+    names = {name: _texts(path, rows.tolist(), name, text_column(frame, name, path)) for name in shape if name in NAMES}
+    return Table(path, rows, t_ns, numbers, names)

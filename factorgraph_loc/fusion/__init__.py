@@ -1,0 +1,1 @@
+"""The estimators, behind one interface (:mod:`factorgraph_loc.fusion.base`)."""

@@ -1,0 +1,74 @@
+"""The interface that all estimators share, and what they report."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+
+
+class Estimator(Protocol):
+    """An estimator. It is given measurements in the order of arrival and can be asked at any time.
+
+    Only what it is given changes it: whatever is asked, and however often, all later answers are the same to the last bit.
+    """
+
+    diagnostics: Diagnostics
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian; before that every estimate is ``unlocalized``. Odometry of before the start may come earlier or
+        later than this, but not after the first measurement of another kind.
+
+        A prior without a heading is given only to an estimator of which :func:`finds_heading` is true: no estimate is
+        ``localized`` until what is seen has told the heading.
+        """
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement; one that is late by more than ``max_delay`` is counted and dropped."""
+
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The pose at the newest time seen, from the measurements so far, or at ``t`` if that is later, as the odometry leads."""
+
+    def belief(self, t: float | None = None) -> Belief:
+        """The whole belief behind :meth:`estimate`."""
+
+    def learnt(self) -> Learnt:
+        """Constants estimated on the way, with what came later, as :meth:`trajectory` has them."""
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
+
+
+@runtime_checkable
+class SpaceEstimator(Protocol):
+    """An estimator of a robot that need not be on a floor: its causal estimates hold ``space``."""
+
+    def space_trajectory(self) -> Trajectory3:
+        """:meth:`Estimator.trajectory` in space, with covariances (N, 6, 6)."""
+
+
+@runtime_checkable
+class ConcludingEstimator(Protocol):
+    """An estimator whose final trajectory is a solution of its own, which may have something to tell."""
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the solution adds to them."""
+
+
+@runtime_checkable
+class ForgettingEstimator(Protocol):
+    """An estimator that can run for as long as one likes."""
+
+    def forget(self, before: float) -> None:
+        """Drop what only the trajectory before that time needs, as far as late measurements cannot change it any more."""
+
+
+def finds_heading(estimator: Estimator) -> bool:
+    """Whether the estimator can start at a position with an unknown heading: who finds its place finds its heading too."""
+    names = ("supports_unknown_start", "supports_unknown_heading")
+    return any(getattr(estimator, name, False) for name in names)

@@ -1,0 +1,202 @@
+"""A cloud of weighted particles: its moments, its modes, the density that it stands for, and drawing from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.model.belief import Mode
+from factors import positive, se2
+from factors.se2 import Array
+
+# of a cloud that has collapsed to one point: its covariance must still be one
+MINIMUM_VARIANCE = 1e-10
+MODES = 5  # at most
+REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
+BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
+LEAST = 1e-3  # of the whole likelihood, that is taken at least: there is an end to what no particle explains
+CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is looked for
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
+
+    ``localized``: the place is known. ``slow`` and ``fast``: averages of the likelihood over many and over few stamps.
+    """
+
+    poses: Array
+    constants: Array
+    log_weights: Array
+    localized: bool = True
+    slow: float = 0.0
+    fast: float = 0.0
+
+    @property
+    def weights(self) -> Array:
+        return np.asarray(np.exp(self.log_weights))
+
+    @cached_property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (3,) and covariance (3, 3) in the world's frame."""
+        return pose_moments(self.poses, self.weights)
+
+    def density(self) -> tuple[Cloud, Array]:
+        """The cloud as a density with the moments of what it was drawn from: poses shrunk towards their mean, each with a Gaussian
+        kernel (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8) as wide as befits their number
+        (:func:`silverman`). Given the pose the constants are Gaussian: as particles they would die out, of a few families,
+        long before the landmarks have told them apart.
+
+        Returns the shrunk cloud and the kernel's covariance (3+P, 3+P), of the pose's body-frame perturbation and of the
+        constants. Where the place is not known there are several modes, and the kernel leaves the poses alone.
+        """
+        weights = self.weights
+        middle, _ = self.moments
+        errors = np.concatenate((se2.log(se2.between(middle, self.poses)), self.constants), axis=1)
+        mean, covariance = vector_moments(errors, weights)
+        # The covariance of a weighted sample is by sum(w^2) too small, and by more where many descend from few, of which only what
+        # the kernels drew is independent. It is little, but the constants would lose it with each resampling.
+        lost = float(weights @ weights)
+        if not self.localized:
+            covariance[:3] = covariance[:, :3] = 0.0
+            constants = np.broadcast_to(mean[3:], self.constants.shape)
+            return replace(self, constants=constants), _inflated(covariance, lost)
+        covariance[range(3), range(3)] += MINIMUM_VARIANCE
+        renewed = silverman(*errors.shape) ** 2
+        # regression (3, 3+P) on the pose, of itself and of the constants; and what it explains of the covariance
+        by_pose = positive.solve(covariance[:3, :3], covariance[:3])
+        explained = covariance[:, :3] @ by_pose
+        shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
+        cloud = replace(self, poses=se2.compose(middle, se2.exp(shrunk[:, :3])), constants=shrunk[:, 3:])
+        kernel = _inflated(explained, lost / renewed) - (1.0 - renewed) * explained
+        return cloud, kernel + _inflated(covariance - explained, lost)
+
+    def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
+        """Particles of equal weight: those of ``rows`` (M,), each with a draw from a ``kernel`` (3+P, 3+P)."""
+        noise = gaussian(kernel, len(rows), rng)
+        return replace(
+            self,
+            poses=se2.compose(self.poses[rows], se2.exp(noise[:, :3])),
+            constants=self.constants[rows] + noise[:, 3:],
+            log_weights=np.full(len(rows), -np.log(len(rows))),
+        )
+
+    def modes(self) -> tuple[Mode, ...]:
+        """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
+        weights = self.weights
+        found: list[Mode] = []
+        _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
+        free = np.ones(len(weights), dtype=bool)
+        while len(found) < MODES and weights[free].sum() > 0.01:
+            heaviest = free & (which == np.argmax(np.bincount(which, weights * free)))
+            middle, _ = _normalised_moments(self.poses[heaviest], weights[heaviest])
+            for _ in range(2):
+                difference = np.abs(self.poses - middle)
+                difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
+                near = free & np.all(difference < REACH, axis=1)
+                middle, covariance = _normalised_moments(self.poses[near], weights[near])
+            found.append(Mode(float(weights[near].sum()), middle, covariance))
+            free &= ~near
+        return tuple(sorted(found, key=lambda m: -m.weight))
+
+
+def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:
+    """Indices of ``count`` draws (as many as weights by default) by systematic resampling (Kitagawa, 1996)."""
+    count = len(weights) if count is None else count
+    positions = (rng.random() + np.arange(count)) / count
+    cumulative = np.cumsum(weights)
+    return np.asarray(np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1))
+
+
+def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
+    """A number (N,) of the cell in which each pose (N, 3) lies, the cells having the size ``cell`` (3,) [m, m, rad]."""
+    places = np.floor(poses / cell).astype(np.int64)
+    places -= places.min(axis=0)
+    size = places.max(axis=0) + 1
+    return np.asarray((places[:, 0] * size[1] + places[:, 1]) * size[2] + places[:, 2])
+
+
+def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
+    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles; not less than
+    :data:`LEAST`, so that a likelihood is taken in a few hundred shares at most."""
+
+    def effective(share: float) -> float:
+        return effective_size(normalised(log_weights + share * likelihood))
+
+    if effective(left) >= enough:
+        return left
+    low, high = 0.0, left
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if effective(middle) >= enough else (low, middle)
+    return max(low, SMALLEST * left, min(left, LEAST))
+
+
+def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
+    """A log-likelihood (N,) of time ``t`` by which particles of these ``log_weights`` (N,) can be weighed: one for which it is no
+    number is impossible.
+
+    RunFailedError if none is possible.
+    """
+    possible = np.isfinite(likelihood)
+    if possible.all():
+        return likelihood
+    if not np.isfinite(log_weights[possible]).any():
+        raise RunFailedError(
+            f"at {t:.3f} s the likelihood of a measurement is a finite number for none of the particles"
+        )
+    return np.where(possible, likelihood, -np.inf)
+
+
+def effective_size(log_weights: Array) -> float:
+    """Of normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
+    return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
+
+
+def normalised(log_weights: Array) -> Array:
+    """Log-weights (N,) whose weights sum to one."""
+    log_weights = log_weights - log_weights.max()
+    return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))
+
+
+def silverman(count: int, size: int) -> float:
+    """Bandwidth, as a share of the standard deviation, of Gaussian kernels on ``count`` points in ``size`` dimensions
+    (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
+
+
+def gaussian(covariance: Array, count: int, rng: np.random.Generator) -> Array:
+    """Draws (count, D) from a Gaussian whose covariance (D, D) may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
+
+
+def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
+    heading = np.arctan2(weights @ np.sin(poses[:, 2]), weights @ np.cos(poses[:, 2]))
+    mean = np.array((weights @ poses[:, 0], weights @ poses[:, 1], heading))
+    error = poses - mean
+    error[:, 2] = se2.wrap(error[:, 2])
+    covariance = (weights[:, None] * error).T @ error
+    return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
+
+
+def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted mean (P,) and covariance (P, P) of vectors (N, P)."""
+    mean = weights @ values
+    error = values - mean
+    return mean, (weights[:, None] * error).T @ error
+
+
+def _inflated(covariance: Array, lost: float) -> Array:
+    """A covariance that has lost this share."""
+    return covariance / max(1.0 - lost, 0.5)
+
+
+def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    return pose_moments(poses, weights / weights.sum())

@@ -1,0 +1,63 @@
+"""Odometry alone: what every other estimator has to beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
+from factorgraph_loc.model.belief import PoseEstimate, PosePrior
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factors import se2
+from factors.motion import Increment, propagate
+from factors.se2 import Array
+
+
+class DeadReckoningSettings(FilterSettings):
+    """Dead reckoning has nothing of its own to set."""
+
+
+@dataclass(frozen=True)
+class _State:
+    pose: Array
+    covariance: Array  # body frame
+
+
+@dataclass(frozen=True)
+class _Record:
+    t: float
+    state: _State
+
+
+class DeadReckoning(Filter):
+    """Composes the odometry, with the covariance that grows on the way; landmarks are counted as ignored."""
+
+    _state: _State
+
+    def trajectory(self) -> Trajectory:
+        """The same as the causal estimates: there is nothing to smooth."""
+        records: list[_Record] = self._records
+        return at_ticks(
+            self._ticks,
+            np.array([r.t for r in records]),
+            np.array([r.state.pose for r in records]),
+            np.array([r.state.covariance for r in records]),
+        )
+
+    def _start(self, prior: PosePrior) -> _State:
+        return _State(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
+
+    def _predict(self, increment: Increment) -> None:
+        s = self._state
+        self._state = _State(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
+
+    def _update(self, m: BearingRange) -> None:
+        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+
+    def _estimate(self) -> PoseEstimate:
+        return world_estimate(self._t, self._state.pose, self._state.covariance)
+
+    def _record(self) -> _Record:
+        return _Record(self._t, self._state)

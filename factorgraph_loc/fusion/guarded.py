@@ -1,0 +1,220 @@
+"""The one boundary around an estimator: what fails in it, and what it says that cannot be, ends as one line.
+
+Whoever runs an estimator asks it through a :class:`Guard`. Numbers that measurements and settings may have can still be such that a
+matrix is singular or a sum overflows, in NumPy, in GTSAM or in compiled code, each with errors of its own: here, and nowhere else,
+they become a :class:`~factorgraph_loc.errors.RunFailedError` that names the estimator, the time and the measurement. What is wrong
+with the program itself (a name, a type, a key) is none of these, and passes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.live.pushed import sensor_of
+from factorgraph_loc.model.belief import Belief, PoseEstimate
+from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.text import plain
+from factors.se2 import Array
+
+# singular matrices, overflows, divisions by zero, values that no function takes; all that GTSAM throws
+FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
+SKEW = 1e-6  # of two standard deviations: how far rounding may take a covariance from symmetry
+ROUNDING = 1e-6  # of a correlation matrix: eigenvalues that are no lower are those of rounding
+LEAST = 1e-9  # what they are raised to
+CLEAR = 1e-4  # share of a variance that the others leave unexplained: nothing more has to be looked at
+
+
+class Guard:
+    """What runs of an estimator go through: ``guard.process(estimator, measurement)``, ``with guard.telling(what): ...``.
+
+    ``who``: the estimator and the log, or the estimator alone. Warnings of NumPy are silent inside, as what comes of them is
+    checked: :func:`sound`, :func:`sound_trajectory`.
+    """
+
+    def __init__(self, who: str) -> None:
+        self._who = who
+        self._last: Measurement | None = None  # what was taken
+        self._telling = ""
+        self._silence = np.errstate(all="ignore")
+        self._is_quiet = False
+
+    @contextmanager
+    def quiet(self) -> Iterator[None]:
+        """A context in which NumPy is silent all the time: it costs as much to silence it once as to give one row of odometry."""
+        with np.errstate(all="ignore"):
+            self._is_quiet = True
+            try:
+                yield
+            finally:
+                self._is_quiet = False
+
+    def process(self, estimator: Estimator, measurement: Measurement) -> None:
+        """Give a measurement to the estimator."""
+        self._last, self._telling = measurement, ""
+        if not self._is_quiet:
+            with self:
+                estimator.process(measurement)
+            return
+        try:
+            estimator.process(measurement)
+        except Exception as error:
+            self._pass_on(error)
+            raise
+
+    def telling(self, what: str) -> Self:
+        """A context in which it is asked for something, such as ``the estimate at 1.000 s``."""
+        self._telling = what
+        return self
+
+    def __enter__(self) -> Self:
+        if not self._is_quiet:
+            self._silence = np.errstate(all="ignore")
+            self._silence.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if not self._is_quiet:
+            self._silence.__exit__(None, None, None)
+        if error is not None:
+            self._pass_on(error)
+
+    def _pass_on(self, error: BaseException) -> None:
+        """Raise what an error of a computation becomes; nothing for others."""
+        if isinstance(error, FAILURES) or (isinstance(error, RunFailedError) and type(error) is RunFailedError):
+            raise self._failure(_reason(error)) from error
+
+    def _failure(self, why: str) -> RunFailedError:
+        what = self._telling or (_named(self._last) if self._last is not None else "its start")
+        after = f" (after {_named(self._last)})" if self._telling and self._last is not None else ""
+        return RunFailedError(f"{self._who}: {what}{after}: {why}")
+
+
+def sound(estimate: PoseEstimate) -> PoseEstimate:
+    """The estimate, if it has a pose of finite numbers with a covariance that is symmetric and positive; of what rounding alone
+    took from that, the nearest that is. ValueError if not: it is asked inside of a :class:`Guard`. One that is ``unlocalized`` says
+    nothing."""
+    if estimate.status == "unlocalized":
+        return estimate
+    if not all(map(math.isfinite, estimate.pose.tolist())):
+        raise ValueError("the pose is not finite")
+    if (space := estimate.space) is not None:
+        if not (np.all(np.isfinite(space.position)) and np.all(np.isfinite(space.rotation))):
+            raise ValueError("the pose in space is not finite")
+        _positive(space.covariance)
+        return estimate
+    if _clearly_positive_3(estimate.covariance):
+        return estimate
+    covariance = _positive(estimate.covariance)
+    return estimate if covariance is estimate.covariance else replace(estimate, covariance=covariance)
+
+
+def sound_belief(belief: Belief) -> Belief:
+    """The same of each mode of a belief, and of its particles."""
+    for values in (belief.particles, belief.weights):
+        if values is not None and not np.all(np.isfinite(values)):
+            raise ValueError("the particles are not finite")
+    if not all(np.all(np.isfinite(mode.pose)) for mode in belief.modes):
+        raise ValueError("the pose is not finite")
+    modes = tuple(replace(mode, covariance=_positive(mode.covariance)) for mode in belief.modes)
+    return replace(belief, modes=modes)
+
+
+def sound_trajectory(trajectory: Trajectory) -> Trajectory:
+    """The same of a trajectory; the error names the time of the first pose that is not so."""
+    finite = np.isfinite(trajectory.poses).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"the pose at {trajectory.t[~finite][0]:.3f} s is not finite")
+    if trajectory.covariances is None:
+        return trajectory
+    doubtful = np.flatnonzero(~clearly_positive(trajectory.covariances)).tolist()
+    if not doubtful:
+        return trajectory
+    covariances = trajectory.covariances.copy()
+    for i in doubtful:
+        covariances[i] = _positive(covariances[i], f" at {trajectory.t[i]:.3f} s")
+    return replace(trajectory, covariances=covariances)
+
+
+def sound_space(trajectory: Trajectory3) -> Trajectory3:
+    """A trajectory in space, if all its numbers are finite; else a ValueError."""
+    for values in (trajectory.positions, trajectory.rotations, trajectory.covariances):
+        if values is not None and not np.all(np.isfinite(values)):
+            raise ValueError("the trajectory in space is not finite")
+    return trajectory
+
+
+def _positive(covariance: Array, where: str = "") -> Array:
+    found = nearest_positive(covariance)
+    if found is None:
+        why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"
+        raise ValueError(f"the covariance{where} {why}")
+    return found
+
+
+def clearly_positive(covariances: Array) -> np.typing.NDArray[np.bool_]:
+    """Which of the covariances (N, D, D) are finite, symmetric and far from singular, whatever their units."""
+    with np.errstate(all="ignore"):
+        sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        shares = covariances / sigmas[:, :, None] / sigmas[:, None, :]
+    finite = np.all(np.isfinite(shares), axis=(1, 2)) & np.all(np.isfinite(covariances), axis=(1, 2))
+    shares[~finite] = np.eye(shares.shape[1])
+    symmetric = np.all(np.abs(shares - shares.transpose(0, 2, 1)) <= SKEW, axis=(1, 2))
+    return np.asarray(finite & symmetric & (np.linalg.eigvalsh(shares)[:, 0] > CLEAR))
+
+
+def nearest_positive(covariance: Array) -> Array | None:
+    """The covariance (D, D), or the nearest one that is symmetric and positive definite where it is not by rounding alone; None
+    where it is no covariance."""
+    sigmas = np.sqrt(np.diag(covariance))
+    if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
+        return None
+    # by parts, as products of the largest and the smallest may be beyond numbers
+    shares = covariance / sigmas[:, None] / sigmas
+    if not np.all(np.isfinite(shares)) or np.abs(shares - shares.T).max() > SKEW:
+        return None
+    values, vectors = np.linalg.eigh((shares + shares.T) / 2.0)
+    if values[0] < -ROUNDING:
+        return None
+    if values[0] > LEAST and np.linalg.eigvalsh(covariance)[0] > 0.0:
+        return covariance
+    raised = (vectors * np.maximum(values, LEAST)) @ vectors.T
+    found = (raised + raised.T) / 2.0 * (sigmas[:, None] * sigmas)
+    return found if np.all(np.isfinite(found)) else None
+
+
+def _clearly_positive_3(covariance: Array) -> bool:
+    """What :func:`clearly_positive` says of one covariance (3, 3), by what the rows before leave unexplained of each variance; in
+    plain numbers, as each estimate of a run is asked."""
+    (a, b, c), (d, e, f), (g, h, i) = covariance.tolist()
+    if not (0.0 < a < math.inf and 0.0 < e < math.inf and 0.0 < i < math.inf):
+        return False
+    x, y, z = math.sqrt(a), math.sqrt(e), math.sqrt(i)
+    xy, xz, yz = b / x / y, c / x / z, f / y / z
+    skew = max(abs(xy - d / x / y), abs(xz - g / x / z), abs(yz - h / y / z))
+    second = 1.0 - xy * xy
+    if not (skew <= SKEW and second > CLEAR):
+        return False
+    across = yz - xy * xz
+    return bool(1.0 - xz * xz - across * across / second > CLEAR)
+
+
+def _named(measurement: Measurement) -> str:
+    name = "tick" if isinstance(measurement, Tick) else sensor_of(measurement)
+    return f"{name} at {measurement.t:.3f} s"
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of what an error says that says anything; its type where it says nothing."""
+    lines = (" ".join(line.split()) for line in str(error).splitlines())
+    return plain(next((line for line in lines if line), type(error).__name__))

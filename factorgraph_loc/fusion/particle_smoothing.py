@@ -1,0 +1,118 @@
+"""The final trajectory of a particle filter, by backward simulation.
+
+Trajectories are drawn backwards through the clouds that were kept (Godsill, Doucet, West, JASA 99(465), 2004). Where the robot
+stands, or where constants travel with the particles, next to nothing is added from one cloud to the next: of the
+particles as they are each would have but one ancestor, and the trajectories would soon coalesce. So a cloud stands for a density
+with Gaussian kernels (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.2), and from
+the kernel of the ancestor the state is drawn given what comes later: one step of Rauch, Tung and Striebel.
+
+Where no particle explains a later pose the filter was set elsewhere in between: if it was lost, the later pose is carried back by
+odometry, else the trajectory goes on from the filter's own cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_loc.fusion.ancestors import draw_ancestors
+from factorgraph_loc.fusion.cloud import Cloud, gaussian, pose_moments, systematic
+from factors import positive, se2
+from factors.motion import ChainState, Increment
+from factors.se2 import Array
+
+BREAK = 100.0  # squared Mahalanobis distance from a pose to its ancestor: ten standard deviations
+
+
+@dataclass(frozen=True)
+class Record:
+    """A stamp of the run: the odometry there, the causal estimate, and the cloud where it is kept for smoothing."""
+
+    t: float
+    odometry: ChainState
+    mean: Array
+    covariance: Array
+    cloud: Cloud | None
+
+    def lost(self) -> Record:
+        """The same, its cloud known to have been elsewhere."""
+        return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
+
+
+class BackwardSimulation:
+    """``count`` trajectories through the clouds at the records ``kept``.
+
+    ``increment(start, end)``: the motion between two records; ``moved(cloud, increment)``: poses (N, 3) after it, without noise,
+    and their transition (3, 3+P) from body-frame perturbation and constants.
+    """
+
+    def __init__(
+        self,
+        kept: Sequence[Record],
+        increment: Callable[[Record, Record], Increment],
+        moved: Callable[[Cloud, Increment], tuple[Array, Array]],
+        rng: np.random.Generator,
+        count: int,
+    ) -> None:
+        self._kept, self._increment, self._moved, self._rng = kept, increment, moved, rng
+        self._t = np.array([r.t for r in kept])
+        clouds = [r.cloud for r in kept if r.cloud is not None]
+        cloud, kernel = clouds[-1].density()
+        self._drawn = [cloud.drawn(systematic(cloud.weights, rng, count), kernel, rng)]
+        # what the noise of the motion must have been from each to the next
+        self._missed: list[Array] = []
+        for k in range(len(clouds) - 2, -1, -1):
+            drawn, missed = self._step(clouds[k], increment(kept[k], kept[k + 1]), self._drawn[0])
+            self._drawn.insert(0, drawn)
+            self._missed.insert(0, missed)
+
+    def at(self, record: Record) -> tuple[Array, Array]:
+        """Mean (3,) and covariance (3, 3) in the world's frame of the trajectories at a record between two kept ones."""
+        k = int(np.searchsorted(self._t, record.t, side="right")) - 1
+        since = self._increment(self._kept[k], record)
+        poses, _ = self._moved(self._drawn[k], since)
+        extra = np.zeros((3, 3))
+        if k + 1 < len(self._kept) and since.duration > 0.0:
+            whole = self._increment(self._kept[k], self._kept[k + 1])
+            share = since.duration / whole.duration
+            poses = se2.compose(poses, se2.exp(share * self._missed[k]))
+            extra = share * (1.0 - share) * whole.covariance
+        mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
+        return mean, covariance + se2.body_to_world(mean, extra)
+
+    def _step(self, cloud: Cloud, increment: Increment, after: Cloud) -> tuple[Cloud, Array]:
+        """Where the states ``after`` came from, and the noise (M, 3) of the motion in between."""
+        here, kernel = cloud.density()
+        predicted, by_state = self._moved(here, increment)
+        transition = np.eye(len(kernel))
+        transition[:3] = by_state
+        carried = transition @ kernel
+        covariance = carried @ transition.T
+        covariance[:3, :3] += increment.covariance
+        rows = draw_ancestors(
+            predicted,
+            here.constants,
+            here.log_weights,
+            after.poses,
+            after.constants,
+            covariance,
+            self._rng.random(len(after.poses)),
+        )
+        error = np.concatenate(
+            (se2.log(se2.between(predicted[rows], after.poses)), after.constants - here.constants[rows]), axis=1
+        )
+        gain = positive.solve(covariance, carried).T
+        step = error @ gain.T + gaussian(kernel - gain @ carried, len(rows), self._rng)
+        constants = here.constants[rows] + step[:, 3:]
+        poses = se2.compose(here.poses[rows], se2.exp(step[:, :3]))
+        jumped = np.sum(error[:, :3] * positive.solve(covariance[:3, :3], error[:, :3].T).T, axis=1) > BREAK
+        if jumped.any() and cloud.localized:
+            poses[jumped] = cloud.poses[systematic(cloud.weights, self._rng, int(jumped.sum()))]
+        elif jumped.any():
+            poses[jumped] = se2.compose(after.poses[jumped], se2.inverse(increment.delta))
+        drawn = replace(after, poses=poses, constants=constants)
+        missed = se2.log(se2.between(self._moved(drawn, increment)[0], after.poses))
+        missed[jumped] = 0.0
+        return drawn, missed

@@ -1,0 +1,111 @@
+"""The whole run as one nonlinear least-squares problem, solved at once.
+
+Levenberg-Marquardt in Python with GTSAM's sparse elimination: our factors are linearised here, where the values are at hand,
+because each callback from GTSAM would copy all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_loc.fusion.marginals import Covariances, covariances
+from factorgraph_loc.fusion.variables import Values, gather, gtsam_errors, retract, to_gtsam
+from factors.graph import Factor, jacobian_factor
+
+MAX_ITERATIONS = 100
+CONVERGED_GAIN = 1e-6  # of the cost
+INITIAL_DAMPING = 1e-4
+MAX_DAMPING = 1e8
+UNITS = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 10)}
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Values of all variables, the cost, and how many iterations it took."""
+
+    values: Values
+    cost: float
+    iterations: int
+
+
+class Problem:
+    """Factors of ours, each with the keys of its variables; ``natives``: more of them, with GTSAM's own that are the same but
+    throw where a point is behind a camera."""
+
+    def __init__(
+        self,
+        factors: Sequence[tuple[Factor, tuple[int, ...]]],
+        natives: Sequence[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = (),
+    ) -> None:
+        self._factors = list(factors)
+        self._natives = natives
+        self._graph = gtsam.NonlinearFactorGraph()
+        for _, _, native in natives:
+            self._graph.add(native)
+
+    def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
+        """The optimum found from a guess, or where ``max_iterations`` lead."""
+        damping, cost = INITIAL_DAMPING, self.cost(values)
+        if not math.isfinite(cost) and len(self._natives):
+            self._replace_natives()
+            cost = self.cost(values)
+        iteration = 0
+        while iteration < max_iterations and damping < MAX_DAMPING:
+            iteration += 1
+            graph = self.linearize(values)
+            for key, value in values.items():
+                size = len(value)
+                graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
+            try:
+                with gtsam_errors():
+                    step = graph.optimize()
+            except RuntimeError:  # nearly singular
+                damping *= 10.0
+                continue
+            moved = {key: retract(key, value, step.at(key)) for key, value in values.items()}
+            new_cost = self.cost(moved)
+            if not (math.isfinite(new_cost) and new_cost <= cost):
+                damping *= 10.0
+                continue
+            gained = cost - new_cost
+            values, cost, damping = moved, new_cost, damping / 10.0
+            if gained < CONVERGED_GAIN * cost:
+                break
+        return Solution(values, cost, iteration)
+
+    def cost(self, values: Values) -> float:
+        """The robust cost, infinite where one of GTSAM's factors throws and where it is not a number."""
+        cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
+        if self._graph.size():
+            try:
+                cost += float(self._graph.error(to_gtsam(values)))
+            except RuntimeError:
+                return math.inf
+        return math.inf if math.isnan(cost) else cost
+
+    def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
+        """All factors, linearised with their robust weights."""
+        graph = gtsam.GaussianFactorGraph()
+        for factor, keys in self._factors:
+            graph.add(jacobian_factor(factor, keys, gather(values, keys)))
+        if self._graph.size():
+            try:
+                graph.push_back(self._graph.linearize(to_gtsam(values)))
+            except RuntimeError:  # one of them threw
+                self._replace_natives()
+                return self.linearize(values)
+        return graph
+
+    def _replace_natives(self) -> None:
+        """From now on our own factors in place of GTSAM's."""
+        self._factors += [(factor, keys) for factor, keys, _ in self._natives]
+        self._natives, self._graph = (), gtsam.NonlinearFactorGraph()
+
+    def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
+        """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""
+        return covariances(self.linearize(values), {key: len(value) for key, value in values.items()}, list(keys))

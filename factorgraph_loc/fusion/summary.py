@@ -1,0 +1,82 @@
+"""What the graph of a window knows of what has left it.
+
+GTSAM marginalises a variable into linear factors on those that it shared factors with. They and the priors hold all that the
+window's own measurements do not tell, correlations included: a window that is built anew begins with them. Marginals of single
+variables in their place would count the measurements among them twice, and lose what they have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+import gtsam
+
+from factorgraph_loc.fusion.variables import Node, index_of, is_pose
+
+KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
+
+
+def oldest_pose(keys: Iterable[int]) -> int:
+    """The index of the oldest pose among ``keys``, 0 if there is none."""
+    return min((index_of(key) for key in keys if is_pose(key)), default=0)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where the graph is linearised."""
+
+    factors: tuple[gtsam.NonlinearFactor, ...]
+    keys: frozenset[int]
+    at: gtsam.Values
+
+    @classmethod
+    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> Summary:
+        every = (graph.at(i) for i in range(graph.size()))
+        kept = tuple(
+            # iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one
+            gtsam.LinearContainerFactor(f.factor(), at) if isinstance(f, gtsam.LinearContainerFactor) else f
+            for f in every
+            if isinstance(f, KINDS)
+        )
+        return cls(kept, frozenset(graph.keyVector()), at)
+
+    @property
+    def oldest(self) -> int:
+        """The index of the oldest pose."""
+        return oldest_pose(self.keys)
+
+    def before(self, pose: int) -> Summary:
+        """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
+        kept = frozenset(key for key in self.keys if not is_pose(key) or index_of(key) < pose)
+        at = gtsam.Values(self.at)
+        for key in self.keys - kept:
+            at.erase(key)
+        return Summary(tuple(self.on(kept)), kept, at)
+
+    def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
+        """The factors on variables that are ``present``, with all that those on others tell of these."""
+        kept: list[gtsam.NonlinearFactor] = []
+        linear, gone = gtsam.GaussianFactorGraph(), set[int]()
+        for factor in self.factors:
+            absent = [key for key in factor.keys() if key not in present]  # noqa: SIM118
+            gone.update(absent)
+            if absent:
+                linear.add(factor.linearize(self.at))
+            else:
+                kept.append(factor)
+        if gone:
+            order = gtsam.Ordering()
+            for key in sorted(gone):
+                order.push_back(key)
+            _, rest = linear.eliminatePartialMultifrontal(order)
+            kept += [gtsam.LinearContainerFactor(rest.at(i), self.at) for i in range(rest.size())]
+        return kept
+
+
+def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
+    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
+    it holds the priors of points, and what hangs on a pose that is gone."""
+    if any(key not in present for key in node.keys):
+        return False
+    return node.has_pose or node.keys[0] not in known

@@ -1,0 +1,169 @@
+"""The paper's fusion rule: RFID when tags are read, vision otherwise (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5).
+
+A scan in which a tag of the map is read gives the word to the particle filter, one without gives it to the EKF on what the camera
+sees; who has not the word is told nothing but odometry. The word is handed over as mean and covariance of the pose, so that
+constants of the odometry which are uncertain count as noise in both. The final trajectory is smoothed over all hand-overs
+(Rauch, Tung, Striebel, 1965), from what was believed at each time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.fusion.ekf import Ekf, EkfSettings
+from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.measurement import Measurement, Odometry, Tick
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factors import positive, se2
+from factors.motion import ChainState, Increment, propagate
+from factors.se2 import Array
+
+TAG_SENSORS = ("rfid", "rssi", "phase")
+LANDMARK_SENSORS = ("camera", "sightings", "bearing_range")
+JUMPED = 50.0  # Mahalanobis distance squared beyond which an estimate did not come from the one before
+LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: particles that agree to the last digit are no Gaussian
+
+
+class SwitchingSettings(FilterSettings):
+    """``particles``: of the particle filter."""
+
+    particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What was believed at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+
+    odometry: ChainState
+    pose: Array
+    covariance: Array
+
+
+class Switching:
+    """The switch; see the module."""
+
+    deterministic = False
+    takes_pixels = True
+
+    def __init__(self, setup: Setup, settings: SwitchingSettings) -> None:
+        self.diagnostics = Diagnostics()
+        self._smooth = settings.smooth
+        self._known = frozenset(setup.world.tags)
+        by_tags = replace(setup, sensors=tuple(s for s in setup.sensors if s not in LANDMARK_SENSORS))
+        by_sight = replace(setup, sensors=tuple(s for s in setup.sensors if s not in TAG_SENSORS))
+        delay = settings.max_delay
+        of_tags = ParticleFilterSettings(
+            max_delay=delay, smooth=False, self_calibration=False, particles=settings.particles
+        )
+        self._tags: Filter = ParticleFilter(by_tags, of_tags)
+        self._vision: Filter = Ekf(by_sight, EkfSettings(max_delay=delay, smooth=False, self_calibration=False))
+        by_scans = "rfid" in setup.sensors
+        self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
+        self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
+        for part in (self._tags, self._vision):
+            for shared in fields(Diagnostics):
+                setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))
+        # both filters take the odometry: the second would count what is late once more
+        self._vision.diagnostics.late = {}
+        self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
+        self._active: Filter = self._tags if by_scans else self._vision
+        self._newest_scan = -np.inf
+        self._ticks: list[float] = []
+        self._records: dict[float, _Record] = {}  # by their times: the last one counts
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian."""
+        self._active.initialize(prior)
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if isinstance(measurement, Odometry):
+            for part in (self._tags, self._vision):
+                part.process(measurement)
+            self._motion.add(measurement)
+            return
+        if isinstance(measurement, RfidScan) and measurement.t >= self._newest_scan:
+            self._newest_scan = measurement.t
+            read = any(tag in self._known for tag in measurement.tags)
+            self._hand_over(self._tags if read else self._vision)
+        if isinstance(measurement, Tick):
+            self._ticks.append(measurement.t)
+        if isinstance(measurement, Tick) or isinstance(measurement, RfidScan) == (self._active is self._tags):
+            self._active.process(measurement)
+            late = self._vision.diagnostics.late
+            self.diagnostics.late |= {sensor: count for sensor, count in late.items() if sensor != "odometry"}
+            self._record()
+        elif isinstance(measurement, RfidScan):
+            self.diagnostics.ignore("rfid while no tag is read", len(measurement.antennas))
+        else:
+            self.diagnostics.ignore("landmarks while tags are read")
+
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The estimate of the filter that has the word."""
+        return self._active.estimate(t)
+
+    def belief(self, t: float | None = None) -> Belief:
+        """The belief of the filter that has the word."""
+        return self._active.belief(t)
+
+    def learnt(self) -> Learnt:
+        """Nothing."""
+        return Learnt()
+
+    def trajectory(self) -> Trajectory:
+        """The smoothed estimates at the ticks, or the causal ones with ``smooth`` off."""
+        times = sorted(self._records)
+        records = [self._records[t] for t in times]
+        found = [(r.pose, r.covariance) for r in records[-1:]]
+        for record, after in zip(records[-2::-1], records[:0:-1], strict=True):
+            step = self._motion.relative(record.odometry, after.odometry)
+            found.append(_smoothed(record, step, found[-1]) if self._smooth else (record.pose, record.covariance))
+        poses = np.array([pose for pose, _ in found[::-1]]).reshape(-1, 3)
+        covariances = np.array([covariance for _, covariance in found[::-1]]).reshape(-1, 3, 3)
+        ticks = [t for t in self._ticks if times and t >= times[0]]
+        return at_ticks(ticks, np.array(times), poses, covariances)
+
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, as far as both filters do not need it for late measurements."""
+        for part in (self._tags, self._vision):
+            part.forget(before)
+        self._ticks = [t for t in self._ticks if t >= before]
+        self._records = {t: record for t, record in self._records.items() if t >= before}
+
+    def _hand_over(self, other: Filter) -> None:
+        """Give the word to ``other``; without a known pose there is nothing to hand over."""
+        if other is self._active:
+            return
+        now = self._active.estimate()
+        if now.status != "localized":
+            return
+        self._active = other
+        self._active.initialize(PosePrior(now.t, now.pose, now.covariance + LEAST))
+
+    def _record(self) -> None:
+        now = self._active.estimate()
+        if now.status != "unlocalized":
+            body = se2.world_to_body(now.pose, now.covariance)
+            self._records[now.t] = _Record(self._motion.state(now.t), now.pose, body + LEAST)
+
+
+def _smoothed(record: _Record, step: Increment, after: tuple[Array, Array]) -> tuple[Array, Array]:
+    """A record given what came later: ``step`` led from it to where ``after`` is the smoothed pose with its covariance."""
+    predicted = propagate(record.covariance, step)
+    error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))
+    if positive.squared(error, predicted + after[1]) > JUMPED:
+        return record.pose, record.covariance
+    gain = positive.solve(predicted, se2.adjoint(se2.inverse(step.delta)) @ record.covariance).T
+    covariance = record.covariance + gain @ (after[1] - predicted) @ gain.T
+    return se2.compose(record.pose, se2.exp(gain @ error)), (covariance + covariance.T) / 2.0

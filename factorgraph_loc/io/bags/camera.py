@@ -1,0 +1,207 @@
+"""Images in a bag: written to the user's cache folder when the bag is first read, one at a time, for a log names files.
+
+Compressed images are written as they are, others as PGM or PPM, whose pixels are those of the message.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.files.temporary import locked, sweep, temporary_folder
+from factorgraph_loc.io.bags.clock import Clock, Stamper
+from factorgraph_loc.io.bags.fields import as_nanoseconds
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.text import quoted
+from factorgraph_loc.vision.feature_cache import cache_folder
+from factors.se2 import Array, Integers
+
+RAW = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+INFO = "sensor_msgs/msg/CameraInfo"
+MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
+INDEX = "images.csv"
+LOCK = ".lock"  # held by who puts a folder of images into its place
+COLUMNS = ("row", "header", "received", "file")
+Pixels = NDArray[Any]
+_Row = tuple[int, int, int, str]  # number, stamp of the header [ns], receipt [ns], file
+
+# to channels in the order red, green, blue
+ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
+    "mono8": (np.uint8, 1, lambda p: p),
+    "8UC1": (np.uint8, 1, lambda p: p),
+    "mono16": (np.uint16, 1, lambda p: p),
+    "16UC1": (np.uint16, 1, lambda p: p),
+    "rgb8": (np.uint8, 3, lambda p: p),
+    "bgr8": (np.uint8, 3, lambda p: p[:, :, ::-1]),
+    "8UC3": (np.uint8, 3, lambda p: p[:, :, ::-1]),
+    "rgba8": (np.uint8, 4, lambda p: p[:, :, :3]),
+    "bgra8": (np.uint8, 4, lambda p: p[:, :, 2::-1]),
+    "bayer_rggb8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerRGGB2RGB)),
+    "bayer_bggr8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerBGGR2RGB)),
+    "bayer_gbrg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGBRG2RGB)),
+    "bayer_grbg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGRBG2RGB)),
+}
+
+
+class CameraTopic(FileModel):
+    """A topic of images, and that of its ``info``: lens, size and the frame it sits in."""
+
+    topic: str
+    info: str | None = None
+    clock: Clock | None = None
+
+
+class Images:
+    """Gathers the images of a topic. ``known``: they lie in the cache folder already, so that their messages need not be read."""
+
+    def __init__(self, bag: Bag, name: str, stamper: Stamper) -> None:
+        topic = bag.topic(name)
+        if topic.type not in {RAW, COMPRESSED}:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {RAW} or {COMPRESSED}")
+        self._source = f"{bag.path} {name}"
+        self._compressed = topic.type == COMPRESSED
+        self._folder = cache_folder() / "bags" / _key(bag.path, name)
+        self._stamper = stamper
+        self._t_ns: list[int] = []
+        self._written: Path | None = None  # the folder that those which are read now are written to
+        self._held = ExitStack()
+        sweep(self._folder.parent)
+        self._rows = _read_whole(self._folder)
+        self.known = bool(self._rows)
+        self._t_ns = [stamper.heard(header, received) for _, header, received, _ in self._rows]
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._written is None:
+            self._folder.parent.mkdir(parents=True, exist_ok=True)
+            self._written = self._held.enter_context(temporary_folder(self._folder)) / "images"
+            self._written.mkdir()
+        where = f"{self._source}:{item.row}"
+        if self._compressed:
+            content = item.message.data.tobytes()
+            suffix = next((suffix for magic, suffix in MAGIC.items() if content.startswith(magic)), None)
+            if suffix is None:
+                raise InputError(f"{where}: format is {quoted(item.message.format)}, expected JPEG, PNG, WebP or BMP")
+        else:
+            content, suffix = netpbm(item.message, where)
+        file = f"{item.row:06d}{suffix}"
+        (self._written / file).write_bytes(content)
+        self._rows.append((item.row, as_nanoseconds(item.message.header.stamp, 1), item.received, file))
+        self._t_ns.append(t_ns)
+
+    def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
+        """The images by their stamps; those that were written now take their place in the cache folder."""
+        if self._written is not None:
+            with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows([COLUMNS, *self._rows])
+            with locked(self._folder.parent / LOCK):
+                if not _read_whole(self._folder):  # else another process was faster, and may be using what it wrote
+                    if self._folder.exists():
+                        self._folder.rename(self._written.with_name("damaged"))
+                    self._written.rename(self._folder)
+            self.discard()
+        rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
+        keep = _last_of_each(self._source, rows, t_ns, warnings)
+        return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
+
+    def discard(self) -> None:
+        """Leave nothing half-written behind."""
+        self._held.close()
+        self._written = None
+
+
+class Info:
+    """Gathers the first message that tells of a camera."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name)
+        if topic.type != INFO:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {INFO}")
+        self._source = f"{bag.path} {name}"
+        self._message: Any = None
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._message is None:
+            self._message = item.message
+
+    @property
+    def frame(self) -> str:
+        return str(self._message.header.frame_id)
+
+    def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
+        """The camera, sitting where ``mounting`` says."""
+        info = self._message
+        k: Array = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=float)
+        d: Array = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, dtype=float)
+        lens = np.zeros(4)
+        lens[: min(4, len(d))] = d[:4]
+        if np.any(d[4:]):
+            notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are taken, not {d[4:].tolist()}")
+        content = {
+            "width": int(info.width),
+            "height": int(info.height),
+            "fx": float(k[0]),
+            "fy": float(k[4]),
+            "cx": float(k[2]),
+            "cy": float(k[5]),
+            "distortion": tuple(lens.tolist()),
+        }
+        return parse_model(CameraSettings, content | mounting, self._source)
+
+
+def netpbm(image: Any, where: str) -> tuple[bytes, str]:
+    """A raw image as the content of a file, and its suffix. InputError for an encoding that is not read, and missing pixels."""
+    if image.encoding not in ENCODINGS:
+        raise InputError(f"{where}: encoding is {quoted(image.encoding)}, expected one of {', '.join(ENCODINGS)}")
+    kind, channels, convert = ENCODINGS[image.encoding]
+    width, height, step = int(image.width), int(image.height), int(image.step)
+    used = width * channels * np.dtype(kind).itemsize
+    data = np.asarray(image.data, dtype=np.uint8)
+    if len(data) != step * height or step < used:
+        raise InputError(f"{where}: has {len(data)} bytes, expected {height} rows of {max(step, used)}")
+    packed: Pixels = (
+        np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(kind).reshape(height, width, channels)
+    )
+    if kind is np.uint16 and not image.is_bigendian:
+        packed = packed.byteswap()  # Netpbm is big-endian
+    pixels = np.ascontiguousarray(convert(packed[:, :, 0] if channels == 1 else packed))
+    mark, suffix = ("P5", ".pgm") if pixels.ndim == 2 else ("P6", ".ppm")
+    return f"{mark}\n{width} {height}\n{np.iinfo(kind).max}\n".encode() + pixels.tobytes(), suffix
+
+
+def _last_of_each(source: str, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
+    """Indices of the images in order of arrival, of several at one stamp the last."""
+    return checks.sightings_in_order(source, rows, t_ns, ["image"] * len(rows), warnings)
+
+
+def _key(path: Path, topic: str) -> str:
+    """A name for the images of a topic, another one if the bag changes."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    facts = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
+
+
+def _read_whole(folder: Path) -> list[_Row]:
+    """What the index says; nothing if it is damaged, or if an image is not there."""
+    try:
+        with (folder / INDEX).open(newline="", encoding="utf-8") as file:
+            rows = [
+                (int(row["row"]), int(row["header"]), int(row["received"]), str(row["file"]))
+                for row in csv.DictReader(file)
+            ]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return rows if all((folder / file).is_file() for *_, file in rows) else []

@@ -1,0 +1,138 @@
+"""Fields of ROS messages by their paths: ``tag.epc``, or ``reads[].tag.epc`` where one message holds a list of reads.
+
+A path is checked against the message type before anything is read, so that a wrong one is told at once, with the fields there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.io.bags.file import Bag, Topic
+from factorgraph_loc.text import listed, quoted
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+LIST = "[]"
+BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, as an EPC is
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+HEADER = "std_msgs/msg/Header"
+DEPTH = 6  # of messages within messages
+
+Row = tuple[Any, ...]
+
+
+class Fields:
+    """Some fields of the messages of a topic. ``rows``: one tuple of their values, in the order of ``names``, for each element of
+    the lists that the paths go through; one where they go through none."""
+
+    def __init__(self, bag: Bag, topic: Topic, paths: Mapping[Any, str]) -> None:
+        self.names = tuple(paths)
+        self._where = f"{bag.path}: topic {topic.name}"
+        store = bag.store(topic.name)
+        for name, path in paths.items():
+            check_path(store, topic, path, f"{self._where}: {name}")
+        self._single = [_getter(path) for path in paths.values() if LIST not in path]
+        self._lists = [_list_getters(path) for path in paths.values() if LIST in path]
+        order = [LIST in path for path in paths.values()]
+        places, singles, lists = [], 0, len(self._single)
+        for is_list in order:
+            places.append(lists if is_list else singles)
+            lists, singles = lists + is_list, singles + (not is_list)
+        self._places = tuple(places)
+        self.has_list = bool(self._lists)
+
+    def rows(self, message: Any, row: int) -> list[Row]:
+        """The values in a message, the ``row``-th of its topic; InputError if its lists are of different lengths."""
+        single = [get(message) for get in self._single]
+        if not self._lists:
+            return [tuple(single[i] for i in self._places)]
+        columns = [[inner(item) for item in outer(message)] for outer, inner in self._lists]
+        if len({len(column) for column in columns}) > 1:
+            lengths = ", ".join(str(len(column)) for column in columns)
+            raise InputError(
+                f"{self._where}: message {row} has lists of {lengths} elements, expected lists of one length"
+            )
+        return [tuple((*single, *items)[i] for i in self._places) for items in zip(*columns, strict=True)]
+
+
+def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
+    """InputError with the fields that the topic's messages have, if ``path`` is none of them."""
+    known = leaves(store, topic.type)
+    if path not in known and path + LIST not in known:
+        raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
+    if path.count(LIST) > 1:
+        raise InputError(f"{where} is {quoted(path)}, a list within a list, expected at most one {LIST}")
+
+
+def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:
+    """The paths of all numbers, texts, bytes and stamps in a message type."""
+    out: list[str] = []
+    definition: Any = store.fielddefs[kind][1]
+    for name, (form, detail) in definition:
+        path, label, inner = f"{prefix}{name}", form.name, detail
+        if label in {"ARRAY", "SEQUENCE"}:
+            (element, inner), _ = detail
+            label = element.name
+            path += "" if label == "BASE" and inner[0] in BYTES else LIST
+        if label == "BASE" or inner in TIMES:
+            out.append(path)
+        elif depth and inner in store.fielddefs:
+            out += leaves(store, str(inner), f"{path}.", depth - 1)
+    return out
+
+
+def has_header(bag: Bag, topic: Topic) -> bool:
+    """Whether the messages of a topic begin with a header, which has a stamp."""
+    fields: Any = bag.store(topic.name).fielddefs[topic.type][1]
+    return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == HEADER
+
+
+def as_text(value: Any) -> str:
+    """A name: a text as it is, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
+    if isinstance(value, str):
+        return value.strip()
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        return value.tobytes().hex().upper()
+    if isinstance(value, (bytes, bytearray)):
+        return value.hex().upper()
+    if isinstance(value, (np.ndarray, list)):  # the numbers of the markers of a bundle
+        return "-".join(str(part) for part in value)
+    return str(value)
+
+
+def as_number(value: Any) -> float:
+    """A number; NaN for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def as_nanoseconds(value: Any, unit: int) -> int:
+    """A stamp: a ROS time, or a number of ``unit`` nanoseconds each. ValueError if it is neither."""
+    if hasattr(value, "nanosec"):
+        return int(value.sec) * 10**9 + int(value.nanosec)
+    if isinstance(value, int):
+        return value * unit
+    return round(float(value) * unit)
+
+
+def _getter(path: str) -> Callable[[Any], Any]:
+    return attrgetter(path) if path else _itself
+
+
+def _list_getters(path: str) -> tuple[Callable[[Any], Sequence[Any]], Callable[[Any], Any]]:
+    """How to get the list, and a field of each of its elements."""
+    outer, _, inner = path.partition(LIST)
+    return attrgetter(outer), _getter(inner.lstrip("."))
+
+
+def _itself(value: Any) -> Any:
+    return value

@@ -1,0 +1,206 @@
+"""ROS bags through the library ``rosbags``, without ROS: version 1 (``.bag``), version 2 (a folder, or its ``.mcap`` or ``.db3``).
+
+Messages are read one after the other; in memory are the index of the bag and the chunk that is being read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import DEFINITION, require_size
+from factorgraph_loc.files.models import inside, nearest
+from factorgraph_loc.io.bags import unpacking as bag_unpacking
+from factorgraph_loc.text import quoted, told
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection, MessageDefinition
+    from rosbags.typesys.store import Typestore
+
+ROS1 = ".bag"
+SUFFIXES = (ROS1, ".mcap", ".db3")
+METADATA = "metadata.yaml"  # in the folder of a bag of version 2
+NO_FILE = 2**63 - 1  # what rosbags says is the start of a bag without messages
+
+# what rosbags says, and what to do about it
+HINTS = {
+    "not indexed": "its recording was cut off: `rosbag reindex` mends it",
+    "index looks damaged": "it is truncated: `rosbag reindex` mends it",
+    "end magic": "it is truncated: `mcap recover` mends it",
+    "missing tables": "it is truncated, or no bag",
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: its message type as ROS 2 writes it (``nav_msgs/msg/Odometry``), and how many messages it has."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Stamped:
+    """A message, the ``row``-th of its topic from 1, and when it was received [ns]."""
+
+    topic: str
+    row: int
+    received: int
+    message: Any
+
+
+class Bag:
+    """An open bag. ``topics`` by name; ``duration`` [s] from the first message to the last."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+        self._stores: dict[str, Typestore] = {}
+        self._connections: dict[str, list[Connection]] = {}
+        for connection in reader.connections:
+            # SQLite has bytes and numbers in columns of text, too
+            if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+                raise InputError(f"{path}: the name or the type of a topic is no text")
+            self._connections.setdefault(connection.topic, []).append(connection)
+        self.topics = {
+            name: Topic(name, connections[0].msgtype, sum(c.msgcount for c in connections))
+            for name, connections in sorted(self._connections.items())
+        }
+        self.duration = 0.0 if reader.start_time == NO_FILE else max(reader.end_time - 1 - reader.start_time, 0) / 1e9
+
+    def topic(self, name: str) -> Topic:
+        """A topic that has messages; InputError if the bag lacks it, or it has none."""
+        if name not in self.topics:
+            raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")
+        topic = self.topics[name]
+        if not topic.count:
+            raise InputError(f"{self.path}: topic {name} ({topic.type}) has no messages: leave it out of the manifest")
+        types = {connection.msgtype for connection in self._connections[name]}
+        if len(types) > 1:
+            raise InputError(
+                f"{self.path}: topic {name} has messages of {' and of '.join(sorted(types))}, expected one type"
+            )
+        return topic
+
+    def store(self, name: str) -> Typestore:
+        """The message types of a topic, from the definitions in the bag; in one without, those that ship with ROS 2."""
+        if name not in self._stores:
+            connection = self._connections[name][0]
+            definition = connection.msgdef
+            require_size(
+                self.path, f"the length of the definition of {connection.msgtype}", len(definition.data), DEFINITION
+            )
+            with _told(self.path):
+                self._stores[name] = _store(connection.msgtype, definition)
+            if connection.msgtype not in self._stores[name].fielddefs:
+                raise InputError(
+                    f"{self.path}: topic {name} is of type {connection.msgtype}, which the bag does not define: "
+                    "convert it to mcap with the package of that type installed"
+                )
+        return self._stores[name]
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Stamped]:
+        """The messages of ``topics`` in the order in which they were received."""
+        if not topics:
+            return
+        chosen = [connection for name in topics for connection in self._connections[name]]
+        decode = {}
+        for name in topics:
+            store, kind = self.store(name), self.topics[name].type
+            call = store.deserialize_ros1 if self.path.suffix == ROS1 else store.deserialize_cdr
+            decode[name] = (call, kind)
+        rows = dict.fromkeys(topics, 0)
+        source = iter(self._reader.messages(chosen))
+        while True:
+            with _told(self.path):
+                try:
+                    connection, received, raw = next(source)
+                except StopIteration:
+                    break
+                name = connection.topic
+                rows[name] += 1
+                call, kind = decode[name]
+                message = call(raw, kind)
+            yield Stamped(name, rows[name], received, message)
+        if missing := [name for name in topics if not rows[name]]:
+            raise InputError(f"{self.path}: topic {missing[0]} has no messages, though the bag's index says so")
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like that of a bag."""
+    return (path / METADATA).is_file() if path.is_dir() else path.suffix in SUFFIXES
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """The bag at ``path``; InputError if it cannot be read, and where ``rosbags`` is not installed."""
+    if not path.exists():
+        raise InputError(f"{path}: does not exist")
+    if not is_bag(path):
+        expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
+        raise InputError(f"{path}: is no ROS bag, expected {expected}")
+    for file in path.iterdir() if path.is_dir() else ():
+        inside(path, file.name, path)  # a link could lead elsewhere, and a FIFO would wait for ever
+    require_rosbags()
+    bag_unpacking.bound()
+    from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
+    from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415
+
+    with _told(path):
+        reader: Any = Reader1(path) if path.suffix == ROS1 else Reader2(path)
+        reader.open()
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def require_rosbags() -> None:
+    """InputError that names the extra to install, where ``rosbags`` is missing."""
+    try:
+        import rosbags.interfaces  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise InputError("ROS bags need the library rosbags: pip install 'factorgraph-loc[ros]'") from error
+
+
+@lru_cache(maxsize=64)
+def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
+    """The types that a definition tells of. They become compiled functions, which takes a hundred times as long as to read a
+    message; topics of one type share them, and so do bags that are read one after the other."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore  # noqa: PLC0415
+
+    if definition.format == MessageDefinitionFormat.NONE:
+        return get_typestore(Stores.LATEST)
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    if definition.format == MessageDefinitionFormat.MSG:
+        types.update(get_types_from_msg(definition.data, msgtype))
+    else:
+        line = "=" * 80 + "\n"
+        parts = definition.data.split(line)
+        for text in parts[1:] if len(parts) > 1 else parts:
+            types.update(get_types_from_idl(text.partition("\n")[2] if text.startswith("IDL: ") else text))
+    store.register(types)
+    return store
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Whatever a bag makes ``rosbags`` raise becomes an InputError: damaged files raise nearly anything there."""
+    try:
+        yield
+    except InputError:
+        raise
+    except PermissionError as error:
+        raise InputError(f"{path}: may not be read") from error
+    except Exception as error:
+        text = told(error)
+        hint = next((hint for words, hint in HINTS.items() if words in text), "")
+        raise InputError(f"{path}: cannot be read as a bag: {text.rstrip('.')}{'; ' + hint if hint else ''}") from error

@@ -1,0 +1,171 @@
+"""The frames of a bag (tf): where sensors sit on the robot, and a reference that is a chain of transforms."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.io.bags.clock import Stamper
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.poses import ReferenceTopic, check_rotations, seven
+from factorgraph_loc.model.planar import on_floor
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.text import listed, quoted
+from factors.camera.model import FORWARD
+from factors.se2 import Array
+
+STATIC = "/tf_static"
+
+
+class StaticFrames:
+    """Gathers transforms that do not change: of each frame its parent, and where it lies in that."""
+
+    def __init__(self) -> None:
+        self.parents: dict[str, tuple[str, Array]] = {}
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        for transform in item.message.transforms:
+            values = np.array(seven(transform.transform, "translation", "rotation"))
+            check_rotations(f"{item.topic}", np.array([item.row]), values[None])
+            parent = plain(transform.header.frame_id)
+            self.parents[plain(transform.child_frame_id)] = (parent, matrices(values[None])[0])
+
+    def pose(self, frame: str, base: str) -> Array | None:
+        """The pose (4, 4) of ``frame`` in ``base``; None where transforms do not join them."""
+        ours, theirs = self._up(plain(frame)), self._up(plain(base))
+        common = next((name for name in ours if name in theirs), None)
+        return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
+
+    def known(self, source: str, frame: str, base: str) -> Array:
+        """The same; InputError where transforms do not join them."""
+        pose = self.pose(frame, base)
+        if pose is None:
+            there = listed(sorted(self.parents)) or "none"
+            raise InputError(f"{source}: tf_static does not say where {frame} sits on {base}; frames: {there}")
+        return pose
+
+    def _up(self, frame: str) -> dict[str, Array]:
+        """The poses of ``frame`` in itself and in all frames above it, from near to far."""
+        out = {frame: np.eye(4)}
+        while frame in self.parents and self.parents[frame][0] not in out:
+            parent, pose = self.parents[frame]
+            out[parent] = pose @ out[frame]
+            frame = parent
+        return out
+
+
+@dataclass
+class _Edge:
+    """The transforms from one frame to its parent: stamps and poses as they come."""
+
+    parent: str
+    rows: array[int] = field(default_factory=lambda: array("q"))
+    t_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+
+
+class FrameReference:
+    """Gathers transforms, and makes of them the way of the topic's ``child`` through its ``parent``."""
+
+    def __init__(self, bag: Bag, topic: ReferenceTopic, stamper: Stamper) -> None:
+        self._source, self._turned = f"{bag.path} {topic.topic}", topic
+        self._parent, self._child = plain(topic.parent or ""), plain(topic.child or "")
+        self._stamper = stamper
+        self._edges: dict[str, _Edge] = {}
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        for transform in item.message.transforms:
+            child, parent = plain(transform.child_frame_id), plain(transform.header.frame_id)
+            edge = self._edges.setdefault(child, _Edge(parent))
+            edge.parent = parent
+            edge.rows.append(item.row)
+            edge.t_ns.append(self._stamper.choose(transform.header.stamp, t_ns))
+            edge.values.extend(seven(transform.transform, "translation", "rotation"))
+
+    def trajectory(self, static: StaticFrames, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
+        """Poses at the stamps of the transform that comes most often, where all are known; the others are interpolated."""
+        moving: list[Trajectory3] = []
+        steps: list[tuple[int, Array]] = []
+        before: Array = np.eye(4)
+        for name in self._chain(static):
+            if name in self._edges:
+                steps.append((len(moving), before))
+                moving.append(self._edge(name, t0_ns, warnings))
+                before = np.eye(4)
+            else:
+                before = static.parents[name][1] @ before
+        if not moving:
+            raise InputError(
+                f"{self._source}: {self._child} does not move in {self._parent}, expected a reference that does"
+            )
+        t = max(moving, key=len).t
+        t = t[(t >= max(m.t[0] for m in moving)) & (t <= min(m.t[-1] for m in moving))]
+        poses = np.broadcast_to(np.eye(4), (len(t), 4, 4))
+        for i, fixed in steps:
+            at = moving[i].at(t)
+            pose = np.tile(np.eye(4), (len(t), 1, 1))
+            pose[:, :3, :3], pose[:, :3, 3] = at.rotations, at.positions
+            poses = pose @ fixed @ poses
+        poses = before @ poses
+        flat = on_floor(self._source, poses[:, :3, 3], poses[:, :3, :3], warnings, self._turned)
+        return Trajectory(t, flat, has_heading=has_heading)
+
+    def _chain(self, static: StaticFrames) -> list[str]:
+        """The frames from the child up to, but without, the parent."""
+        chain: list[str] = []
+        frame = self._child
+        parents = {name: parent for name, (parent, _) in static.parents.items()}
+        parents |= {name: edge.parent for name, edge in self._edges.items()}
+        while frame != self._parent:
+            if frame not in parents or frame in chain:
+                known = sorted({*parents, *parents.values()})
+                wrong = next((name for name in (self._parent, self._child) if name not in known), None)
+                hint = (
+                    f"there is no frame {quoted(wrong)}{nearest(wrong, known)}"
+                    if wrong
+                    else f"it ends at {quoted(frame)}"
+                )
+                raise InputError(f"{self._source}: no transforms lead from {self._child} to {self._parent}: {hint}")
+            chain.append(frame)
+            frame = parents[frame]
+        return chain
+
+    def _edge(self, name: str, t0_ns: int, warnings: list[str]) -> Trajectory3:
+        edge = self._edges[name]
+        source = f"{self._source} {edge.parent} to {name}"
+        rows, t_ns = np.array(edge.rows, dtype=np.int64), np.array(edge.t_ns, dtype=np.int64)
+        values = np.array(edge.values).reshape(-1, 7)
+        check_rotations(source, rows, values)
+        keep = checks.in_order(source, rows, t_ns, warnings)
+        poses = matrices(values[keep])
+        return Trajectory3(checks.seconds(t_ns[keep], t0_ns), poses[:, :3, 3], poses[:, :3, :3])
+
+
+def plain(frame: str) -> str:
+    """A frame's name as ROS 2 has it, without the slash that some bags put before it."""
+    return frame.lstrip("/")
+
+
+def matrices(table: Array) -> Array:
+    """Poses (N, 4, 4) of positions and quaternions x, y, z, w (N, 7)."""
+    out = np.tile(np.eye(4), (len(table), 1, 1))
+    out[:, :3, 3] = table[:, :3]
+    out[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix()
+    return out
+
+
+def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a camera whose optical axes stand in the robot's frame as ``rotation`` (3, 3): the inverse of
+    :func:`factors.camera.model.mounting`."""
+    turned = rotation @ FORWARD.T
+    yaw = math.atan2(turned[1, 0], turned[0, 0])
+    pitch = math.atan2(-turned[2, 0], math.hypot(turned[0, 0], turned[1, 0]))
+    return math.atan2(turned[2, 1], turned[2, 2]), pitch, yaw

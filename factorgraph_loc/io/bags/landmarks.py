@@ -1,0 +1,166 @@
+"""Identified landmarks in a bag: markers that a detector found with their poses or their corners, or any message by a mapping."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.tables import NAMES, Table
+from factorgraph_loc.io.bags.clock import Clock
+from factorgraph_loc.io.bags.fields import Fields, as_number, as_text, leaves
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.frames import StaticFrames
+from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.native import native
+from factorgraph_loc.maps.markers import corner_names
+from factorgraph_loc.model.planar import Axes, Turned
+from factorgraph_loc.sensors.camera import tables as native_camera
+from factorgraph_loc.sensors.camera.stream import SightingStream
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.text import listed
+from factors.se2 import Array
+
+LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
+PixelField = Literal["landmark", "u", "v"]
+CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
+
+CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
+
+_POSE = "pose.position"
+# what detectors of markers say: the marker's name, and where it is in the camera's optical frame
+DETECTIONS: dict[str, tuple[str, str]] = {
+    "apriltag_ros/msg/AprilTagDetectionArray": ("detections[].id", f"detections[].pose.pose.{_POSE}"),
+    "aruco_msgs/msg/MarkerArray": ("markers[].id", f"markers[].pose.{_POSE}"),
+    "aruco_opencv_msgs/msg/ArucoDetection": ("markers[].marker_id", f"markers[].{_POSE}"),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": ("marker_ids[]", "poses[].position"),
+    "fiducial_msgs/msg/FiducialTransformArray": ("transforms[].fiducial_id", "transforms[].transform.translation"),
+}
+
+
+class LandmarkTopic(Turned):
+    """``fields``: where a message has the landmark's name, and its range and bearing, or its place x, y, z in the sensor's frame;
+    they are known for the usual detectors of markers. ``frame``: the sensor's, for tf_static to say where it sits; without it
+    ``axes`` tell how its axes stand: z forward (``optical``), x forward (``body``), or a list of them; and ``mounting`` how it is
+    turned on the robot."""
+
+    topic: str
+    fields: dict[LandmarkField, str] | None = None
+    axes: Axes = "optical"
+    frame: str | None = None
+    clock: Clock | None = None
+
+
+class PixelTopic(FileModel):
+    """Identified points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, as
+    :func:`factorgraph_loc.maps.markers.corner_names` says."""
+
+    topic: str
+    fields: dict[PixelField, str] | None = None
+    clock: Clock | None = None
+
+
+class Landmarks:
+    """Gathers ranges and bearings of a topic, or the places that they are computed from."""
+
+    def __init__(self, bag: Bag, options: LandmarkTopic) -> None:
+        topic = bag.topic(options.topic)
+        self._options = options
+        fields: dict[Any, str] = dict(options.fields or {})
+        if not fields:
+            if topic.type not in DETECTIONS:
+                known = ", ".join(DETECTIONS)
+                raise InputError(
+                    f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {known}"
+                )
+            name, place = DETECTIONS[topic.type]
+            fields = {"landmark": name} | {axis: f"{place}.{axis}" for axis in "xyz"}
+        self._places = "x" in fields
+        wanted = {"landmark", "x", "y", "z"} if self._places else {"landmark", "range", "bearing"}
+        if "landmark" not in fields or not set(fields) <= wanted or len(fields) < (4 if self._places else 2):
+            expected = "landmark with x, y and z, or with range, bearing or both"
+            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {expected}")
+        self._fields = Fields(bag, topic, fields)
+        self._rows = Rows(f"{bag.path} {topic.name}", 3 if self._places else 2)
+        self._names: list[str] = []
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        for values in self._fields.rows(item.message, item.row):
+            told = dict(zip(self._fields.names, values, strict=True))
+            self._names.append(_name(self._rows.source, told["landmark"], item.row))
+            wanted = "xyz" if self._places else ("range", "bearing")
+            self._rows.append(item, t_ns, tuple(as_number(told.get(name, np.nan)) for name in wanted))
+
+    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
+        """Ranges along the floor and bearings, in the robot's frame where ``frames`` say where the sensor sits there."""
+        source, rows = self._rows.source, self._rows.rows
+        ranges, bearings = self._polar(frames, base) if self._places else self._rows.values.T
+        table = Table(
+            Path(source), rows, self._rows.t_ns, {"range": ranges, "bearing": bearings}, {"landmark": self._names}
+        )
+        return native.make_sightings(table, t0_ns, warnings)
+
+    def _polar(self, frames: StaticFrames, base: str) -> tuple[Array, Array]:
+        places = self._rows.values
+        for i, axis in enumerate("xyz"):
+            checks.require_finite(self._rows.source, self._rows.rows, axis, places[:, i])
+        pose = np.eye(4)
+        if self._options.frame is not None:
+            pose = frames.known(self._rows.source, self._options.frame, base)
+        else:
+            pose[:3, :3] = self._options.turned()
+        x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
+        return np.hypot(x, y), np.arctan2(y, x)
+
+
+class PixelsOfPoints:
+    """Gathers identified pixels of a topic."""
+
+    def __init__(self, bag: Bag, options: PixelTopic) -> None:
+        topic = bag.topic(options.topic)
+        self._corners = not options.fields
+        if self._corners and topic.type != CORNERS:
+            raise InputError(
+                f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {CORNERS}"
+            )
+        if self._corners:
+            known = leaves(bag.store(topic.name), topic.type)
+            if lacking := [path for path in CORNER_FIELDS if path not in known]:
+                raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {listed(lacking)}")
+        fields: dict[Any, str] = dict(options.fields or {})
+        if not self._corners and set(fields) != {"landmark", "u", "v"}:
+            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected landmark, u and v")
+        self._fields = Fields(bag, topic, fields)
+        self._rows = Rows(f"{bag.path} {topic.name}", 2)
+        self._names: list[str] = []
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._corners:
+            for found in item.message.detections:
+                names = corner_names(f"{found.family}-{found.id}")
+                # apriltag begins at the lower left one and goes on to the lower right one
+                for name, corner in zip(reversed(names), found.corners, strict=True):
+                    self._names.append(name)
+                    self._rows.append(item, t_ns, (corner.x, corner.y))
+            return
+        for values in self._fields.rows(item.message, item.row):
+            told = dict(zip(self._fields.names, values, strict=True))
+            self._names.append(_name(self._rows.source, told["landmark"], item.row))
+            self._rows.append(item, t_ns, (as_number(told["u"]), as_number(told["v"])))
+
+    def stream(self, t0_ns: int, warnings: list[str]) -> SightingStream:
+        u, v = self._rows.values.T
+        source = Path(self._rows.source)
+        table = Table(source, self._rows.rows, self._rows.t_ns, {"u": u, "v": v}, {"landmark": self._names})
+        return native_camera.make_pixels(table, t0_ns, warnings)
+
+
+def _name(source: str, value: Any, row: int) -> str:
+    text = as_text(value)
+    if not text:
+        raise bad_field(source, "landmark", text, NAMES["landmark"], row=row)
+    return text

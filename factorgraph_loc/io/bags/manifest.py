@@ -1,0 +1,277 @@
+"""A manifest for a bag, proposed from its topics: which of them is which sensor, by the type of messages and by usual names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
+from factorgraph_loc.io.bags.clock import TF
+from factorgraph_loc.io.bags.fields import LIST, has_header, leaves
+from factorgraph_loc.io.bags.file import Bag, Topic
+from factorgraph_loc.io.bags.frames import STATIC
+from factorgraph_loc.io.bags.landmarks import CORNERS, DETECTIONS
+from factorgraph_loc.io.bags.messages import INITIAL_POSE, LANDMARK, PIXEL, ROUND
+from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
+from factorgraph_loc.io.bags.poses import POINT, POSES
+
+TRUTH = re.compile(
+    r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
+)
+NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
+
+# the last part of a field's path, without underscores, as people name it
+NAMES: dict[str, tuple[str, ...]] = {
+    "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag"),
+    "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
+    "rssi": ("rssi", "peakrssi", "rssidbm", "signalstrength"),
+    "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle", "phasedegrees", "phasedeg", "phaseradians", "phaserad"),
+    "frequency": (
+        "frequency",
+        "freq",
+        "frequencyhz",
+        "frequencykhz",
+        "frequencymhz",
+        "carrier",
+        "channelfrequency",
+        "channelmhz",
+        "channelkhz",
+    ),
+    "stamp": (
+        "firstseen",
+        "firstseenus",
+        "firstseenms",
+        "firstseentimestamp",
+        "firstseentimestamputc",
+        "readtime",
+        "timestamp",
+    ),
+}
+# the end of a field's name tells its unit, the first that fits
+UNITS = {
+    "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
+    "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
+    "stamp": {"us": "us", "ms": "ms", "ns": "ns"},
+}
+
+
+@dataclass
+class Proposal:
+    """``options`` of the reader; ``uses``: what a topic is taken as, by its name; ``notes``: what a person has to look at."""
+
+    options: dict[str, Any] = field(default_factory=dict)
+    uses: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def take(self, sensor: str, topic: Topic, **settings: Any) -> None:
+        self.options[sensor] = {"topic": topic.name, **settings}
+        self.uses[topic.name] = sensor
+
+
+def propose(bag: Bag) -> Proposal:
+    """What a bag seems to hold. Where several topics could be one sensor the likeliest is taken, and a note tells of the others."""
+    out = Proposal()
+    topics = [topic for topic in bag.topics.values() if topic.count]
+    _motion(out, topics)
+    _reference(out, topics)
+    _one_of(out, "imu", [topic for topic in topics if topic.type == IMU])
+    _camera(out, topics)
+    _landmarks(out, topics)
+    _rfid(out, bag, topics)
+    if STATIC in bag.topics:
+        out.uses[STATIC] = "where sensors sit"
+    if not any(has_header(bag, bag.topics[used["topic"]]) for used in out.options.values()):
+        out.options["clock"] = "receive"
+    return out
+
+
+def manifest_of(proposal: Proposal, path: str, beside: Mapping[str, str]) -> dict[str, Any]:
+    """The manifest, which names the bag as ``path``; ``beside``: names of rig and world that exist."""
+    return {
+        "title": f"What the bag {Path(path).name} holds",
+        "reader": "rosbag",
+        "path": path,
+        **beside,
+        "licence": "none stated",
+        "origin": "your own recording",
+        "options": proposal.options,
+    }
+
+
+def remarks(bag: Bag, proposal: Proposal, beside: Mapping[str, str]) -> list[str]:
+    """What a person has to look at in a proposed manifest, and the topics that it does not use."""
+    out = list(proposal.notes)
+    if "rig" not in beside:
+        out.append('no rig is given: rig = "NAME.rig.toml", beside this file, says what the robot is like')
+    if "world" not in beside:
+        out.append('no map is given: world = "NAME.world.toml", beside this file, says where tags and landmarks are')
+    unused = [topic for topic in bag.topics.values() if topic.name not in proposal.uses]
+    return out + [f"not used: {topic.name} ({topic.type}, {topic.count} messages)" for topic in unused]
+
+
+def manifest_text(manifest: Mapping[str, Any], told: Sequence[str]) -> str:
+    """A manifest as TOML, with what is ``told`` as comments."""
+    head = {key: value for key, value in manifest.items() if key != "options"}
+    options = dict(sorted(manifest["options"].items(), key=lambda item: isinstance(item[1], dict)))  # tables come last
+    comments = "".join(f"# {line}\n" for line in told)
+    return f"{tomli_w.dumps(head)}{comments}\n{tomli_w.dumps({'options': options})}"
+
+
+def _motion(out: Proposal, topics: Sequence[Topic]) -> None:
+    """Odometry before measured velocities, these before wheels, and commands last."""
+    ranked = [
+        topic
+        for kinds, measured in (
+            ({ODOMETRY}, True),
+            (set(TWISTS), True),
+            ({JOINTS}, True),
+            (set(TWISTS), False),
+        )
+        for topic in topics
+        if topic.type in kinds and not TRUTH.search(topic.name) and bool(NOT_MEASURED.search(topic.name)) != measured
+    ]
+    if not ranked:
+        out.notes.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
+        return
+    settings: dict[str, Any] = {}
+    if ranked[0].type == JOINTS:
+        settings = {"wheels": {"left": "left_wheel_joint", "right": "right_wheel_joint", "radius": 0.1, "track": 0.5}}
+        out.notes.append("wheels: name the joints of your robot, and measure radius and track [m]")
+    elif NOT_MEASURED.search(ranked[0].name):
+        out.notes.append(f"{ranked[0].name} holds what the robot was told to do, not what it did")
+    out.take("odometry", ranked[0], **settings)
+    _others(out, "odometry", ranked[1:])
+
+
+def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
+    poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
+    named = [topic for topic in poses if TRUTH.search(topic.name)]
+    if named:
+        out.take("reference", named[0])
+        _others(out, "reference", named[1:])
+        return
+    plain = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name)]
+    if plain:
+        out.take("reference", plain[0])
+        out.notes.append(f"{plain[0].name} is taken as the reference: leave it out if it is an estimate, not the truth")
+    for topic in topics:
+        if topic.type in TF and topic.name != STATIC and not plain:
+            text = (
+                f'[options.reference] topic = "{topic.name}", parent = "map", child = "base_link" would take it from tf'
+            )
+            out.notes.append(text)
+
+
+def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
+    images = [topic for topic in topics if topic.type in {COMPRESSED, RAW} and "depth" not in topic.name.lower()]
+    if not images:
+        return
+    infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
+    chosen = images[0]
+    place = chosen.name
+    while place and place not in infos:  # /camera/image_raw/compressed has its info at /camera/camera_info
+        place = place.rpartition("/")[0]
+    settings = {"info": infos[place].name} if place in infos else {}
+    out.take("camera", chosen, **settings)
+    if settings:
+        out.uses[settings["info"]] = "camera: lens"
+    else:
+        out.notes.append("no CameraInfo belongs to the images: the rig has to say what the camera is like")
+    _others(out, "camera", images[1:])
+
+
+def _landmarks(out: Proposal, topics: Sequence[Topic]) -> None:
+    for topic in topics:
+        if topic.type == LANDMARK:
+            out.take("bearing_range", topic, fields={name: name for name in ("landmark", "range", "bearing")})
+        elif topic.type == PIXEL:
+            out.take("sightings", topic, fields={name: name for name in ("landmark", "u", "v")})
+        elif topic.type in DETECTIONS and "bearing_range" not in out.options:
+            out.take("bearing_range", topic)
+        elif topic.type == CORNERS and "sightings" not in out.options:
+            out.take("sightings", topic)
+        elif topic.type == INITIAL_POSE[1] and topic.name == INITIAL_POSE[0]:
+            out.take("start", topic)
+
+
+def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
+    """The topic whose messages have the field of an EPC, and most of what is told of a read beside it."""
+    found = []
+    for topic in topics:
+        if topic.name in out.uses or topic.type.startswith(
+            ("sensor_msgs/", "nav_msgs/", "geometry_msgs/", "tf2_msgs/")
+        ):
+            continue
+        try:
+            fields = read_fields(leaves(bag.store(topic.name), topic.type))
+        except InputError as error:  # of a topic that is perhaps of no interest
+            out.notes.append(str(error))
+            continue
+        if "epc" in fields:
+            found.append((topic, fields))
+    if not found:
+        return
+    topic, fields = max(found, key=lambda entry: len(entry[1]))
+    settings: dict[str, Any] = {"fields": fields}
+    if "antenna" not in fields:
+        settings["antenna"] = "antenna"
+        out.notes.append(f"{topic.name} does not tell antennas apart: all reads are taken as of one, named antenna")
+    if units := _units(fields):
+        settings["units"] = units
+    if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
+        settings["rounds"] = "message"
+        if topic.type != ROUND:
+            out.notes.append(
+                "rfid: each message is taken as one inventory round of its antenna, an empty one as a silent round"
+            )
+    out.take("rfid", topic, **settings)
+    doubtful = [name for name in UNITS if name in fields and name not in units and topic.type != ROUND]
+    if doubtful:
+        out.notes.append(f"rfid: {', '.join(doubtful)}: taken to be in rad, Hz and us, set units if not so")
+    _others(out, "rfid", [other for other, _ in found if other is not topic])
+
+
+def read_fields(paths: Sequence[str]) -> dict[str, str]:
+    """The fields of a read among the paths of a message type, by their usual names."""
+    out = {}
+    for name, known in NAMES.items():
+        fitting = [p for p in paths if p.count(LIST) <= 1 and _plain(p) in known and not p.startswith("header.")]
+        if fitting:
+            out[name] = min(fitting, key=lambda p: (known.index(_plain(p)), len(p)))
+    if "stamp" not in out:  # the stamp of a read beside its EPC
+        stamps = [p for p in paths if p.endswith("stamp") and LIST in p]
+        if stamps:
+            out["stamp"] = stamps[0]
+    return out
+
+
+def _units(fields: Mapping[str, str]) -> dict[str, str]:
+    """Units that the names of fields tell."""
+    out = {}
+    for name, ends in UNITS.items():
+        plain = _plain(fields.get(name, ""))
+        unit = next((unit for end, unit in ends.items() if plain.endswith(end)), None)
+        if unit is not None:
+            out[name] = unit
+    return out
+
+
+def _plain(path: str) -> str:
+    return path.rsplit(".", 1)[-1].removesuffix(LIST).replace("_", "").lower()
+
+
+def _one_of(out: Proposal, sensor: str, topics: Sequence[Topic]) -> None:
+    if topics:
+        out.take(sensor, topics[0])
+        _others(out, sensor, topics[1:])
+
+
+def _others(out: Proposal, sensor: str, topics: Sequence[Topic]) -> None:
+    if topics:
+        out.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics)}")

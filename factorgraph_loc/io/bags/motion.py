@@ -1,0 +1,197 @@
+"""How the robot moved, by what a bag holds of it: poses or velocities of odometry, angles of wheels, the gyro of an IMU."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import FileModel, nearest
+from factorgraph_loc.io.bags.clock import Clock
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.frames import StaticFrames
+from factorgraph_loc.io.bags.poses import POSES, Poses
+from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.readers import motions
+from factorgraph_loc.model.planar import Turned, about_z
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.text import quoted
+from factors import se2
+from factors.se2 import Array, Integers
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWISTS = {"geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist"}
+JOINTS = "sensor_msgs/msg/JointState"
+IMU = "sensor_msgs/msg/Imu"
+
+
+class WheelSettings(FileModel):
+    """A differential drive: the names of its two wheels' joints, their radius, and the track between them."""
+
+    left: str
+    right: str
+    radius: Annotated[float, Field(gt=0.0, le=5.0, description="m")]
+    track: Annotated[float, Field(gt=0.0, le=20.0, description="m")]
+
+
+class OdometryTopic(Turned):
+    """``use``: of odometry its ``pose``, as the motion between messages, or its ``twist``; of wheels their position or velocity by
+    the same words. ``wheels`` are needed where the topic is of joints."""
+
+    topic: str
+    use: Literal["pose", "twist"] = "pose"
+    wheels: WheelSettings | None = None
+    clock: Clock | None = None
+
+
+class ImuTopic(Turned):
+    """A topic of an IMU: its turn rate about the robot's z axis. ``frame``: the IMU's, for tf_static to say how it sits; without it
+    ``axes`` and ``mounting`` do, else its z axis points up."""
+
+    topic: str
+    frame: str | None = None
+    clock: Clock | None = None
+
+
+Motion = IncrementStream | VelocityStream
+
+
+class PoseMotion:
+    """Odometry from poses of its own frame: the motion from one to the next."""
+
+    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
+        self._poses = Poses(bag, options.topic, options)
+        self.add = self._poses.add
+
+    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
+        """Absolute stamps (N,) and the stream, whose own count from the first."""
+        t_ns, poses = self._poses.in_order(warnings)
+        return t_ns, increments(t_ns, motions.between_poses(self._poses.rows.source, t_ns, poses, warnings))
+
+
+class TwistMotion:
+    """Odometry from velocities: each holds until the next."""
+
+    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
+        kind = bag.topic(options.topic).type
+        self._of_odometry = kind == ODOMETRY
+        self._stamped = kind.endswith("TwistStamped")
+        self._rows = Rows(f"{bag.path} {options.topic}", 2)
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        twist = item.message
+        if self._of_odometry:
+            twist = twist.twist.twist
+        elif self._stamped:
+            twist = twist.twist
+        self._rows.append(item, t_ns, (twist.linear.x, twist.angular.z))
+
+    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
+        t_ns, (v, w) = finite_columns(self._rows, ("v", "w"), warnings)
+        return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
+
+
+class WheelMotion:
+    """Odometry from the angles of two wheels, or from how fast they turn."""
+
+    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
+        if options.wheels is None:
+            raise InputError(f"{bag.path} {options.topic}: odometry.wheels is missing: left, right, radius and track")
+        self._wheels = options.wheels
+        self._column = "position" if options.use == "pose" else "velocity"
+        self._rows = Rows(f"{bag.path} {options.topic}", 2)
+        self._seen: set[str] = set()
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        names, values = item.message.name, getattr(item.message, self._column)
+        self._seen.update(names)
+        if len(values) != len(names):
+            if self._wheels.left in names:
+                raise InputError(
+                    f"{self._rows.source}:{item.row}: has {len(values)} numbers of {self._column} for {len(names)} joints, "
+                    "expected one for each; the other is chosen by odometry.use"
+                )
+            return
+        if self._wheels.left in names and self._wheels.right in names:  # other messages tell of other joints
+            wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
+            self._rows.append(item, t_ns, (float(wheels[0]), float(wheels[1])))
+
+    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
+        if not len(self._rows):
+            wrong = next((n for n in (self._wheels.left, self._wheels.right) if n not in self._seen), self._wheels.left)
+            raise InputError(
+                f"{self._rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
+            )
+        t_ns, (left, right) = finite_columns(self._rows, ("left wheel", "right wheel"), warnings)
+        radius, track = self._wheels.radius, self._wheels.track
+        if self._column == "velocity":
+            v, w = radius * (left + right) / 2.0, radius * (right - left) / track
+            return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
+        ways, scales = radius * np.column_stack((left, right)), np.full(2, radius)
+        left, right = motions.between_ways(self._rows.source, t_ns, ways, scales, warnings).T
+        arc, turn = (left + right) / 2.0, (right - left) / track
+        return t_ns, increments(t_ns, se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn))))
+
+
+class YawRates:
+    """The turn rate of an IMU."""
+
+    def __init__(self, bag: Bag, options: ImuTopic) -> None:
+        topic = bag.topic(options.topic)
+        if topic.type != IMU:
+            raise InputError(f"{bag.path}: topic {topic.name} is of type {topic.type}, expected {IMU}")
+        if options.frame is not None and options.is_given():
+            raise InputError(f"{bag.path} {topic.name}: tf_static tells of the frame, expected no axes or mounting")
+        self._options = options
+        self._rows = Rows(f"{bag.path} {options.topic}", 3)
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        rate = item.message.angular_velocity
+        self._rows.append(item, t_ns, (rate.x, rate.y, rate.z))
+
+    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> YawRateStream:
+        """Turn rates about the robot's z axis; of the IMU's axes only those that are turned about then need be numbers."""
+        turned = self._options.turned()
+        if self._options.frame is not None:
+            turned = frames.known(self._rows.source, self._options.frame, base)[:3, :3]
+        rows, t_ns = self._rows.rows, self._rows.t_ns
+        w = about_z(self._rows.source, rows, self._rows.values, turned)
+        keep = checks.in_order(self._rows.source, rows, t_ns, warnings)
+        return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
+
+
+OdometryRows = PoseMotion | TwistMotion | WheelMotion
+
+
+def odometry(bag: Bag, options: OdometryTopic) -> OdometryRows:
+    """What gathers the odometry of a topic, by the type of its messages."""
+    kind = bag.topic(options.topic).type
+    poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
+    if options.is_given() and not poses:
+        raise InputError(f"{bag.path} {options.topic}: axes and mounting are for odometry that comes as poses")
+    if kind == JOINTS:
+        return WheelMotion(bag, options)
+    if poses:
+        return PoseMotion(bag, options)
+    if kind in TWISTS or kind == ODOMETRY:
+        return TwistMotion(bag, options)
+    known = ", ".join(sorted({*POSES, *TWISTS, JOINTS}))
+    raise InputError(f"{bag.path}: topic {options.topic} is of type {kind}, expected one of {known}")
+
+
+def increments(t_ns: Integers, moves: Array) -> IncrementStream:
+    """The motions (N - 1, 3) between N stamps; the first row only says when the motion begins."""
+    dx, dy, dtheta = np.vstack((np.zeros((1, 3)), moves)).T
+    return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), dx, dy, dtheta)
+
+
+def finite_columns(rows: Rows, names: tuple[str, ...], warnings: list[str]) -> tuple[Integers, list[Array]]:
+    """Stamps and columns of rows in order of time, all numbers finite; InputError names the message of what is not so."""
+    number, t_ns, values = rows.rows, rows.t_ns, rows.values
+    for i, name in enumerate(names):
+        checks.require_finite(rows.source, number, name, values[:, i])
+    keep = checks.in_order(rows.source, number, t_ns, warnings)
+    return t_ns[keep], [values[keep, i] for i in range(len(names))]

@@ -1,0 +1,130 @@
+"""Poses in a bag: those of odometry, and the reference that estimates are scored against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.io.bags.clock import Clock
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
+from factorgraph_loc.model.trajectory import Trajectory
+from factors.se2 import Array, Integers
+
+POINT = "geometry_msgs/msg/PointStamped"
+WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSES: dict[str, Callable[[Any], Any]] = {
+    "nav_msgs/msg/Odometry": attrgetter("pose.pose"),
+    "geometry_msgs/msg/PoseStamped": attrgetter("pose"),
+    WITH_COVARIANCE: attrgetter("pose.pose"),
+    "geometry_msgs/msg/TransformStamped": attrgetter("transform"),
+}
+
+
+class ReferenceTopic(Turned):
+    """A topic of poses, or of tf, and then the frames: the robot is ``child`` in the world ``parent``. ``has_heading``: whether the
+    heading means something."""
+
+    topic: str
+    parent: str | None = None
+    child: str | None = None
+    has_heading: bool = True
+    clock: Clock | None = None
+
+
+class StartTopic(Turned):
+    """A topic whose first pose is a known start, with its covariance."""
+
+    topic: str
+    clock: Clock | None = None
+
+
+class Poses:
+    """Gathers the poses of a topic; points are poses whose heading means nothing."""
+
+    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
+        topic = bag.topic(name)
+        self._turned = turned
+        self._are_points = topic.type == POINT
+        if topic.type not in POSES and not self._are_points:
+            known = ", ".join(sorted({*POSES, POINT}))
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected one of {known}")
+        self._pose = POSES.get(topic.type, attrgetter("point"))
+        # a transform says translation and rotation where a pose says position and orientation
+        self._parts = (
+            ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
+        )
+        self.rows = Rows(f"{bag.path} {name}", 7)
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        pose = self._pose(item.message)
+        if self._are_points:
+            self.rows.append(item, t_ns, (pose.x, pose.y, pose.z, 0.0, 0.0, 0.0, 1.0))
+        else:
+            self.rows.append(item, t_ns, seven(pose, *self._parts))
+
+    def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
+        """Stamps (N,) and planar poses (N, 3), of equal stamps the last; InputError names the message of what is wrong."""
+        rows, t_ns = self.rows.rows, self.rows.t_ns
+        values, turns = self.rows.values, None
+        check_rotations(self.rows.source, rows, values)
+        if not self._are_points:
+            turns = rotations_of(self.rows.source, rows, values[:, 3:])
+        poses = on_floor(self.rows.source, values[:, :3], turns, warnings, self._turned)
+        keep = checks.in_order(self.rows.source, rows, t_ns, warnings)
+        return t_ns[keep], poses[keep]
+
+    def trajectory(self, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
+        t_ns, poses = self.in_order(warnings)
+        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading and not self._are_points)
+
+
+class Start:
+    """Gathers the first pose with covariance of a topic: where the robot is known to start."""
+
+    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
+        topic = bag.topic(name)
+        self._turned = turned
+        if topic.type != WITH_COVARIANCE:
+            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
+        self._source = f"{bag.path} {name}"
+        self._found: tuple[int, Any] | None = None
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        if self._found is None:
+            self._found = (t_ns, item.message.pose)
+
+    def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
+        """InputError if a variance of x, y or heading is not above zero."""
+        assert self._found is not None
+        t_ns, told = self._found
+        first = np.ones(1, dtype=np.int64)
+        values = np.array([seven(told.pose)])
+        check_rotations(self._source, first, values)
+        turns = rotations_of(self._source, first, values[:, 3:])
+        pose = on_floor(self._source, values[:, :3], turns, warnings, self._turned)[0]
+        variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
+        for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
+            if not 0.0 < variance < np.inf:
+                raise bad_field(self._source, f"covariance {name}", variance, "more than 0", row=1)
+        return StartPose((t_ns - t0_ns) / 1e9, pose, np.sqrt(variances))
+
+
+def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
+    """x, y, z [m] and the quaternion x, y, z, w of a pose, or of a transform."""
+    p, q = getattr(pose, position), getattr(pose, orientation)
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def check_rotations(source: str, rows: Integers, table: Array) -> None:
+    """InputError for a number of positions and quaternions (N, 7) that is not finite, and a quaternion that is no unit one."""
+    for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
+        checks.require_finite(source, rows, name, table[:, i])
+    require_unit(source, rows, table[:, 3:])

@@ -1,0 +1,226 @@
+"""ROS bags by a mapping of topics: ``fgloc manifest BAG`` proposes one.
+
+The bag is read once, as a stream; of its messages only the numbers that a log needs are kept, and images go to files.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.io.bags import clock as bag_clock
+from factorgraph_loc.io.bags import rig as bag_rig
+from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
+from factorgraph_loc.io.bags.clock import TF, Clock, Stamper
+from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
+from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
+from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
+from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
+from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTopic
+from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.text import told
+
+
+class Options(FileModel):
+    """Which topic is which sensor. ``clock``: which stamps count, those of the messages' headers or those of their receipt; a topic
+    may have its own. ``base_frame``: the robot's, of which tf_static says where sensors sit."""
+
+    odometry: OdometryTopic
+    imu: ImuTopic | None = None
+    rfid: RfidTopic | None = None
+    bearing_range: LandmarkTopic | None = None
+    camera: CameraTopic | None = None
+    sightings: PixelTopic | None = None
+    reference: ReferenceTopic | None = None
+    start: StartTopic | None = None
+    clock: Clock = "header"
+    base_frame: str = "base_link"
+
+
+class Gatherer(Protocol):
+    """Takes the messages of one topic."""
+
+    def add(self, item: Stamped, t_ns: int) -> None: ...
+
+
+class Listeners:
+    """Who takes the messages of which topic, and by which clock."""
+
+    def __init__(self, bag: Bag, clock: Clock) -> None:
+        self.bag, self.clock = bag, clock
+        self.stampers: list[Stamper] = []
+        self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
+
+    def stamper(self, topic: str, clock: Clock | None) -> Stamper:
+        """By the topic's own clock, or by that of the bag."""
+        return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
+
+    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
+        """``timed``: whether stamps of the topic mean something."""
+        self._of.setdefault(topic, []).append((stamper, gatherer))
+        if timed:
+            self.stampers.append(stamper)
+
+    def run(self) -> None:
+        """Read the bag."""
+        for item in self.bag.messages(list(self._of)):
+            for stamper, gatherer in self._of[item.topic]:
+                try:
+                    gatherer.add(item, stamper.stamp(item))
+                except (AttributeError, TypeError) as error:
+                    kind = self.bag.topics[item.topic].type
+                    where = f"{self.bag.path} {item.topic}:{item.row}"
+                    raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {told(error)}") from error
+        for stamper in self.stampers:
+            stamper.check()
+
+
+@dataclass
+class Gathered:
+    """What takes the messages of each sensor that the manifest names."""
+
+    imu: YawRates | None = None
+    rfid: Reads | None = None
+    bearing_range: Landmarks | None = None
+    camera: Images | None = None
+    info: Info | None = None
+    sightings: PixelsOfPoints | None = None
+    reference: Poses | FrameReference | None = None
+    start: Start | None = None
+
+
+def read(path: Path | None, options: Options) -> Log:
+    """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of what is wrong."""
+    if path is None:
+        raise InputError("rosbag: the path of the bag is missing")
+    with open_bag(path) as bag, ExitStack() as stack:
+        return _read(bag, options, stack)
+
+
+def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
+    listeners = Listeners(bag, options.clock)
+    motion = odometry(bag, options.odometry)
+    listeners.add(options.odometry.topic, motion, listeners.stamper(options.odometry.topic, options.odometry.clock))
+    frames = StaticFrames()
+    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
+        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    gathered = _listen(listeners, options)
+    if gathered.camera:
+        stack.callback(gathered.camera.discard)
+    listeners.run()
+
+    clock, warnings = bag_clock.report(listeners.stampers, options.clock)
+    t_ns, moved = motion.stream(warnings)
+    t0_ns = int(t_ns[0])
+    streams: dict[str, Stream] = {"odometry": moved}
+    if gathered.imu:
+        streams["imu"] = gathered.imu.stream(frames, options.base_frame, t0_ns, warnings)
+    if gathered.rfid:
+        streams["rfid"] = gathered.rfid.rounds(warnings).stream(t0_ns)
+    if gathered.bearing_range:
+        streams["bearing_range"] = gathered.bearing_range.stream(frames, options.base_frame, t0_ns, warnings)
+    if gathered.camera:
+        streams["camera"] = gathered.camera.stream(t0_ns, warnings)
+    if gathered.sightings:
+        streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
+    notes: list[str] = []  # of the bag's own rig, which one of the manifest replaces
+    rig = _rig(streams, gathered, options, frames, notes)
+    name = bag.path.resolve().stem
+    return Log(
+        name=name,
+        rig=rig,
+        world=World(name=name),
+        streams=streams,
+        reference=_reference(gathered, options, frames, t0_ns, warnings),
+        start=gathered.start.pose(t0_ns, warnings) if gathered.start else None,
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+        metadata={"clock": clock} | ({"robot": "; ".join(notes)} if notes else {}),
+    )
+
+
+def _listen(listeners: Listeners, options: Options) -> Gathered:
+    """All that the manifest names beside odometry."""
+    bag, out = listeners.bag, Gathered()
+    if options.imu:
+        out.imu = YawRates(bag, options.imu)
+        listeners.add(options.imu.topic, out.imu, listeners.stamper(options.imu.topic, options.imu.clock))
+    if options.rfid:
+        out.rfid = Reads(bag, options.rfid)
+        listeners.add(options.rfid.topic, out.rfid, listeners.stamper(options.rfid.topic, options.rfid.clock))
+    if options.bearing_range:
+        seen = options.bearing_range
+        out.bearing_range = Landmarks(bag, seen)
+        listeners.add(seen.topic, out.bearing_range, listeners.stamper(seen.topic, seen.clock))
+    if options.sightings:
+        out.sightings = PixelsOfPoints(bag, options.sightings)
+        listeners.add(
+            options.sightings.topic,
+            out.sightings,
+            listeners.stamper(options.sightings.topic, options.sightings.clock),
+        )
+    if options.camera:
+        out.camera, out.info = _listen_to_camera(listeners, options.camera)
+    if options.reference:
+        topic = options.reference
+        stamper = listeners.stamper(topic.topic, topic.clock)
+        if bag.topic(topic.topic).type not in TF:
+            out.reference = Poses(bag, topic.topic, topic)
+        elif topic.parent is None or topic.child is None:
+            raise InputError(f"{bag.path} {topic.topic}: reference.parent and reference.child are missing: two frames")
+        else:
+            out.reference = FrameReference(bag, topic, stamper)
+        listeners.add(topic.topic, out.reference, stamper)
+    if options.start:
+        out.start = Start(bag, options.start.topic, options.start)
+        listeners.add(options.start.topic, out.start, listeners.stamper(options.start.topic, options.start.clock))
+    return out
+
+
+def _listen_to_camera(listeners: Listeners, options: CameraTopic) -> tuple[Images, Info | None]:
+    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
+    images = Images(bag, options.topic, stamper)
+    if images.known:
+        listeners.stampers.append(stamper)
+    else:
+        listeners.add(options.topic, images, stamper)
+    info = None
+    if options.info:
+        info = Info(bag, options.info)
+        listeners.add(options.info, info, listeners.stamper(options.info, None), timed=False)
+    return images, info
+
+
+def _reference(
+    gathered: Gathered, options: Options, frames: StaticFrames, t0_ns: int, warnings: list[str]
+) -> Trajectory | None:
+    if options.reference is None:
+        return None
+    has_heading = options.reference.has_heading
+    if isinstance(gathered.reference, FrameReference):
+        return gathered.reference.trajectory(frames, t0_ns, has_heading, warnings)
+    return None if gathered.reference is None else gathered.reference.trajectory(t0_ns, has_heading, warnings)
+
+
+def _rig(
+    streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, notes: list[str]
+) -> Rig:
+    """What the bag tells of the robot; a rig of the manifest replaces it."""
+    base = options.base_frame
+    camera = bag_rig.camera_of(gathered.info, frames, base, notes) if gathered.info else None
+    reads = streams.get("rfid")
+    rfid = None
+    if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
+        rfid = bag_rig.antennas_of(set(reads.antenna), options.rfid.frames, frames, base, notes)
+    usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
+    return bag_rig.rig_of(usable, camera, rfid)

@@ -1,0 +1,12 @@
+"""The rig of a log that brings none."""
+
+from __future__ import annotations
+
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+
+# what a reader gives where the format says nothing of the robot
+DEFAULT_RIG = Rig(
+    name="default",
+    bearing_range=BearingRangeSettings(range_sigma=0.2, range_sigma_relative=0.1, bearing_sigma=0.05),
+)

@@ -1,0 +1,95 @@
+"""What every log must keep to, wherever it comes from: the bounds of its tables' columns, and of its span.
+
+Readers name the file and the row of what they can tell; what comes out of several rows, or of a format of others, is found here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import (
+    AGE,
+    BEARING_RANGE,
+    IMU,
+    INCREMENTS,
+    MAX_SPAN,
+    MEASURED_RANGE,
+    POSES,
+    RFID,
+    SIGHTINGS,
+    TWIST,
+    VELOCITIES,
+    Column,
+)
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.stream import RightSightingStream, SightingStream
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.twist.stream import TwistStream
+from factors.se2 import Array
+
+ROUNDING = 1e-9  # as a share: of a value that was multiplied with its unit
+COLUMNS: dict[type, tuple[Column, ...]] = {
+    VelocityStream: VELOCITIES.columns[1:],
+    IncrementStream: INCREMENTS.columns[1:],
+    YawRateStream: IMU.columns[1:],
+    TwistStream: TWIST.columns[1:],
+    BearingRangeStream: (MEASURED_RANGE, BEARING_RANGE["bearing"]),
+    RfidStream: (AGE, RFID["rssi"], RFID["phase"], RFID["frequency"]),
+    SightingStream: SIGHTINGS.columns[2:],
+    RightSightingStream: SIGHTINGS.columns[2:],
+}
+
+
+def require_bounds(log: Log) -> None:
+    """InputError at the first value of a log that lies outside its column's bounds, with the time."""
+    for name, stream in log.streams.items():
+        for column in COLUMNS.get(type(stream), ()):
+            _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
+    if log.reference is not None:
+        known = ("x", "y", "heading") if log.reference.has_heading else ("x", "y")
+        for name, values in zip(known, log.reference.poses.T, strict=False):
+            _require(f"{log.name}: reference", POSES[name], log.reference.t, values)
+    if log.reference3 is not None:
+        for name, values in zip("xyz", log.reference3.positions.T, strict=True):
+            _require(f"{log.name}: reference", POSES[name], log.reference3.t, values)
+    if log.start is not None:
+        for name, value in zip(("x", "y", "heading"), log.start.pose, strict=True):
+            _require(f"{log.name}: start", POSES[name], np.array((log.start.t,)), np.array((value,)))
+
+
+def _require(where: str, column: Column, t: Array, values: Array) -> None:
+    """InputError at the first row of ``values`` (N,) or (N, 3) that lies outside by more than rounding; ``t`` (N,): its time."""
+    low, high = column.low - ROUNDING * abs(column.low), column.high + ROUNDING * abs(column.high)
+    bad = replace(column, low=low, high=high).outside(values)
+    if bad.any():
+        i = int(np.argmax(bad.reshape(len(t), -1).any(axis=1)))
+        value = float(np.ravel(values[i])[np.argmax(np.ravel(bad[i]))])
+        raise InputError(f"{where} at {t[i]:.3f} s: {column.name} is {value!r}, expected {column.expected}")
+
+
+def require_one_span(log: Log) -> None:
+    """InputError at a stamp of a log that is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from the others, the start's
+    included: sensors whose clocks do not agree, if each table was in order when it was read."""
+    filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
+    if not filled:
+        return
+    for name, t in filled.items():
+        if not np.all(np.isfinite(t)):
+            raise InputError(f"{log.name}: {name} has a stamp that is no finite number")
+    first, last = log.span()
+    expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log"
+    if last - first > MAX_SPAN:
+        stamps: NDArray[np.float64] = np.sort(np.concatenate(list(filled.values())))
+        middle = float(stamps[len(stamps) // 2])
+        name, t = max(filled.items(), key=lambda item: float(np.abs(item[1] - middle).max()))
+        i = int(np.argmax(np.abs(t - middle)))
+        where = f"{log.name}: {name} has a stamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
+        raise InputError(f"{where}, expected {expected}: do their clocks agree?")
+    if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
+        raise InputError(f"{log.name}: the start is at {log.start.t:.0f} s after the first stamp, expected {expected}")

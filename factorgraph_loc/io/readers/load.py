@@ -1,0 +1,199 @@
+"""From what a user names to logs: a manifest, a folder in our own format, a shipped name, or any path with its reader."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import kind
+from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
+from factorgraph_loc.files.models import inside, nearest, parse_model, read_toml
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.io import look_over
+from factorgraph_loc.io.bags.file import is_bag
+from factorgraph_loc.io.native import default_rig
+from factorgraph_loc.io.native.rig_file import read_rig
+from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import registry as readers
+from factorgraph_loc.io.readers.bounds import require_bounds
+from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
+from factorgraph_loc.maps.markers import MarkerSettings
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.text import listed, one_line
+
+RUN_FILE = "run.toml"
+MOST = 1000  # logs that lists of options stand for
+TABLES = (".csv", *JSON_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What to read, and what to put into the log that the reader makes."""
+
+    reader: str
+    path: Path | None
+    name: str | None = None  # None: the reader's
+    options: Mapping[str, Any] = field(default_factory=dict)
+    rig: Rig | None = None
+    world: World | None = None
+    start: StartSettings | None = None
+    markers: MarkerSettings | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+def load(
+    log: str | Path,
+    *,
+    data_root: str | Path | None = None,
+    reader: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    rig: str | Path | None = None,
+    world: str | Path | None = None,
+) -> list[Log]:
+    """The logs that ``log`` names.
+
+    ``log`` is a manifest, a folder in the native format or its ``run.toml``, a name that ``manifests()`` lists, or, with
+    ``reader``, any path. ``options`` are the reader's and go before a manifest's; a list, or text with commas, makes a log of
+    each value. ``rig`` and ``world`` replace those of the log. ``data_root``: where the files of manifests are that are not
+    below the manifest's own folder, by default the environment's FGLOC_DATA. InputError names what is wrong in one line.
+    """
+    given = dict(options or {})
+    source = _find(str(log), data_root, reader)
+    choices = {key: _choices(value) for key, value in source.options.items()}
+    # the command line gives a list as text with commas
+    choices |= {
+        key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
+        for key, value in given.items()
+    }
+    if (count := math.prod(map(len, choices.values()))) > MOST:
+        raise InputError(f"{log}: its options stand for {count:,} logs, expected at most {MOST:,}")
+    if empty := [key for key, values in choices.items() if not values]:
+        raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
+    naming = [
+        key
+        for key, values in choices.items()
+        if (key in given or len(values) > 1) and not any(isinstance(value, Mapping) for value in values)
+    ]
+    replaced = replace(
+        source,
+        rig=read_rig(rig) if rig is not None else source.rig,
+        world=read_world(world) if world is not None else source.world,
+    )
+    return [
+        _read(replaced, dict(zip(choices, values, strict=True)), naming)
+        for values in itertools.product(*choices.values())
+    ]
+
+
+def read_log(
+    log: str | Path,
+    *,
+    data_root: str | Path | None = None,
+    reader: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    rig: str | Path | None = None,
+    world: str | Path | None = None,
+) -> Log:
+    """The one log that ``log`` names, which is what :func:`load` takes; InputError if it names several."""
+    logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
+    if len(logs) > 1:
+        raise InputError(f"{log} stands for {len(logs)} logs, expected one: {listed(found.name for found in logs)}")
+    return logs[0]
+
+
+def _choices(value: Any) -> list[Any]:
+    """The values of an option, of which there may be a list."""
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
+def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source:
+    path = Path(log)
+    if reader is not None:
+        readers.reader(reader)  # a wrong name of a reader is told before a wrong path
+    if kind(path) not in ("", "a file", "a folder"):
+        raise InputError(f"{log}: is {kind(path)}, expected a file or a folder")
+    if reader is not None:
+        if not path.exists():
+            raise InputError(f"{log}: does not exist")
+        return _Source(reader, path, None if reader == "native" else _name(path))
+    if path.is_dir() and (path / RUN_FILE).is_file():
+        path /= RUN_FILE
+    if path.exists() and is_bag(path):
+        raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
+    if path.is_file():
+        if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have that name too
+            return _Source("native", path.parent)
+        if path.suffix == ".toml":
+            return _from_manifest(path, data_root)
+        if path.suffix.lower() in TABLES:
+            raise InputError(f"{log}: is a table: a manifest with the reader mapped says what its columns are")
+        raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
+    known = manifests()
+    if log in known:
+        return _from_manifest(known[log], data_root)
+    if path.is_dir():
+        raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
+    raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
+
+
+def _name(path: Path) -> str:
+    return path.resolve().stem if path.is_file() else path.resolve().name
+
+
+def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
+    manifest: Manifest = read_manifest(file)
+    path = None
+    if manifest.path is not None:
+        path = inside(file.parent, manifest.path, file)  # one's own manifest, beside its log
+        if not path.exists():
+            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
+            path = inside(find_data_root(data_root, missing), manifest.path, file)
+        if not path.exists():
+            raise InputError(f"{file}: its data {path} does not exist")
+    return _Source(
+        reader=manifest.reader,
+        path=path,
+        name=None if file.name == RUN_FILE else file.stem,
+        options=manifest.options,
+        rig=None if manifest.rig is None else read_rig(inside(file.parent, manifest.rig, file)),
+        world=None if manifest.world is None else read_world(inside(file.parent, manifest.world, file)),
+        start=manifest.start,
+        markers=manifest.markers,
+        metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
+    )
+
+
+def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
+    """One log; ``naming``: the options that become part of its name, for they tell it from others of its source."""
+    chosen = readers.reader(source.reader)
+    log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
+    name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
+    log = replace(
+        log,
+        name=name,
+        rig=source.rig or log.rig,
+        world=source.world or log.world,
+        start=source.start.pose(log.t0_ns) if source.start else log.start,
+        metadata={**log.metadata, **source.metadata},
+    )
+    require_bounds(log)
+    if source.markers is not None:
+        from factorgraph_loc.sensors.camera.markers import with_markers  # noqa: PLC0415 - few logs need OpenCV to be read
+
+        log = with_markers(log, source.markers.family)
+    warnings = list(log.warnings)
+    if "imu" in log.streams and "imu" not in log.rig.sensors:
+        if log.rig is default_rig.DEFAULT_RIG:
+            log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
+        else:
+            warnings.append("the gyro is used only where sensors name imu: those of the rig do not")
+    if log.rig.name == default_rig.DEFAULT_RIG.name:
+        warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
+    return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over.look_over(log)))))

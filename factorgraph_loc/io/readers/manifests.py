@@ -1,0 +1,123 @@
+"""The data sets that ship with the project, each described by a manifest ``NAME.toml``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import LATEST
+from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model, read_toml
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.maps.markers import MarkerSettings
+from factorgraph_loc.model.log import StartPose
+
+DATA_ROOT = "FGLOC_DATA"
+
+
+class StartSettings(FileModel):
+    """A known start: pose, standard deviations, and absolute time (without it, t = 0 of the log)."""
+
+    x: Coordinate
+    y: Coordinate
+    heading: Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
+    sigma_position: Annotated[float, Field(ge=1e-6, le=1000.0, description="m")]
+    sigma_heading: Annotated[float, Field(ge=1e-6, le=10.0, description="rad")]
+    t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST, description="ns")] | None = None
+
+    def pose(self, t0_ns: int) -> StartPose:
+        """As a start in a log whose t = 0 is at ``t0_ns``."""
+        t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) / 1e9
+        sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
+        return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)
+
+
+class Manifest(FileModel):
+    """What a manifest says. ``path`` and the files of ``checksums`` (sha256) are below the data root, ``rig`` and ``world``
+    below the manifest's folder. ``options`` go to the reader; one whose value is a list makes several logs. ``markers`` are
+    looked for in the log's images."""
+
+    title: str
+    reader: str
+    licence: str
+    origin: str
+    path: str | None = None
+    rig: str | None = None
+    world: str | None = None
+    options: Mapping[str, Any] = Field(default_factory=dict)
+    start: StartSettings | None = None
+    markers: MarkerSettings | None = None
+    checksums: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A shipped data set; ``present``: whether the files that it needs are there."""
+
+    name: str
+    title: str
+    reader: str
+    licence: str
+    origin: str
+    present: bool
+
+
+def read_manifest(file: Path) -> Manifest:
+    """Read a manifest; InputError names file, key and what is expected."""
+    return parse_model(Manifest, read_toml(file), file)
+
+
+def describe(data_root: str | Path | None = None) -> list[Dataset]:
+    """What ships with the project, by name; InputError if a data root is named that does not exist."""
+    datasets = []
+    for name, file in manifests().items():
+        m = read_manifest(file)
+        datasets.append(Dataset(name, m.title, m.reader, m.licence, m.origin, is_present(m, file, data_root)))
+    return datasets
+
+
+def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> bool:
+    names = [*manifest.checksums, *([] if manifest.path is None else [manifest.path])]
+    if not names:
+        return True
+    if data_root is None and not os.environ.get(DATA_ROOT):
+        return False
+    root = find_data_root(data_root, file)
+    return all(inside(root, name, file).exists() for name in names)
+
+
+def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
+    """What is wrong with the files of a manifest, a line each: missing, or another content than the checksum says."""
+    if not manifest.checksums:
+        return []
+    root = find_data_root(data_root, manifest.title)
+    faults = []
+    for name, expected in manifest.checksums.items():
+        file = inside(root, name, manifest.title)
+        if not file.is_file():
+            faults.append(f"{file}: is missing")
+            continue
+        with file.open("rb") as content:
+            if hashlib.file_digest(content, "sha256").hexdigest() != expected:
+                faults.append(f"{file}: is not the file that the manifest describes (its sha256 differs)")
+    return faults
+
+
+def find_data_root(data_root: str | Path | None, source: object) -> Path:
+    """The folder that holds the data: the argument, else the environment's; InputError if there is none."""
+    if data_root is None:
+        named = os.environ.get(DATA_ROOT)
+        if not named:
+            raise InputError(f"{source}: needs the data folder: give --data-root or set {DATA_ROOT}")
+        data_root = named
+    folder = Path(data_root)
+    if not folder.is_dir():
+        raise InputError(f"{source}: the data folder {folder} does not exist")
+    return folder

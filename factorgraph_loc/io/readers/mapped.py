@@ -1,0 +1,175 @@
+"""A folder of tables that other programs wrote, each by a mapping of its columns: what a manifest says in place of a program."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.files.columns import IMU
+from factorgraph_loc.files.models import FileModel, inside
+from factorgraph_loc.files.tables import COLUMNS, NAMES, Table
+from factorgraph_loc.io.native import native
+from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.readers.mapped_poses import (
+    OdometryFile,
+    Offset,
+    ReferenceFile,
+    odometry_stream,
+    read_odometry,
+    read_reference,
+)
+from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories, texts_of
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.planar import Turned, about_z
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.tables import make_images
+from factorgraph_loc.sensors.rfid.tables import Rounds, read_rounds
+from factors.se2 import Array
+
+RATES = ("wx", "wy", "wz")
+SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "imu": (("t", "w"), ("t", *RATES)),
+    "bearing_range": (("t", "landmark", "range"), ("t", "landmark", "bearing"), ("t", "landmark", "range", "bearing")),
+    "camera": (("t", "file"),),
+    "sightings": (("t", "landmark", "u", "v"),),
+}
+RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which not all are needed
+
+
+class SensorFile(ColumnMapping):
+    """``clock_offset`` [s]: added to all stamps."""
+
+    clock_offset: Offset = 0.0
+
+
+class ImuFile(SensorFile, Turned):
+    """``columns``: t and w, the turn rate about an axis that points up; or wx, wy and wz, about axes of which ``axes`` and
+    ``mounting`` say how they stand on the robot."""
+
+
+class ImageFile(SensorFile):
+    """``folder``: where the images lie, by default that of the log."""
+
+    folder: str = "."
+
+
+class InventoryFile(SensorFile):
+    """``columns``: t (the end of a round), antenna, duration. The antennas' names are those of ``rfid``."""
+
+
+class Options(FileModel):
+    """Which file below the folder is which sensor, and the reference. The folder is the manifest's ``path``. ``readers``: files of
+    several RFID readers by any names, in place of ``rfid``."""
+
+    odometry: OdometryFile | None = None
+    imu: ImuFile | None = None
+    rfid: RfidFile | None = None
+    readers: dict[str, RfidFile] = Field(default_factory=dict)
+    inventories: InventoryFile | None = None
+    bearing_range: SensorFile | None = None
+    camera: ImageFile | None = None
+    sightings: SensorFile | None = None
+    reference: ReferenceFile | None = None
+
+
+def read(path: Path | None, options: Options) -> Log:
+    """The log in the folder ``path``; t = 0 at its first stamp. InputError names file, row and column of what is wrong."""
+    if path is None or not path.is_dir():
+        raise InputError(f"{path}: is no folder: path in the manifest names the folder of the log's files")
+    if options.odometry is None:
+        raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
+    warnings: list[str] = []
+    odometry_path = inside(path, options.odometry.file, path)
+    odometry_t_ns, moves, increments = read_odometry(odometry_path, options.odometry, warnings)
+    tables = {
+        sensor: _table(inside(path, mapping.file, path), sensor, mapping, warnings)
+        for sensor in SHAPES
+        if (mapping := getattr(options, sensor)) is not None
+    }
+    rounds = _rounds(path, options, warnings)
+    stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
+    t0_ns = min(int(t_ns.min()) for t_ns in stamps)
+    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
+    for sensor, table in tables.items():
+        if sensor == "camera" and options.camera is not None:
+            streams[sensor] = make_images(table, t0_ns, warnings, inside(path, options.camera.folder, path))
+        else:
+            streams[sensor] = native.make_stream(sensor, table, t0_ns, warnings)
+    if rounds:
+        streams["rfid"] = rounds.stream(t0_ns)
+    reference = None
+    if (told := options.reference) is not None:
+        times = None if told.times is None else inside(path, told.times, path)
+        reference = read_reference(inside(path, told.file, path), times, told, t0_ns, warnings)
+        if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
+            warnings.append(
+                f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
+                f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; look at units.t and clock_offset"
+            )
+    name = path.resolve().name
+    return Log(
+        name=name,
+        rig=DEFAULT_RIG,
+        world=World(name=name),
+        streams=streams,
+        reference=reference,
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+    )
+
+
+def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) -> Table:
+    """A file as the table of that sensor in the native format."""
+    mapped = read_mapped(path, mapping, SHAPES[sensor])
+    if mapped.passed:
+        warnings.append(f"{path}: {mapped.passed} objects without the columns of {sensor} are left out")
+    columns = {**COLUMNS[sensor], **dict.fromkeys(RATES, RATE)}
+    numbered = [name for name in mapped.fields if name != "t" and columns[name].kind == "number"]
+    numbers = {name: mapped.numbers(name, columns[name]) for name in numbered}
+    if sensor == "bearing_range":
+        numbers = {name: numbers.get(name, np.full(len(mapped.rows), np.nan)) for name in ("range", "bearing")}
+    if isinstance(mapping, ImuFile):
+        numbers = {"w": _about_z(mapped, mapping, numbers)}
+    names = {name: texts_of(mapped, name) for name in mapped.fields if name in NAMES}
+    return Table(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+
+
+def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Array:
+    if "w" not in numbers:
+        return about_z(mapped.path, mapped.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
+    if mapping.is_given():
+        raise InputError(
+            f"{mapped.path}: axes and mounting are for rates about three axes, expected columns wx, wy, wz"
+        )
+    return numbers["w"]
+
+
+def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | None:
+    files = [options.rfid] if options.rfid else list(options.readers.values())
+    if options.rfid and options.readers:
+        raise InputError(f"{folder}: [options] has rfid and readers, expected one of them")
+    if not files:
+        if options.inventories is not None:
+            raise InputError(f"{folder}: [options] has inventories without rfid")
+        return None
+    tables = [read_all_reads(folder, told, warnings) for told in files]
+    reads = tables[0] if len(tables) == 1 else joined(folder, tables)
+    gaps = {told.round_gap for told in files if told.round_gap is not None}
+    inventories = None
+    if (mapping := options.inventories) is not None:
+        if gaps:
+            raise InputError(f"{folder}: round_gap means nothing beside inventories, which tell the rounds")
+        antennas = {name: given for told in files for name, given in told.antennas.items()}
+        path = inside(folder, mapping.file, folder)
+        inventories = read_inventories(path, mapping, mapping.clock_offset, antennas)
+    if len(gaps) > 1:
+        raise InputError(
+            f"{folder}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
+        )
+    return read_rounds(reads, inventories, gaps.pop() if gaps else native.ROUND_GAP, warnings)

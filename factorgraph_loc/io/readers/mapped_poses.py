@@ -1,0 +1,139 @@
+"""Odometry and references by a mapping of columns: velocities, motions, poses or the ways of two wheels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.files.columns import INCREMENTS, LENGTH, VELOCITIES, WAYS
+from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
+from factorgraph_loc.io.readers import motions
+from factorgraph_loc.io.readers.space_poses import read_kitti
+from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
+from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factors import se2
+from factors.se2 import Array, Integers
+
+Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
+ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
+LEAST_AROUND = 300.0  # no robot turns by so many radians from one row to the next
+COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) for c in table.columns}
+
+
+class OdometryFile(ColumnMapping, Turned):
+    """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
+    quaternion (poses, of which only the motion between them counts); left, right (ways of the wheels, with their ``track``).
+    ``clock_offset`` [s]: added to all stamps."""
+
+    track: Annotated[float, Field(gt=0.0, le=10.0, description="m between the wheels")] | None = None
+    clock_offset: Offset = 0.0
+
+
+class ReferenceFile(ColumnMapping, Turned):
+    """Where the robot really was. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
+
+    format: Literal["columns", "tum", "kitti"] = "columns"
+    columns: dict[str, str] = Field(default_factory=dict)
+    times: str | None = None
+    has_heading: bool = True
+    clock_offset: Offset = 0.0
+
+
+def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tuple[Integers, Array, bool]:
+    """Stamps (N,), and velocities (N, 2) or increments (N, 3) with whether they are the latter. InputError names file and row."""
+    mapped = read_mapped(path, options, ODOMETRY)
+    if ("left" in mapped.fields) != (options.track is not None):
+        raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
+    t_ns, columns = _columns(mapped, options.clock_offset)
+    if "dx" in columns:
+        moves = np.column_stack((columns["dx"], columns["dy"], columns["dtheta"]))
+        return *checks.increments_in_order(path, mapped.rows, t_ns, moves, warnings), True
+    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
+    t_ns = t_ns[keep]
+    kept = {name: values[keep] for name, values in columns.items()}
+    if "v" in kept:
+        return t_ns, np.column_stack((kept["v"], kept["w"])), False
+    if options.track is not None:
+        ways = np.column_stack((kept["left"], kept["right"]))
+        scales = np.array([_scale(options, name) for name in ("left", "right")])
+        left, right = motions.between_ways(path, t_ns, ways, scales, warnings).T
+        arc, turn = (left + right) / 2.0, (right - left) / options.track
+        return t_ns, _after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
+    poses = _planar(path, mapped.rows[keep], kept, options, warnings)
+    return t_ns, _after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
+
+
+def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int) -> IncrementStream | VelocityStream:
+    t = checks.seconds(t_ns, t0_ns)
+    return IncrementStream(t, *values.T) if increments else VelocityStream(t, *values.T)
+
+
+def read_reference(
+    path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str]
+) -> Trajectory:
+    """The reference in seconds after ``t0_ns``; InputError names file and row of what is wrong."""
+    if options.format != "columns" and (options.columns or options.units):
+        raise InputError(f"{path}: format {options.format} has no columns or units to map")
+    if (options.format == "kitti") != (times is not None):
+        raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
+    shift = round(options.clock_offset * 1e9)
+    if options.format == "tum":
+        rows, t_ns, table = read_tum_rows(path)
+        poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), warnings, options)
+        t_ns = t_ns + shift
+    elif times is not None:
+        rows, t_ns, space = read_kitti(path, times)
+        known = (
+            options if options.axes else Turned(axes="body", mounting=options.mounting)
+        )  # the format says how they stand
+        t_ns, poses = t_ns + shift, on_floor(path, space.positions, space.rotations, warnings, known)
+    else:
+        mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
+        if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
+            raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
+        rows = mapped.rows
+        t_ns, columns = _columns(mapped, options.clock_offset)
+        poses = _planar(path, rows, columns, options, warnings)
+    keep = checks.in_order(path, rows, t_ns, warnings)
+    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
+
+
+def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
+    return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.fields if n != "t"}
+
+
+def _scale(options: OdometryFile, field: str) -> float:
+    """Metres per unit of a column: per tick, where it is what an encoder counts."""
+    unit = options.units.get(field, 1.0)
+    return LENGTH.get(unit, 1.0) if isinstance(unit, str) else float(unit)
+
+
+def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:
+    if "qw" in columns:
+        rotations = rotations_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
+        places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))
+        return on_floor(path, places, rotations, warnings, turned)
+    if turned.is_given():
+        raise InputError(f"{path}: axes and mounting are for poses with a quaternion, expected columns qx, qy, qz, qw")
+    heading = columns.get("heading", np.zeros(len(rows)))
+    around = np.abs(np.diff(heading, prepend=heading[0]))
+    if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
+        i = degrees[0]
+        expected = 'radians; it seems to go around at 360: units.heading = "deg"'
+        raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
+    return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
+
+
+def _after_rest(moves: Array) -> Array:
+    """Motions (N - 1, 3) as increments (N, 3): the first row only says when the motion begins."""
+    return np.vstack((np.zeros((1, 3)), moves))

@@ -1,0 +1,257 @@
+"""Reads of RFID tags as readers and their tools log them: CSV or JSON lines by a mapping of columns, with presets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import bounded
+from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
+from factorgraph_loc.files.columns import INVENTORIES, PURE, RFID, Column
+from factorgraph_loc.files.models import FileModel, inside
+from factorgraph_loc.files.tables import NAMES, Table
+from factorgraph_loc.sensors.rfid.tables import check_reads
+from factorgraph_loc.text import quoted
+from factors.se2 import Array, Integers
+
+SIGNALS = ("rssi", "phase", "frequency")
+OPTIONAL = (*SIGNALS, "channel", "last", "count")
+CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
+COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "how many reads the row stands for")
+REQUIRED = (("t", "epc", "antenna"), ("t", "epc"))
+
+# What tools write. ``impinj_itemtest``: the CSV of ItemTest; ``impinj_iot``: the stream of events of an R700; ``sllurp_log``: what
+# ``sllurp log`` writes; ``sllurp_reports``: its tag reports as JSON, whose stamps and phases are those of LLRP.
+PRESETS: dict[str, dict[str, dict[str, str]]] = {
+    "impinj_itemtest": {
+        "columns": {
+            "t": "Timestamp",
+            "epc": "EPC",
+            "antenna": "Antenna",
+            "rssi": "RSSI",
+            "phase": "PhaseAngle",
+            "frequency": "Frequency",
+        },
+        "units": {"t": "iso", "phase": "rad", "frequency": "MHz"},
+    },
+    "impinj_iot": {
+        "columns": {
+            "t": "timestamp",
+            "epc": "tagInventoryEvent.epcHex",
+            "antenna": "tagInventoryEvent.antennaPort",
+            "rssi": "tagInventoryEvent.peakRssiCdbm",
+            "phase": "tagInventoryEvent.phaseAngle",
+            "frequency": "tagInventoryEvent.frequency",
+        },
+        "units": {"t": "iso", "rssi": "cdBm", "phase": "deg", "frequency": "kHz"},
+    },
+    "sllurp_log": {
+        "columns": {"t": "timestamp", "epc": "epc", "antenna": "antenna", "rssi": "rssi"},
+        "units": {"t": "s"},
+    },
+    "sllurp_reports": {
+        "columns": {
+            "t": "FirstSeenTimestampUTC",
+            "last": "LastSeenTimestampUTC",
+            "epc": "EPC",
+            "antenna": "AntennaID",
+            "rssi": "PeakRSSI",
+            "phase": "ImpinjRFPhaseAngle",
+            "channel": "ChannelIndex",
+            "count": "TagSeenCount",
+        },
+        "units": {"t": "us", "last": "us", "phase": "turn/4096"},
+    },
+}
+
+
+class Channels(FileModel):
+    """Channels at even distances: the frequency of channel 1, and the step to the next."""
+
+    first: Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")]
+    step: Annotated[float, Field(gt=0.0, lt=100.0, description="MHz")]
+
+
+class RfidFile(ColumnMapping):
+    """``columns``: t (or the first of several reads), epc, antenna, rssi, phase, frequency or channel, and, where a row stands for
+    several reads, ``last`` and ``count``. ``preset``: columns and units of a known tool, which those given here replace.
+    ``antenna``: the name of the only one. ``antennas``: names in the rig of those of the file. ``channels`` [MHz]: frequencies of
+    channels 1, 2, ... ``epc_case``: in which letters EPCs are compared with the map. ``clock_offset`` [s]: added to all stamps."""
+
+    columns: dict[str, str] = Field(default_factory=dict)
+    preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
+    antenna: str | None = None
+    antennas: dict[str, str] = Field(default_factory=dict)
+    channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")], ...] | Channels | None = None
+    epc_case: EpcCase = "as written"
+    round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] | None = None
+    clock_offset: Annotated[float, Field(ge=-1e10, le=1e10, description="s")] = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_preset(cls, content: Any) -> Any:
+        """The mapping of the preset, with what is given in place of it."""
+        name = content.get("preset") if isinstance(content, dict) else None
+        preset = PRESETS.get(name) if isinstance(name, str) else None
+        if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
+            return content
+        columns = preset["columns"] | content.get("columns", {})
+        units = preset["units"] | content.get("units", {})
+        if "antenna" in content:
+            columns.pop("antenna", None)
+        if "channels" not in content:
+            columns.pop("channel", None)
+        return {**content, "columns": columns, "units": units}
+
+
+def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Table:
+    """The reads of the file below ``folder``, or of all files whose names fit where it holds ``*``, as readers begin new ones."""
+    if "*" not in options.file:
+        return read_reads(inside(folder, options.file, folder), options, warnings)
+    inside(folder, options.file.replace("*", "x"), folder)
+    with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns of which pathlib makes nothing
+        files = sorted(file for file in folder.glob(options.file) if file.is_file())
+    if not files:
+        raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of files that are there")
+    return joined(
+        folder / options.file,
+        [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files],
+    )
+
+
+def joined(path: Path, tables: Sequence[Table]) -> Table:
+    """All reads of several tables in the order of time, as of ``path``."""
+    return _in_time(
+        Table(
+            path,
+            np.concatenate([table.rows for table in tables]),
+            np.concatenate([table.t_ns for table in tables]),
+            {name: np.concatenate([table.numbers[name] for table in tables]) for name in SIGNALS},
+            {name: [text for table in tables for text in table.names[name]] for name in ("epc", "antenna")},
+        )
+    )
+
+
+def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:
+    """The reads as the table ``rfid`` of the native format. InputError names file, row and column of what is wrong.
+
+    A row that stands for several reads gives two, the first with what was measured: when the others came is not told.
+    """
+    if ("antenna" in options.columns) == (options.antenna is not None):
+        raise InputError(f"{path}: expected either columns.antenna, or antenna, the name of the only one")
+    if ("channel" in options.columns) != (options.channels is not None):
+        raise InputError(f"{path}: columns.channel and channels, the frequencies [MHz], are needed together")
+    if {"channel", "frequency"} <= set(options.columns):
+        raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
+    shape = REQUIRED[0] if options.antenna is None else REQUIRED[1]
+    mapped = read_mapped(path, options, (shape,), OPTIONAL)
+    if mapped.passed:
+        warnings.append(f"{path}: {mapped.passed} objects that are no reads are left out")
+    t_ns = mapped.stamps("t", options.clock_offset)
+    antennas = [options.antenna] * len(t_ns) if options.antenna else texts_of(mapped, "antenna")
+    numbers = {name: _signal(mapped, name) for name in SIGNALS}
+    if "channel" in mapped.fields:
+        numbers["frequency"] = _frequencies(mapped, options.channels)
+    table = Table(
+        path,
+        mapped.rows,
+        t_ns,
+        numbers,
+        {"epc": _epcs(mapped, options.epc_case), "antenna": [options.antennas.get(str(a), str(a)) for a in antennas]},
+    )
+    check_reads(table)
+    return _in_time(_with_last(table, mapped, options, warnings))
+
+
+def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> Table:
+    """The rounds as the table ``inventories`` of the native format; ``antennas`` as of the reads."""
+    mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
+    names = [antennas.get(name, name) for name in texts_of(mapped, "antenna")]
+    duration = mapped.numbers("duration", INVENTORIES["duration"])
+    return Table(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
+
+
+def _signal(mapped: Mapped, name: str) -> Array:
+    return mapped.numbers(name, RFID[name]) if name in mapped.fields else np.full(len(mapped.rows), np.nan)
+
+
+def texts_of(mapped: Mapped, field: str) -> list[str]:
+    """The names (N) in a column; InputError where one is missing."""
+    for row, text in zip(mapped.cells.rows, mapped.texts(field), strict=True):
+        if not text:
+            raise bad_field(mapped.path, mapped.mapping.columns[field], text, NAMES[field], row=row)
+    return list(mapped.texts(field))
+
+
+def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
+    """EPCs as the map writes them: without the marks of Python's bytes, which some versions of sllurp leave."""
+    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts_of(mapped, "epc")]
+    return in_case(plain, case)
+
+
+def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
+    """The frequencies (N,) [Hz] of channels, which count from 1."""
+    number = mapped.numbers("channel", CHANNEL)
+    last = len(channels) if isinstance(channels, tuple) else 1000
+    with np.errstate(invalid="ignore"):
+        bad = np.flatnonzero(~(np.isnan(number) | ((number >= 1) & (number <= last) & (number == np.floor(number)))))
+    if len(bad):
+        i = int(bad[0])
+        column = mapped.mapping.columns["channel"]
+        raise bad_field(mapped.path, column, float(number[i]), f"a channel of 1 to {last}", row=mapped.cells.rows[i])
+    if isinstance(channels, Channels):
+        return np.asarray((channels.first + (number - 1.0) * channels.step) * 1e6)
+    table = np.array((*(channels or ()), np.nan)) * 1e6
+    return np.asarray(table[np.where(np.isnan(number), len(table), number).astype(np.int64) - 1])
+
+
+def _with_last(table: Table, mapped: Mapped, options: RfidFile, warnings: list[str]) -> Table:
+    """With a second read, of which only the time is known, for each row that stands for more than one."""
+    if "last" not in mapped.fields:
+        if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
+            warnings.append(f"{table.path}: {many} rows stand for several reads, of which one time is known: one each")
+        return table
+    last_ns = mapped.stamps("last", options.clock_offset)
+    wrong = np.flatnonzero(last_ns < table.t_ns)
+    if len(wrong):
+        i = int(wrong[0])
+        column = mapped.mapping.columns["last"]
+        raise bad_field(
+            table.path, column, mapped.texts("last")[i], "a time not before the first", row=int(table.rows[i])
+        )
+    several = last_ns > table.t_ns
+    if "count" in mapped.fields:
+        count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
+        several &= count > 1.0
+        if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
+            warnings.append(f"{table.path}: {more} reads between the first and the last of their row are left out")
+    return _taken(table, np.concatenate((np.arange(len(last_ns)), np.flatnonzero(several))), last_ns)
+
+
+def _taken(table: Table, order: Integers, last_ns: Integers) -> Table:
+    """The rows ``order`` (M,), the later ones of which are the last reads of rows that came before."""
+    repeated = np.arange(len(order)) >= len(table.rows)
+    return Table(
+        table.path,
+        table.rows[order],
+        np.where(repeated, last_ns[order], table.t_ns[order]),
+        {name: np.where(repeated, np.nan, values[order]) for name, values in table.numbers.items()},
+        {name: [texts[i] for i in order.tolist()] for name, texts in table.names.items()},
+    )
+
+
+def _in_time(table: Table) -> Table:
+    """In the order of time: readers report in batches, in any order."""
+    order = np.argsort(table.t_ns, kind="stable")
+    return Table(
+        table.path,
+        table.rows[order],
+        table.t_ns[order],
+        {name: values[order] for name, values in table.numbers.items()},
+        {name: [texts[i] for i in order.tolist()] for name, texts in table.names.items()},
+    )

@@ -1,0 +1,89 @@
+"""The motion between poses of odometry, and between counts of encoders: both may begin anew in the middle of a log."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factors import se2
+from factors.se2 import Array, Integers
+
+# m/s and rad/s: below these no motion is a jump, and how many times faster than ever before a jump is
+SPEED, TURN, FASTER = 1.0, 2.0, 3.0
+NEAR, ZERO = 0.05, 1e-6  # m: of the origin, where odometry begins anew; and of what is set to 0
+HELD = 1.0  # s for which the motion before goes on where odometry begins anew
+COUNTERS = (2**8, 2**16, 2**32)  # where encoders begin anew at 0
+
+
+def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
+    """The motions (N - 1, 3) between poses (N, 3) of odometry at N stamps [ns].
+
+    Where odometry begins anew, at the origin of its frame and faster than the robot ever moved before, or at nothing but zeros
+    after a pause, the motion before goes on.
+    """
+    moves = se2.between(poses[:-1], poses[1:])
+    durations = _durations(t_ns)
+    speeds, turns = np.hypot(moves[:, 0], moves[:, 1]) / durations, np.abs(moves[:, 2]) / durations
+    fastest = _before(speeds, SPEED)
+    home = np.hypot(poses[1:, 0], poses[1:, 1]) <= NEAR + fastest * durations
+    jumps = (speeds > FASTER * fastest) | (turns > FASTER * _before(turns, TURN))
+    zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > NEAR) & (durations > HELD)
+    anew = np.flatnonzero((home & jumps) | zeros)
+    for i in anew.tolist():
+        before = se2.log(moves[i - 1]) / durations[i - 1] if i else np.zeros(3)
+        moves[i] = se2.exp(before * min(float(durations[i]), HELD))
+    _tell(source, t_ns, anew, warnings)
+    return moves
+
+
+def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, warnings: list[str]) -> Array:
+    """The motions (N - 1, 3) of a pair of wheels between the ways (N, 2) [m] that they have gone, ``scales`` (2,) times what
+    encoders counted; N stamps [ns]. An encoder with few bits counts on from 0; one that begins anew is treated as poses are."""
+    steps = np.stack([_unwound(ways[:, i], float(scales[i])) for i in range(2)], axis=-1)
+    durations = _durations(t_ns)
+    speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
+    fastest = _before(speeds, SPEED)
+    home = np.abs(ways[1:]).max(axis=1, initial=0.0) <= NEAR + fastest * durations
+    anew = np.flatnonzero(home & (speeds > FASTER * fastest))
+    for i in anew.tolist():
+        before = steps[i - 1] / durations[i - 1] if i else np.zeros(2)
+        steps[i] = before * min(float(durations[i]), HELD)
+    _tell(source, t_ns, anew, warnings)
+    return steps
+
+
+def _unwound(ways: Array, scale: float) -> Array:
+    """Steps (N - 1,) of one wheel; half the range of a counter is more than a wheel turns between two rows."""
+    steps: Array = np.diff(ways)
+    ticks = ways / scale
+    if not np.allclose(ticks, np.rint(ticks), atol=1e-3):
+        return steps
+    size = next((size for size in COUNTERS if ticks.min() >= -(size // 2) and ticks.max() < size), None)
+    # of a counter that never came to its end the size is not known, and does not matter
+    if size is None or np.abs(steps).max(initial=0.0) <= 0.5 * size * abs(scale):
+        return steps
+    whole = size * scale
+    return np.asarray(steps - whole * np.rint(steps / whole))
+
+
+def _durations(t_ns: Integers) -> Array:
+    """Between N stamps (N - 1,) [s], at least a millisecond: stamps may repeat, with a motion in between."""
+    return np.asarray(np.maximum(np.diff(t_ns), 1_000_000) / 1e9)
+
+
+def _before(rates: Array, least: float) -> Array:
+    """The largest (N,) of all rates (N,) before each, those of jumps left out, and at least ``least``."""
+    out, most = np.empty(len(rates)), least
+    for i, rate in enumerate(rates.tolist()):
+        out[i] = most
+        if most < rate <= FASTER * most:
+            most = rate
+    return out
+
+
+def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -> None:
+    if len(anew):
+        at = (int(t_ns[anew[0] + 1]) - int(t_ns[0])) / 1e9
+        times = "" if len(anew) == 1 else f" {len(anew)} times, first"
+        warnings.append(
+            f"{source}: the odometry begins anew at 0{times} {at:.1f} s after its start: the motion before goes on there"
+        )

@@ -1,0 +1,127 @@
+"""The Plaza sets (Djugash, Hamner, Roth, JFR 26(9), 2009) as the gtsam wheel ships them: odometry and ranges to beacons."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.readers.matlab import read_matlab
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factors import se2
+from factors.se2 import Array, Integers
+
+FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}
+
+# what to add to the reference's heading so that a positive distance drives forward
+HEADING_OFFSET = {1: 0.0, 2: math.pi}
+# the heading of the first run's truth is the sum of its odometry's rotations
+HAS_HEADING = {1: False, 2: True}
+
+
+class Options(FileModel):
+    """``run``: 1 or 2."""
+
+    run: Annotated[int, Field(ge=1, le=2)]
+
+
+def read(path: Path | None, options: Options) -> Log:
+    """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its truth.
+
+    InputError names file, field and row (counted from 1 within the field) of what is wrong.
+    """
+    file = path or shipped(options.run)
+    fields = read_matlab(file, FIELDS)
+    warnings: list[str] = []
+    for name, columns in (("GT", "t x y heading"), ("DR", "t distance dtheta"), ("TD", "t 2 beacon range")):
+        for i, column in enumerate(columns.split()):
+            checks.require_finite(f"{file}:{name}", rows_of(fields[name]), column, fields[name][:, i])
+    truth, truth_ns = kept_in_order(f"{file}:GT", fields["GT"], warnings)
+    t0_ns = int(truth_ns[0])
+    poses = truth[:, 1:].copy()
+    poses[:, 2] = se2.wrap(poses[:, 2] + HEADING_OFFSET[options.run])
+    return Log(
+        name=f"plaza{options.run}",
+        rig=DEFAULT_RIG,
+        world=beacons(f"{file}:TL", fields["TL"]),
+        streams={
+            "odometry": increments(f"{file}:DR", fields["DR"], t0_ns, warnings),
+            "bearing_range": ranges(f"{file}:TD", fields["TD"], t0_ns, warnings),
+        },
+        reference=Trajectory(checks.seconds(truth_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+    )
+
+
+def shipped(run: int) -> Path:
+    """The file of a run in the gtsam wheel."""
+    import gtsam  # noqa: PLC0415 - heavy, and needed for this only
+
+    try:
+        return Path(gtsam.findExampleDataFile(f"Plaza{run}_.mat"))  # type: ignore[no-untyped-call]
+    except RuntimeError as error:
+        raise InputError(f"Plaza{run}_.mat: is not in the installed gtsam, give the path of the file") from error
+
+
+def rows_of(table: Array) -> Integers:
+    return np.arange(1, len(table) + 1, dtype=np.int64)
+
+
+def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Integers]:
+    """The rows of a table to keep, and their stamps [ns]."""
+    t_ns = checks.stamps(source, rows_of(table), table[:, 0])
+    keep = checks.in_order(source, rows_of(table), t_ns, warnings)
+    return table[keep], t_ns[keep]
+
+
+def beacons(source: str, table: Array) -> World:
+    landmarks: dict[str, Landmark] = {}
+    for row, (number, x, y) in enumerate(table, start=1):
+        if not np.all(np.isfinite((number, x, y))):
+            raise bad_field(source, "row", [float(number), float(x), float(y)], "finite numbers", row=row)
+        landmarks[beacon_name(number)] = parse_model(Landmark, {"x": x, "y": y}, f"{source}:{row}")
+    return World(name="plaza", landmarks=landmarks)
+
+
+def beacon_name(number: float) -> str:
+    return f"{number:g}"
+
+
+def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> IncrementStream:
+    """The odometry, led by a row without motion at ``t0_ns``: without it the duration of the first one is not known."""
+    moves = np.column_stack((table[:, 1], np.zeros(len(table)), table[:, 2]))
+    rows = rows_of(table)
+    t_ns, moves = checks.increments_in_order(source, rows, checks.stamps(source, rows, table[:, 0]), moves, warnings)
+    if t_ns[0] > t0_ns:
+        moves = np.vstack((np.zeros(3), moves))
+        t_ns = np.concatenate(([t0_ns], t_ns))
+    return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
+
+
+def ranges(source: str, table: Array, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
+    """The ranges by time: the file joins recordings that overlap, so its order is not that of arrival."""
+    rows = rows_of(table)
+    checks.require_above_zero(source, rows, "range", table[:, 3])
+    t_ns = checks.stamps(source, rows, table[:, 0])
+    if moved := int(np.count_nonzero(t_ns < np.maximum.accumulate(t_ns))):
+        warnings.append(f"{source}: {moved} rows are older than one before them: sorted by time")
+    order = np.argsort(t_ns, kind="stable")
+    table, t_ns, rows = table[order], t_ns[order], rows[order]
+    names = [beacon_name(number) for number in table[:, 2]]
+    keep = checks.sightings_in_order(source, rows, t_ns, names, warnings)
+    return BearingRangeStream(
+        checks.seconds(t_ns[keep], t0_ns), [names[i] for i in keep], table[keep, 3], np.full(len(keep), np.nan)
+    )

@@ -1,0 +1,94 @@
+"""Poses in space as data sets write them: quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's; and lists of images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
+from factorgraph_loc.files.columns import POSES
+from factorgraph_loc.files.tables import Table
+from factorgraph_loc.io.readers.columns import read_columns
+from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factors.camera import model as reprojection
+from factors.se2 import Integers
+
+ORTHONORMAL = 2e-3  # and a rotation matrix: KITTI's have seven digits
+MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+
+
+def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:
+    """Rows (N,), stamps (N,) [ns] and poses of a KITTI odometry file, whose stamps are the lines of ``times``.
+
+    The file's poses are of a camera that looks along z, with y down, in the frame of the first of them (Geiger, Lenz, Urtasun, "Are
+    we ready for autonomous driving?", CVPR 2012). Here z is up and x ahead, in world and robot. InputError names file and row.
+    """
+    table, rows = read_columns(path, MATRIX)
+    if not len(table):
+        raise InputError(f"{path}: holds no poses")
+    stamps = read_times(times)
+    if len(stamps) < len(table):
+        raise bad_field(
+            times, "number of rows", len(stamps), f"at least {len(table)}, one for each pose of {path.name}"
+        )
+    matrices = table.reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
+    if len(bad):
+        i = int(bad[0])
+        raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=int(rows[i]))
+    u, _, vt = np.linalg.svd(rotations)
+    ahead = reprojection.FORWARD
+    t_ns = stamps[: len(table)]
+    return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+
+
+def read_times(path: Path) -> Integers:
+    """The stamps (N,) [ns] of a file with one in each line, in seconds; InputError at one that is not after the one before."""
+    columns = ColumnMapping(file=path.name, columns={"t": "1"}, units={"t": "s"}, separator=" ", header=False)
+    mapped = read_mapped(path, columns, (("t",),))
+    t_ns = mapped.stamps("t")
+    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
+    if len(stuck):
+        i = int(stuck[0])
+        expected = f"a stamp after that of the row before, {int(t_ns[i - 1])} ns"
+        raise bad_field(path, "time", f"{int(t_ns[i])} ns", expected, row=int(mapped.rows[i]))
+    return t_ns
+
+
+def read_poses(
+    path: Path, columns: Sequence[str], *, unit: str, separator: Literal[",", " "], warnings: list[str]
+) -> tuple[Integers, Trajectory3]:
+    """Stamps (N,) [ns] and poses, in seconds after the first, of a file whose ``columns`` are named in their order by t, x, y, z,
+    qx, qy, qz, qw; of equal stamps the last. InputError names file and row of what is wrong."""
+    named = {name: str(i) for i, name in enumerate(columns, start=1)}
+    told = ColumnMapping(file=path.name, columns=named, units={"t": unit}, separator=separator, header=False)
+    mapped = read_mapped(path, told, (tuple(columns),))
+    numbers = {name: mapped.numbers(name, POSES[name]) for name in columns if name != "t"}
+    t_ns = mapped.stamps("t")
+    rotations = rotations_of(path, mapped.rows, np.column_stack([numbers[name] for name in ("qx", "qy", "qz", "qw")]))
+    positions = np.column_stack([numbers[name] for name in "xyz"])
+    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
+    t_ns = t_ns[keep]
+    return t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, positions[keep], rotations[keep])
+
+
+def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> Table:
+    """The stamps and names of images, as the table ``camera`` of the native format."""
+    columns = {"t": "1", "file": "2"}
+    told = ColumnMapping(file=path.name, columns=columns, units={"t": unit}, separator=separator, header=False)
+    mapped = read_mapped(path, told, (("t", "file"),))
+    return Table(path, mapped.rows, mapped.stamps("t"), {}, {"file": list(mapped.texts("file"))})
+
+
+def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:
+    """The same with seconds after ``t0_ns``; its stamps are ``t_ns`` (N,)."""
+    return replace(trajectory, t=checks.seconds(t_ns, t0_ns))

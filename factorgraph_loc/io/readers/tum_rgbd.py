@@ -1,0 +1,52 @@
+"""TUM RGB-D: colour images of a camera in the hand, listed in ``rgb.txt``, and its true poses in ``groundtruth.txt`` (Sturm et
+al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). Depth images and the accelerometer are not read."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel, inside
+from factorgraph_loc.io.readers.space_poses import later, read_image_list, read_poses
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.tables import make_images
+
+POSES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+# the robot's frame is the camera's, and its lens the nominal one that the benchmark names for all of its sensors
+RIG = Rig(
+    name="kinect-tum",
+    sensors=("camera",),
+    camera=CameraSettings(
+        width=640, height=480, fx=525, fy=525, cx=319.5, cy=239.5, pitch=-math.pi / 2, yaw=math.pi / 2
+    ),
+)
+
+
+class Options(FileModel):
+    """The format has no options."""
+
+
+def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
+    """The images with the true camera poses as ``reference3``; t = 0 at the first image.
+
+    InputError names the file and what is wrong."""
+    if path is None:
+        raise InputError("tum_rgbd: the path of the folder with rgb.txt is missing")
+    warnings: list[str] = []
+    table = read_image_list(inside(path, "rgb.txt", path), unit="s", separator=" ")
+    t0_ns = int(table.t_ns.min())
+    t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), POSES, unit="s", separator=" ", warnings=warnings)
+    name = path.resolve().name
+    return Log(
+        name=name,
+        rig=RIG,
+        world=World(name=name),
+        streams={"camera": make_images(table, t0_ns, warnings, path)},
+        reference3=later(poses, t_ns, t0_ns),
+        t0_ns=t0_ns,
+        warnings=tuple(warnings),
+    )

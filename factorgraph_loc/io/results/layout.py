@@ -1,0 +1,21 @@
+"""The files of a result folder."""
+
+from __future__ import annotations
+
+FILES = (
+    "final.tum",
+    "causal.tum",
+    "estimates.parquet",
+    "learnt.json",
+    "events.csv",
+    "config.toml",
+    "metrics.json",
+)  # the last says that all are there
+COVARIANCES = {
+    "cov_xx": (0, 0),
+    "cov_xy": (0, 1),
+    "cov_xh": (0, 2),
+    "cov_yy": (1, 1),
+    "cov_yh": (1, 2),
+    "cov_hh": (2, 2),
+}

@@ -1,0 +1,223 @@
+"""Bundle adjustment: points and the cameras that see them, all in one graph of GTSAM.
+
+After Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000: projection factors with Huber's loss,
+a prior on each camera from where its pose is known, Levenberg-Marquardt. What does not fit is left out and the rest
+adjusted again. Covariances come from the Schur complement on the cameras, which are few beside the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+import scipy.sparse
+from gtsam.symbol_shorthand import K, L, X
+
+from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Integers, Tracks, Truths, reproject
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+ROUNDS = 3
+LOOSE, OUTLIER = (
+    6.0,
+    3.5,
+)  # standard deviations of a pixel beyond which an observation is left out, in the first round and later
+ITERATIONS = 20
+RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
+FOCAL_SIGMA = 0.1  # of an unknown focal length, as a share
+FIXED = 1e-5  # standard deviation of those constants of a calibration that are known
+SOMEWHERE = 1000.0  # m, standard deviation of a point of which nothing is known
+CHUNK = 500  # points whose covariances are computed at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """What was adjusted: ``model`` (its focal length too, if that was a variable), ``cameras``, and ``points`` (T, 3) [m] of
+    ``tracks``, whose observations agree; ``old`` (T,): their numbers before. ``errors`` (N, 2) [px]: of the observations.
+
+    ``camera_covariances`` (F, 6, 6): of the cameras' perturbations in their own frames, turn first, then shift;
+    ``point_covariances`` (T, 3, 3) [m^2]: marginal ones, the cameras' uncertainty included, that of the focal length not."""
+
+    model: CameraModel
+    cameras: Cameras
+    tracks: Tracks
+    points: Array
+    old: Integers
+    errors: Array
+    camera_covariances: Array
+    point_covariances: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Those of the ``points`` (M,) of which a map knows the ``positions`` (M, 3) [m] with ``covariances`` (M, 3, 3)."""
+
+    points: Integers
+    positions: Array
+    covariances: Array
+
+    def kept(self, left: Integers) -> Known:
+        """What is known of the points ``left`` (T',), ascending, by their new numbers."""
+        rows = np.isin(self.points, left)
+        return Known(np.searchsorted(left, self.points[rows]), self.positions[rows], self.covariances[rows])
+
+
+class Motion(Protocol):
+    """What is known of the motion from camera to camera."""
+
+    def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors on the poses ``X(0)``, ``X(1)``, ..."""
+
+
+def adjust(
+    model: CameraModel,
+    cameras: Cameras,
+    covariances: Array,
+    tracks: Tracks,
+    points: Array,
+    *,
+    known: Known | None = None,
+    motion: Motion | None = None,
+    focal: bool = False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Bundle:
+    """Adjust ``points`` (T, 3) and the ``cameras``, whose poses are known with ``covariances`` (F, 6, 6), see :class:`Bundle`.
+
+    ``known``: what is known of some of the points, ``motion``: of how the camera moves; the covariances do not tell of the latter.
+    ``focal``: the focal lengths are not known. RuntimeError where the graph cannot be solved.
+    """
+    known = known or Known(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    old = np.arange(len(points))
+    fixed = gtsam.NonlinearFactorGraph()
+    for i, covariance in enumerate(covariances):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        fixed.add(gtsam.PriorFactorPose3(X(i), pose3(cameras.positions[i], cameras.rotations[i]), noise))
+    if motion is not None:
+        motion.add_to(fixed)
+    for i in range(ROUNDS):
+        model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, focal=focal)
+        least = np.full(len(points), 2)
+        least[known.points] = 1
+        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER, least)
+        progress((i + 1) / ROUNDS)
+        if right.all() and i > 0:
+            break
+        tracks, left = tracks.kept(right)
+        points, old, known = points[left], old[left], known.kept(left)
+    errors = reproject(model, cameras, points, tracks)[0]
+    of_cameras, of_points = marginals(
+        model, cameras, np.asarray(np.linalg.inv(covariances), dtype=float), tracks, points
+    )
+    return Bundle(model, cameras, tracks, points, old, errors, of_cameras, of_points)
+
+
+def agreeing(
+    model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float, least: Integers
+) -> Truths:
+    """Which observations (N,) are at most ``limit`` standard deviations off, of points that then still are seen as often as
+    ``least`` (T,) says."""
+    errors, _, _, depths = reproject(model, cameras, points, tracks)
+    right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
+    seen = np.bincount(tracks.track[right], minlength=tracks.count)
+    return np.asarray(right & (seen >= least)[tracks.track])
+
+
+def marginals(
+    model: CameraModel,
+    cameras: Cameras,
+    information: Array,
+    tracks: Tracks,
+    points: Array,
+    known: Known | None = None,
+) -> tuple[Array, Array]:
+    """Marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised here; ``information`` (F, 6, 6): of the
+    cameras' priors."""
+    count, total = len(cameras), tracks.count
+    _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
+    by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
+    of_points = np.repeat(SOMEWHERE**-2 * np.eye(3)[None], total, axis=0)
+    np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
+    if known is not None:
+        of_points[known.points] += np.linalg.inv(known.covariances)
+    of_cameras = np.array(information)
+    np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))
+    inverse = np.linalg.inv(of_points)
+    # the gain of each observation: how its point moves with its camera
+    gains = np.einsum("nij,nkj,nkl->nil", inverse[tracks.track], by_point, by_camera)
+    gain = _sparse(gains, tracks.track, tracks.frame, (3 * total, 6 * count))
+    cross = _sparse(np.einsum("nki,nkj->nij", by_camera, by_point), tracks.frame, tracks.track, (6 * count, 3 * total))
+    schur = -(cross @ gain).toarray()
+    for i in range(count):
+        schur[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += of_cameras[i]
+    joint = np.linalg.inv(schur)
+    for begin in range(0, total, CHUNK):
+        block = gain[3 * begin : 3 * (begin + CHUNK)]
+        moved, dense = (part.reshape(-1, 3, 6 * count) for part in (block @ joint, block.toarray()))
+        inverse[begin : begin + CHUNK] += moved @ dense.transpose(0, 2, 1)
+    places = 6 * np.arange(count)[:, None] + np.arange(6)
+    return joint[places[:, :, None], places[:, None, :]], 0.5 * (inverse + inverse.transpose(0, 2, 1))
+
+
+def pose3(position: Array, rotation: Array) -> gtsam.Pose3:
+    """A pose as GTSAM has it."""
+    return gtsam.Pose3(gtsam.Rot3(rotation), position)
+
+
+def robust_noise(model: CameraModel) -> Any:
+    """The noise of a pixel under Huber's loss."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(model.robust)
+    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
+
+
+def _optimized(
+    model: CameraModel,
+    fixed: gtsam.NonlinearFactorGraph,
+    known: Known,
+    cameras: Cameras,
+    tracks: Tracks,
+    points: Array,
+    *,
+    focal: bool,
+) -> tuple[CameraModel, Cameras, Array]:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.push_back(fixed)
+    calibration = model.calibration()
+    for i in range(len(cameras)):
+        values.insert(X(i), pose3(cameras.positions[i], cameras.rotations[i]))
+    for k, point in enumerate(points):
+        values.insert(L(k), point)
+    for k, position, covariance in zip(known.points.tolist(), known.positions, known.covariances, strict=True):
+        graph.add(gtsam.PriorFactorPoint3(L(k), position, gtsam.noiseModel.Gaussian.Covariance(covariance)))
+    noise = robust_noise(model)
+    rows = zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.pixels, strict=True)
+    if focal:
+        sigmas = np.array([FOCAL_SIGMA * model.fx, FOCAL_SIGMA * model.fy, *[FIXED] * 7])
+        graph.add(gtsam.PriorFactorCal3DS2(K(0), calibration, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        values.insert(K(0), calibration)
+        for i, k, pixel in rows:
+            graph.add(gtsam.GeneralSFMFactor2Cal3DS2(pixel, noise, X(i), L(k), K(0)))
+    else:
+        for i, k, pixel in rows:
+            graph.add(gtsam.GenericProjectionFactorCal3DS2(pixel, noise, X(i), L(k), calibration, False, False))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(ITERATIONS)
+    parameters.setRelativeErrorTol(RELATIVE)
+    parameters.setAbsoluteErrorTol(ABSOLUTE)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    if focal:
+        fx, fy = found.atCal3DS2(K(0)).vector()[:2].tolist()
+        model = replace(model, fx=fx, fy=fy)
+    poses = [found.atPose3(X(i)) for i in range(len(cameras))]
+    adjusted = Cameras(np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses]))
+    return model, adjusted, np.array([found.atPoint3(L(k)) for k in range(len(points))]).reshape(-1, 3)
+
+
+def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
+    """The matrix that has ``blocks`` (N, r, c) at those places, counted in blocks."""
+    _, height, width = blocks.shape
+    i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
+    j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)
+    return scipy.sparse.csr_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape)

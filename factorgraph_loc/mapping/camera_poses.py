@@ -1,0 +1,85 @@
+"""Where the camera of a log was at each of its images, and how well that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.mapping.triangulation import Cameras, Integers
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.vision.frame import CameraFrame
+from factors.camera.model import CameraModel, camera_pose
+from factors.se2 import Array
+
+MAX_GAP = 0.5  # s between the stamps of a reference, across which it is not interpolated
+ASKEW, AFLOAT = 0.003, 0.003  # rad, m: how much a robot on the floor tilts and heaves
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrames:
+    """F frames with features, and the ``cameras`` that took them; ``covariances`` (F, 6, 6) of these in their own frames, turn
+    first, then shift."""
+
+    frames: list[CameraFrame]
+    cameras: Cameras
+    covariances: Array
+
+    def __getitem__(self, index: Integers) -> PosedFrames:
+        """The frames of an index array."""
+        return PosedFrames([self.frames[i] for i in index.tolist()], self.cameras[index], self.covariances[index])
+
+
+def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames:
+    """The frames of a log with features, at the poses of its reference, in the plane or in space.
+
+    ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis where the reference has no
+    covariances. Frames that lie outside of the reference or in its gaps are left out. InputError where a camera, features or a
+    reference are missing, or nothing is left.
+    """
+    stream = log.streams.get("camera")
+    if not isinstance(stream, FeatureStream):
+        raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+    if log.rig.camera is None:
+        raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
+    model = log.rig.camera.model()
+    t = stream.t + log.rig.time_offset("camera")
+    usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
+    if log.reference3 is not None:
+        inside = (t >= log.reference3.t[0]) & (t <= log.reference3.t[-1])
+        at = log.reference3.at(t[inside])
+        cameras = Cameras(at.positions + at.rotations @ model.position, at.rotations @ model.rotation)
+        covariances = np.repeat(usual[None], len(at), axis=0)
+    elif log.reference is not None and log.reference.has_heading:
+        poses = log.reference.at(t, max_gap=MAX_GAP)
+        inside = np.isfinite(poses).all(axis=1)
+        cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
+    else:
+        raise InputError(f"{log.name}: has no reference with headings that says where its images were taken")
+    frames = [frame for frame, keep in zip(stream.frame, inside.tolist(), strict=True) if keep]
+    if not any(len(frame.pixels) for frame in frames):
+        raise InputError(f"{log.name}: none of its {len(stream.t)} images has features and a pose of the reference")
+    return PosedFrames(frames, cameras, covariances)
+
+
+def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array, usual: Array) -> tuple[Cameras, Array]:
+    """Cameras of a robot on the floor at ``poses`` (F, 3), and their covariances."""
+    places = [camera_pose(model, pose) for pose in poses]
+    cameras = Cameras(
+        np.array([p for p, _ in places]).reshape(-1, 3), np.array([r for _, r in places]).reshape(-1, 3, 3)
+    )
+    if reference.covariances is None:
+        return cameras, np.repeat(usual[None], len(t), axis=0)
+    nearest = np.clip(np.searchsorted(reference.t, t), 0, len(reference.t) - 1)
+    # by (x, y, heading) in the world: the heading turns about z, and swings the camera around the robot
+    by_pose = np.zeros((len(t), 6, 3))
+    by_pose[:, 2, 2] = by_pose[:, 3, 0] = by_pose[:, 4, 1] = 1.0
+    arm = cameras.positions[:, :2] - poses[:, :2]
+    by_pose[:, 3, 2], by_pose[:, 4, 2] = -arm[:, 1], arm[:, 0]
+    back = cameras.rotations.transpose(0, 2, 1)
+    by_pose = np.concatenate((back @ by_pose[:, :3], back @ by_pose[:, 3:]), axis=1)
+    floor = np.diag(np.repeat(np.square((ASKEW, AFLOAT)), 3))
+    return cameras, by_pose @ reference.covariances[nearest] @ by_pose.transpose(0, 2, 1) + floor

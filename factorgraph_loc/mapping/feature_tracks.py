@@ -1,0 +1,136 @@
+"""Features of images with known camera poses, matched and chained into tracks.
+
+Poses say where in another image a feature can be: near its epipolar line (Hartley and Zisserman, "Multiple View Geometry", 2004,
+chapter 9). Matching there alone keeps features that look alike apart, and finds more of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_loc.mapping.triangulation import Cameras, Integers, Tracks, Truths
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.matching import match
+from factors.camera.model import CameraModel, undistorted
+from factors.se2 import Array
+
+RANKS = (
+    0,
+    1,
+    2,
+    4,
+    7,
+    12,
+    20,
+    33,
+)  # which of the frames that overlap with a frame, the nearest first, it is matched with
+APART, ASKEW = 1.0, 0.8  # m and rad: two cameras farther from each other are taken to see different things
+RATIO = 0.85
+
+
+def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
+    """Indices of frames: the first, and each that is ``distance`` [m] or ``angle`` [rad] away from all that are chosen before, so
+    that a place that is visited again adds none."""
+    chosen: list[int] = []
+    for i in range(len(cameras)):
+        near = np.linalg.norm(cameras.positions[chosen] - cameras.positions[i], axis=1) < distance
+        if not np.any(near & (_angles(cameras.rotations[chosen], cameras.rotations[i]) < angle)):
+            chosen.append(i)
+    return np.array(chosen, dtype=np.int64)
+
+
+def overlapping_pairs(cameras: Cameras, *, apart: float = APART, askew: float = ASKEW) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of frames that see mostly the same, near ones and some farther ones of each."""
+    pairs = set()
+    for i in range(len(cameras)):
+        distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
+        turn = _angles(cameras.rotations, cameras.rotations[i])
+        cost = distance / apart + turn / askew
+        cost[i] = np.inf
+        order = np.argsort(cost, kind="stable")
+        order = order[cost[order] < 1.0]
+        pairs |= {(min(i, j), max(i, j)) for j in order[[r for r in RANKS if r < len(order)]].tolist()}
+    return sorted(pairs)
+
+
+def near_epipolar_lines(
+    model: CameraModel, cameras: Cameras, i: int, j: int, first: Array, second: Array, gate: float
+) -> Truths:
+    """Which pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j may show one point: at most
+    ``gate`` pixels from each other's epipolar line."""
+    rotation = cameras.rotations[j].T @ cameras.rotations[i]
+    shift = cameras.rotations[j].T @ (cameras.positions[i] - cameras.positions[j])
+    x, y, z = shift
+    essential = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ rotation
+    a, b = (np.column_stack((undistorted(model, pixels), np.ones(len(pixels)))) for pixels in (first, second))
+    lines_j, lines_i = (lines.astype(np.float32) for lines in (a @ essential.T, b @ essential))
+    off = np.abs(lines_j @ b.T.astype(np.float32))  # single precision is a thousandth of a pixel, and half of the time
+    limit = np.float32(gate / np.sqrt(model.fx * model.fy))
+    return np.asarray(
+        (off <= limit * np.hypot(lines_j[:, 0], lines_j[:, 1])[:, None]) & (off <= limit * np.hypot(*lines_i[:, :2].T))
+    )
+
+
+def matched_pairs(
+    model: CameraModel, cameras: Cameras, frames: Sequence[CameraFrame], pairs: Sequence[tuple[int, int]], gate: float
+) -> list[tuple[int, int, Integers, Array]]:
+    """For each of ``pairs`` (i, j): indices (K, 2) of the features that match, and their distances (K,) in units of
+    the typical one of that pair. ``gate`` [px]: see :func:`near_epipolar_lines`."""
+    out = []
+    for i, j in pairs:
+        a, b = frames[i], frames[j]
+        if not (len(a.pixels) and len(b.pixels)):
+            continue
+        allowed = near_epipolar_lines(model, cameras, i, j, a.pixels, b.pixels, gate)
+        binary = a.descriptors.dtype == np.uint8
+        found = match(a.descriptors, b.descriptors, binary=binary, ratio=RATIO, allowed=allowed)
+        if len(found):
+            out.append((i, j, found.indices, found.distances / np.median(found.distances + 1e-9)))
+    return out
+
+
+def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
+    """Tracks of features that match: the best matches first, and none that would bring two features of a frame into a track."""
+    starts = np.cumsum([0, *(len(frame.pixels) for frame in frames)])
+    frame_of = np.repeat(np.arange(len(frames)), np.diff(starts))
+    first = np.concatenate([starts[i] + indices[:, 0] for i, _, indices, _ in matches] or [np.empty(0, dtype=np.int64)])
+    second = np.concatenate(
+        [starts[j] + indices[:, 1] for _, j, indices, _ in matches] or [np.empty(0, dtype=np.int64)]
+    )
+    order = np.argsort(np.concatenate([d for *_, d in matches] or [np.empty(0)]), kind="stable")
+    root = list(range(int(starts[-1])))
+    members: dict[int, dict[int, int]] = {}  # of each root: its feature by frame
+
+    def find(k: int) -> int:
+        while root[k] != k:
+            root[k] = root[root[k]]
+            k = root[k]
+        return k
+
+    for a, b in zip(first[order].tolist(), second[order].tolist(), strict=True):
+        ra, rb = find(a), find(b)
+        if ra == rb:
+            continue
+        of_a = members.setdefault(ra, {int(frame_of[ra]): ra})
+        of_b = members.setdefault(rb, {int(frame_of[rb]): rb})
+        if len(of_a) < len(of_b):
+            ra, rb, of_a, of_b = rb, ra, of_b, of_a
+        if of_a.keys().isdisjoint(of_b):
+            root[rb] = ra
+            of_a |= of_b
+            del members[rb]
+    chains = [sorted(one.values()) for one in members.values() if len(one) > 1]
+    chains.sort()
+    nodes = np.array([k for chain in chains for k in chain], dtype=np.int64)
+    track = np.repeat(np.arange(len(chains)), [len(chain) for chain in chains]).astype(np.int64)
+    frame = frame_of[nodes]
+    pixels = np.concatenate([frame.pixels for frame in frames])[nodes] if len(nodes) else np.empty((0, 2))
+    return Tracks(track, frame, nodes - starts[frame], pixels)
+
+
+def _angles(rotations: Array, other: Array) -> Array:
+    """Angles (F,) [rad] between ``rotations`` (F, 3, 3) and one (3, 3)."""
+    trace = np.einsum("nij,ij->n", rotations, other)
+    return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

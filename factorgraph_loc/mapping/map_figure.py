@@ -1,0 +1,130 @@
+"""The picture of a map, of landmarks, tags or points: what was given, what was learnt, and where the robot was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend
+from factorgraph_loc.mapping.mapping import LandmarkMap
+from factorgraph_loc.mapping.tag_mapping import MadeTags
+from factorgraph_loc.maps.points import PointMap
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CORNERS = 60  # of an ellipse that is drawn as a polygon
+FAR = 10.0  # median absolute deviations, of points that are left out of the picture
+LABEL = 4  # last characters of a tag's EPC, that the picture has room for
+
+
+def tag_figure(log: str, made: MadeTags) -> Figure:
+    """Given and learnt tags as of :func:`figure`, labelled by the end of the EPC; where ambiguous ones may be, and those
+    of the given map that were not located."""
+    out = figure(log, made.made, made.poses, LABEL)
+    axis = out.axes[0]
+    for name, modes in made.modes.items():
+        places = np.array([mode.position for mode in modes])
+        axis.plot(*places.T, ":o", color=COLOURS[4], markersize=6, label="ambiguous: one of these", zorder=3)
+        axis.annotate(name[-LABEL:], tuple(places[0]), (7, 7), textcoords="offset points", fontsize=10, zorder=5)
+    lost = [e.given for e in made.made.entries if e.given is not None and e.landmark in made.open]
+    if lost and made.made.judged:
+        axis.plot(*np.array(lost).T, "s", color=COLOURS[3], markersize=12, markerfacecolor="none", label="not located")
+    for text in list(out.legends):
+        text.remove()
+    legend(out, [axis])
+    return out
+
+
+def dropped_figure(
+    log: str,
+    places: Mapping[str, Array],
+    dead: Mapping[str, float],
+    poses: Array,
+    walls: Sequence[tuple[float, ...]] = (),
+) -> Figure:
+    """Tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
+    kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
+    everything = np.concatenate((np.array(list(places.values())), poses[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: dead tags of the map")
+    axis = axes[0, 0]
+    for x1, y1, x2, y2 in walls:
+        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
+    axis.plot(*kept.T, "+", color=COLOURS[0], markersize=9, label="kept", zorder=3)
+    for name in dead:
+        x, y = places[name]
+        axis.plot(x, y, "x", color=COLOURS[1], markersize=9, label="believed dead, dropped", zorder=4)
+        axis.annotate(name[-LABEL:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    legend(out, [axis])
+    return out
+
+
+def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
+    """Given and learnt landmarks, these with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
+    given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
+    learnt = [e for e in made.entries if e.learnt is not None]
+    places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
+    everything = np.concatenate((given.reshape(-1, 2), places, poses[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map")
+    axis = axes[0, 0]
+    axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
+    if len(given):
+        axis.plot(*given.T, "k^", markersize=9, markerfacecolor="none", label="given map", zorder=3)
+    for entry in learnt:
+        assert entry.learnt is not None
+        colour = COLOURS[1] if entry.flagged else COLOURS[0]
+        kind = "wrong in the given map" if entry.flagged else "learnt"
+        x, y = entry.learnt.position
+        axis.plot(x, y, "x" if entry.flagged else "+", color=colour, markersize=9, label=kind, zorder=4)
+        axis.plot(*_ellipse(entry.learnt.position, entry.learnt.covariance), color=colour, label="2 sigma", zorder=4)
+        axis.annotate(entry.landmark[-label:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
+        if entry.flagged and entry.given is not None:
+            axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    legend(out, [axis])
+    return out
+
+
+def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
+    """Points from above, those of one height in one colour, and where the camera was, ``cameras`` (F, 3)."""
+    off = np.abs(points.positions - np.median(points.positions, axis=0))
+    # a few points far off would make all others small
+    shown = points.positions[np.all(off <= np.maximum(FAR * np.median(off, axis=0), 1.0), axis=1)]
+    everything = np.concatenate((shown[:, :2], cameras[:, :2]))
+    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map of {len(points)} points")
+    axis = axes[0, 0]
+    for x1, y1, x2, y2 in walls:
+        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    axis.plot(*cameras[:, :2].T, color=COLOURS[1], linewidth=1.0, label="camera", zorder=3)
+    dots = axis.scatter(*shown[:, :2].T, c=shown[:, 2], s=6.0, cmap="viridis", label="point", zorder=2)
+    out.colorbar(dots, ax=axis, label="height [m]")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    legend(out, [axis])
+    return out
+
+
+def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
+    """A given map that could not be brought together with the new one has another frame."""
+    return made.judged or verdict == "given"
+
+
+def _ellipse(centre: Array, covariance: Array) -> Array:
+    """Outline (2, CORNERS) of two standard deviations."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+    circle = np.stack((np.cos(angle), np.sin(angle)))
+    return np.asarray(centre[:, None] + vectors @ (2.0 * np.sqrt(np.maximum(values, 0.0))[:, None] * circle))

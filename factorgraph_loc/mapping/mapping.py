@@ -1,0 +1,307 @@
+"""Maps of identified landmarks, made from the landmarks that a run has estimated, and what they say about a given map.
+
+A run without a map has a frame of its own. Its landmarks are brought onto those of a given map by one rotation and translation,
+robustly, as landmarks of the given map may be wrong: by sample consensus over pairs of landmarks (Fischler and Bolles, "Random
+sample consensus", 1981) with the truncated cost of Torr and Zisserman ("MLESAC", 2000), in units of the scale of the least median
+of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5), then by weighted least squares on the
+inliers, which are chosen anew after each iteration.
+
+The covariances of the run hold how the robot drifted between its start and the landmarks. That is common to all landmarks and the
+alignment takes it away, so they are scaled by the variance of unit weight that the inliers show (Koch, "Parameter Estimation and
+Hypothesis Testing in Linear Models", 1999).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.evaluation.alignment import align_points
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factors import se2
+from factors.se2 import Array
+
+GATE = 13.816  # 99.9 % of chi-square with two degrees of freedom
+MEDIAN = 1.386  # 50 % of the same
+TOLERANCE = 0.15  # m; no landmark is doubted below this, however sure the run is of it
+# verdicts that are not on a wrong landmark, and how a summary counts them
+VERDICTS = {
+    "agrees": "agreeing with the given one",
+    "given": "as given",
+    "new": "new",
+    "not seen": "not seen",
+    "not judged": "not judged",
+}
+MIN_COMMON = 3  # landmarks: two can always be brought onto two others of the same distance
+FACTORS = (0.01, 4.0)  # bounds of the variance factor: nothing that is stated is wrong by more
+MAX_PAIRS = 5000  # above, as many pairs are drawn
+MAX_ITERATIONS = 20
+CONVERGED = 1e-9  # m and rad
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One landmark: its ``given`` position (2,) or None; what was ``learnt`` of it, in the new map's frame, or None; and the
+    verdict, ``flagged`` where that is that the given map is wrong."""
+
+    landmark: str
+    given: Array | None
+    learnt: LearntPoint | None
+    verdict: str
+    flagged: bool = False
+
+    @property
+    def distance(self) -> float | None:
+        """From the given to the learnt position [m]."""
+        if self.given is None or self.learnt is None:
+            return None
+        return float(np.hypot(*(self.learnt.position - self.given)))
+
+    @property
+    def sigma(self) -> float | None:
+        """Standard deviation [m] of what was learnt, in its least certain direction."""
+        return None if self.learnt is None else float(np.sqrt(np.linalg.eigvalsh(self.learnt.covariance)[-1]))
+
+
+@dataclass(frozen=True)
+class LandmarkMap:
+    """A map and how it came about.
+
+    ``frame`` (3,): pose of the run's frame in the map's. ``judged``: whether the log's map was compared with it, and their frames
+    are the same. ``notes``: what people should know, one line each.
+    """
+
+    world: World
+    entries: tuple[Entry, ...]
+    frame: Array
+    judged: bool
+    notes: tuple[str, ...]
+
+    @property
+    def flagged(self) -> tuple[str, ...]:
+        """Names of the landmarks whose given position is wrong."""
+        return tuple(entry.landmark for entry in self.entries if entry.flagged)
+
+    def summary(self, what: str = "landmarks") -> str:
+        """One sentence on what was found."""
+        counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
+        text = f"{len(self.world.landmarks)} {what} are in the new map"
+        parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
+        if self.flagged:
+            parts.append(f"{len(self.flagged)} wrong in the given map ({', '.join(self.flagged)})")
+        return f"{text}: {', '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """``pose`` (3,) that brings points onto targets; its ``covariance`` (3, 3) of (x, y, angle); how many points agree; and the
+    ``factor`` by which their covariances are to be multiplied."""
+
+    pose: Array
+    covariance: Array
+    inliers: int
+    factor: float
+
+
+IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
+
+
+def check(log: Log) -> None:
+    """InputError if no landmark can be located from what the log's sightings hold."""
+    stream = log.streams.get("bearing_range")
+    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so that there is nothing to map")
+    if log.rig.bearing_range is None:
+        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and place")
+    if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
+        raise InputError(
+            f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
+        )
+
+
+def make_map(
+    log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
+) -> LandmarkMap:
+    """The map of the ``learnt`` landmarks of a run on ``log``.
+
+    ``extend``: the run used the log's map and learnt what it lacks; its landmarks stay as they are. Otherwise the run has used no
+    map: where the log has one, the learnt landmarks are brought into its frame (unless they are ``in_frame`` already) and its
+    landmarks are judged. A landmark is wrong
+    where it lies more than ``TOLERANCE`` from the learnt one, and the square of that distance, in units of its covariance, is
+    beyond ``GATE``. The covariance is the sum of the learnt landmark's, the alignment's and the survey's.
+
+    Raises RunFailedError if nothing was learnt.
+    """
+    if not learnt and not extend:
+        raise RunFailedError(
+            f"{log.name}: no landmark was sighted twice in agreement with odometry, so none was mapped"
+        )
+    given = log.world.landmarks
+    common = [name for name in given if name in learnt]
+    if extend:
+        return _assemble(log, learnt, np.zeros(3), dict.fromkeys(given, "given"), keep=tuple(given))
+    if not given:
+        return _assemble(log, learnt, np.zeros(3), {})
+    if len(common) < MIN_COMMON and not in_frame:
+        note = f"only {len(common)} of the given map's landmarks were mapped, expected {MIN_COMMON} or more to compare"
+        return _unjudged(log, learnt, note)
+    points = [learnt[name] for name in common]
+    targets = np.array([log.world.position(name) for name in common])
+    surveys = np.array([_survey(given[name]) for name in common])
+    alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
+    if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
+        note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map at a time"
+        return _unjudged(log, learnt, note)
+    moved = {name: _moved(point, alignment) for name, point in learnt.items()}
+    wrong = [n for n in common if _differ(moved[n], given[n])]
+    verdicts = {name: _verdict(name, moved, given, wrong) for name in common}
+    unseen = tuple(name for name in given if name not in learnt)
+    notes = []
+    if unseen:
+        verdicts |= dict.fromkeys(unseen, "not seen")
+        notes.append(f"kept as they are in the given map, as they were not seen: {', '.join(unseen)}")
+    return _assemble(log, moved, alignment.pose, verdicts, keep=unseen, flagged=wrong, judged=True, notes=notes)
+
+
+def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
+    """The rotation and translation on which more than half of K ``points`` agree with their ``targets`` (K, 2).
+
+    ``surveys`` (K, 2, 2): covariances of the targets. K must be at least ``MIN_COMMON``.
+    """
+    positions = np.array([p.position for p in points])
+    covariances = np.array([p.covariance for p in points])
+    count = len(points)
+
+    def errors(pose: Array) -> tuple[Array, Array, Array]:
+        """Errors (K, 2), the inverses (K, 2, 2) of their stated covariances, and their squares (K,) in these units."""
+        turn = _rotation(pose)
+        information = np.linalg.inv(turn @ covariances @ turn.T + surveys)
+        error = se2.transform_from(pose, positions) - targets
+        return error, information, np.einsum("ki,kij,kj->k", error, information, error)
+
+    candidates = [align_points(positions[pair], targets[pair]) for pair in _pairs(count)]
+    half = max(MIN_COMMON, count // 2 + 1)
+    median = min(np.partition(errors(pose)[2], half - 1)[half - 1] for pose in candidates)
+    factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
+
+    def cost(pose: Array) -> float:
+        """Truncated; what is within the tolerance of a landmark's place counts as within the gate."""
+        error, _, squared = errors(pose)
+        tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
+        return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
+
+    pose = min(candidates, key=cost)
+    for _ in range(MAX_ITERATIONS):
+        error, information, squared = errors(pose)
+        inliers = (squared < GATE * factor) | (np.hypot(error[:, 0], error[:, 1]) < TOLERANCE)
+        jacobian = _by_alignment(pose, positions[inliers])
+        weighted = np.einsum("kij,kil->kjl", jacobian, information[inliers])
+        covariance = np.linalg.pinv(np.einsum("kjl,klm->jm", weighted, jacobian))
+        step = -covariance @ np.einsum("kjl,kl->j", weighted, error[inliers])
+        pose = pose + step
+        if np.abs(step).max(initial=0.0) < CONVERGED:
+            break
+    agreeing = int(inliers.sum())
+    factor = float(np.clip(squared[inliers].sum() / max(2 * agreeing - 3, 1), *FACTORS))
+    return Alignment(pose, factor * covariance, agreeing, factor)
+
+
+def _pairs(count: int) -> list[list[int]]:
+    """All pairs of ``count`` landmarks, or ``MAX_PAIRS`` of them, always the same."""
+    if count * (count - 1) // 2 <= MAX_PAIRS:
+        return [list(pair) for pair in combinations(range(count), 2)]
+    rng = np.random.default_rng(0)
+    return [rng.choice(count, 2, replace=False).tolist() for _ in range(MAX_PAIRS)]
+
+
+def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
+    """A learnt point in the given map's frame, with the uncertainty of the alignment."""
+    turn = _rotation(alignment.pose)
+    (jacobian,) = _by_alignment(alignment.pose, point.position[None])
+    covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
+    return LearntPoint(se2.transform_from(alignment.pose, point.position), (covariance + covariance.T) / 2.0)
+
+
+def _rotation(pose: Array) -> Array:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array(((c, -s), (s, c)))
+
+
+def _by_alignment(pose: Array, positions: Array) -> Array:
+    """Jacobians (K, 2, 3) of aligned positions by the alignment's (x, y, angle)."""
+    x, y = (se2.transform_from(pose, positions) - pose[:2]).T
+    jacobian = np.zeros((len(positions), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = -y, x
+    return jacobian
+
+
+def _survey(landmark: Landmark) -> Array:
+    """Covariance (2, 2) of a given landmark."""
+    if landmark.covariance is None:
+        return landmark.sigma**2 * np.eye(2)
+    xx, xy, yy = landmark.covariance
+    return np.array(((xx, xy), (xy, yy)))
+
+
+def _differ(point: LearntPoint, landmark: Landmark) -> bool:
+    """Whether a learnt point lies significantly off a landmark."""
+    error = point.position - np.array((landmark.x, landmark.y))
+    covariance = point.covariance + _survey(landmark)
+    return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)
+
+
+def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, Landmark], wrong: list[str]) -> str:
+    if name not in wrong:
+        return "agrees"
+    for other in wrong:
+        if other != name and not (_differ(learnt[name], given[other]) or _differ(learnt[other], given[name])):
+            return f"swapped with {other}"
+    offset = learnt[name].position - np.array((given[name].x, given[name].y))
+    return f"moved by {np.hypot(*offset):.2f} m"
+
+
+def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: str) -> LandmarkMap:
+    """The map in the frame of the start, without the given one, which cannot be brought together with it."""
+    notes = [f"{note}: it is not judged, and the new map is in the frame of the run's start, without it"]
+    return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
+
+
+def _assemble(
+    log: Log,
+    learnt: Mapping[str, LearntPoint],
+    frame: Array,
+    verdicts: Mapping[str, str],
+    *,
+    keep: tuple[str, ...] = (),
+    flagged: Sequence[str] = (),
+    judged: bool = False,
+    notes: Sequence[str] = (),
+) -> LandmarkMap:
+    """The map with the landmarks of the given one in their order, then the new ones; those to ``keep`` are the given ones."""
+    entries, landmarks = [], {}
+    for name in (*log.world.landmarks, *sorted(set(learnt) - set(log.world.landmarks), key=_natural)):
+        point = learnt.get(name)
+        entries.append(Entry(name, log.world.position(name), point, verdicts.get(name, "new"), name in flagged))
+        if name in keep:
+            landmarks[name] = log.world.landmarks[name]
+        elif point is not None:
+            (xx, xy), (_, yy) = point.covariance.tolist()
+            x, y = point.position.tolist()
+            landmarks[name] = Landmark.bounded(x=x, y=y, covariance=(xx, xy, yy))
+    return LandmarkMap(World(name=f"{log.name}-map", landmarks=landmarks), tuple(entries), frame, judged, tuple(notes))
+
+
+def _natural(name: str) -> tuple[int, str]:
+    """10 after 9, and words after numbers as text."""
+    return (int(name), "") if name.isdecimal() else (10**9, name)

@@ -1,0 +1,223 @@
+"""A map of 3-D points learnt from images with known camera poses: the paper's "bearing-only" learning of its landmarks.
+
+Keyframes are chosen, features matched near epipolar lines and chained into tracks, these triangulated under enough
+parallax, and points and cameras adjusted together. What is seen often enough and known well enough is kept, with what it looks like
+from a few sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.mapping import bundle
+from factorgraph_loc.mapping.bundle import Bundle
+from factorgraph_loc.mapping.camera_poses import PosedFrames
+from factorgraph_loc.mapping.feature_tracks import chained, keyframes, matched_pairs, overlapping_pairs
+from factorgraph_loc.mapping.triangulation import PARALLAX, Cameras, Integers, Tracks, parallax, reproject, triangulate
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.text import told
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+MOST_KEYFRAMES = 600
+WIDER = 1.3  # between keyframes, until there are not too many
+DEPTH = 2.0  # m, typical: at it a camera's shift counts as pixels
+GATE = 3.0  # standard deviations, of the distance to an epipolar line
+NARROW, WIDE = 3.0, 25.0  # px, bounds of that gate
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """``distance`` [m] and ``angle`` [rad] between keyframes, 0 for all frames. ``focal``: the focal length is adjusted too.
+
+    A point is kept that is seen in ``observations`` keyframes or more, under a ``parallax`` [rad] at least, with a standard
+    deviation of at most ``sigma`` [m] in its worst direction, and with the looks of at most ``views`` keyframes.
+    """
+
+    distance: float = 0.1
+    angle: float = 0.1
+    focal: bool = False
+    observations: int = 3
+    parallax: float = PARALLAX
+    sigma: float = 0.2
+    views: int = 4
+
+
+@dataclass(frozen=True)
+class PointReport:
+    """Counts on the way; errors of the kept observations: root mean square and median absolute value [px] of their coordinates;
+    medians of the parallax [rad] and of the points' worst standard deviation [m]; how far the cameras were ``shifted`` [m] and
+    ``turned`` [rad] from where they were said to be, medians; the ``focal`` length fx [px]."""
+
+    keyframes: int
+    pairs: int
+    tracks: int
+    triangulated: int
+    points: int
+    observations: int
+    rms: float
+    mad: float
+    parallax: float
+    sigma: float
+    shifted: float
+    turned: float
+    focal: float
+
+
+@dataclass(frozen=True, eq=False)
+class MadePoints:
+    """The map, the ``cameras`` of its keyframes as they were adjusted, with the camera's ``model``, and what there is to report."""
+
+    points: PointMap
+    cameras: Cameras
+    model: CameraModel
+    report: PointReport
+
+
+def map_points(
+    model: CameraModel,
+    posed: PosedFrames,
+    settings: PointSettings | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> MadePoints:
+    """The map of what is seen in ``posed`` frames; RunFailedError where nothing is seen from several places.
+
+    ``progress`` is given the share done.
+    """
+    settings = settings or PointSettings()
+    posed = posed[chosen_keyframes(posed, settings)]
+    pairs = overlapping_pairs(posed.cameras)
+    gate = epipolar_gate(model, posed.covariances)
+    matches = []
+    for begin in range(0, len(pairs), 50):
+        matches += matched_pairs(model, posed.cameras, posed.frames, pairs[begin : begin + 50], gate)
+        progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
+    tracks = chained(posed.frames, matches)
+    found = triangulate(model, posed.cameras, tracks)
+    # the poses' errors are in the rays' too, until all is adjusted
+    good = found.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
+    if not good.any():
+        raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
+    total, (seen, old) = tracks.count, tracks.kept(good[tracks.track])
+    try:
+        adjusted = bundle.adjust(
+            model,
+            posed.cameras,
+            posed.covariances,
+            seen,
+            found.positions[old],
+            focal=settings.focal,
+            progress=lambda share: progress(0.7 + 0.3 * share),
+        )
+    except RuntimeError as error:  # GTSAM's of a system that is not determined
+        raise RunFailedError(f"points and cameras cannot be adjusted: {told(error)}") from error
+    kept, points, covariances, angles = _kept(adjusted, settings)
+    errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
+    shift, turn = _moved(posed.cameras, adjusted.cameras)
+    report = PointReport(
+        keyframes=len(posed.frames),
+        pairs=len(pairs),
+        tracks=total,
+        triangulated=int(np.count_nonzero(good)),
+        points=len(points),
+        observations=len(kept),
+        rms=float(np.sqrt(np.mean(errors**2))),
+        mad=float(np.median(np.abs(errors))),
+        parallax=float(np.median(angles)),
+        sigma=float(np.median(_worst(covariances))),
+        shifted=float(np.median(shift)),
+        turned=float(np.median(turn)),
+        focal=adjusted.model.fx,
+    )
+    made = point_map(posed, adjusted.cameras, kept, points, covariances, settings.views)
+    return MadePoints(made, adjusted.cameras, adjusted.model, report)
+
+
+def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
+    """Indices of the frames that are used, far enough apart that there are not too many."""
+    filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
+    distance, angle = settings.distance, settings.angle
+    while True:
+        chosen = filled[keyframes(posed.cameras[filled], distance, angle)]
+        if len(chosen) <= MOST_KEYFRAMES:
+            return np.asarray(chosen)
+        distance, angle = max(WIDER * distance, 0.02), max(WIDER * angle, 0.02)
+
+
+def epipolar_gate(model: CameraModel, covariances: Array) -> float:
+    """How far [px] from its epipolar line a feature may be, as the cameras' ``covariances`` (F, 6, 6) say."""
+    turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
+    sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
+    return float(np.clip(GATE * sigma, NARROW, WIDE))
+
+
+def point_map(
+    posed: PosedFrames, cameras: Cameras, tracks: Tracks, points: Array, covariances: Array, views: int
+) -> PointMap:
+    """The map of ``points`` (T, 3), each with at most ``views`` of its looks."""
+    shown = _different_views(cameras, tracks, points, views)
+    seen = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
+    return PointMap(
+        names=tuple(f"p{i}" for i in range(len(points))),
+        positions=points,
+        covariances=covariances,
+        feature=posed.frames[0].feature,
+        owners=tracks.track[shown],
+        descriptors=np.array([posed.frames[i].descriptors[k] for i, k in seen]),
+        seen_from=cameras.positions[tracks.frame[shown]],
+        sizes=np.array([posed.frames[i].sizes[k] for i, k in seen], dtype=float),
+    )
+
+
+def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
+    """Tracks, positions, covariances and parallaxes of what is good enough."""
+    tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
+    angles = parallax(adjusted.cameras, points, tracks)
+    good = (
+        (tracks.lengths() >= settings.observations)
+        & (angles >= settings.parallax)
+        & (_worst(covariances) <= settings.sigma)
+    )
+    if not good.any():
+        raise RunFailedError(
+            f"none of {len(points)} points is seen in {settings.observations} keyframes and known to {settings.sigma:g} m"
+        )
+    kept, old = tracks.kept(good[tracks.track])
+    return kept, points[old], covariances[old], angles[old]
+
+
+def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
+    """Observations (V,), at most ``views`` of each point: the one nearest to their mean, then each time the one that differs
+    most, in direction or in the logarithm of the distance, from those chosen."""
+    chosen: list[int] = []
+    order = np.argsort(tracks.track, kind="stable")
+    for rows in np.split(order, np.cumsum(tracks.lengths())[:-1]):
+        if len(rows) <= views:
+            chosen += rows.tolist()
+            continue
+        rays = cameras.positions[tracks.frame[rows]] - points[tracks.track[rows[0]]]
+        distances = np.linalg.norm(rays, axis=1, keepdims=True)
+        places = np.column_stack((rays / distances, np.log(distances)))
+        taken = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmin())]
+        apart = np.linalg.norm(places - places[taken[0]], axis=1)
+        while len(taken) < views:
+            taken.append(int(apart.argmax()))
+            apart = np.minimum(apart, np.linalg.norm(places - places[taken[-1]], axis=1))
+        chosen += rows[taken].tolist()
+    return np.array(chosen, dtype=np.int64)
+
+
+def _worst(covariances: Array) -> Array:
+    """Standard deviations (T,) in the worst direction."""
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)))
+
+
+def _moved(before: Cameras, after: Cameras) -> tuple[Array, Array]:
+    """How far each camera was shifted (F,) [m] and turned (F,) [rad]."""
+    trace = np.einsum("nij,nij->n", before.rotations, after.rotations)
+    shift = np.linalg.norm(after.positions - before.positions, axis=1)
+    return shift, np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

@@ -1,0 +1,100 @@
+"""What a log tells of its RFID tags: all looks of all antennas, and what is given of each tag beside its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.text import listed
+from factors.rfid.detection import Looks
+from factors.rfid.model import RfidModel
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, eq=False)
+class TagLooks:
+    """K looks at T tags, in order of time.
+
+    ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): places in the ``model``; ``rounds`` (K,); ``hits`` (K, T). ``heights``
+    (T,) [m] and ``facing`` (T,) [rad], in the world, NaN where not known; ``positions`` (T, 2): as the log's map has them, in the
+    world, NaN where it does not.
+    """
+
+    model: RfidModel
+    names: tuple[str, ...]
+    t: Array
+    antennas: NDArray[np.int64]
+    rounds: NDArray[np.int64]
+    hits: NDArray[np.int64]
+    heights: Array
+    facing: Array
+    positions: Array
+
+    def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> Looks:
+        """The looks ``which`` at all tags, made from ``poses`` (K', 3) in the world, as seen from the world's origin."""
+        return Looks(poses, self.antennas[which], self.rounds[which], self.hits[which])
+
+
+def tag_looks(log: Log, height: float | None = None) -> TagLooks:
+    """All looks of a log at the tags that it read or that its map has.
+
+    Height and facing of a tag are those of the map. Where that lacks the tag, its ``height`` [m] is the one given, else that of
+    the antennas on average, and its facing is not known.
+
+    Raises InputError if the log has no reads, or its rig no antennas that made one.
+    """
+    stream = log.streams.get("rfid")
+    if not isinstance(stream, RfidStream) or not any(stream.epc):
+        raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")
+    if log.rig.rfid is None:
+        raise InputError(f"{log.name}: its rig has no [rfid], expected antennas and what they read")
+    antennas = {name: i for i, name in enumerate(log.rig.rfid.all_antennas())}
+    model = log.rig.rfid.model()
+    given = tag_map(log.world, log.rig.survey)
+    names = (*given.names, *sorted(set(stream.epc) - set(given.names) - {""}))
+    index = {name: i for i, name in enumerate(names)}
+    rows = [
+        row
+        for m in stream.measurements(log.rig.time_offset("rfid"))
+        if isinstance(m, RfidScan)
+        for row in _rows(m, antennas, index)
+    ]
+    if not rows:
+        known = listed(antennas)
+        raise InputError(f"{log.name}: no antenna that read is in its rig, expected some of {known}")
+    rows.sort(key=lambda row: row[0])
+    t, antenna, rounds, hits = zip(*rows, strict=True)
+    others = len(names) - len(given.names)
+    if height is None:
+        height = float(np.mean([a.z for a in model.antennas]))
+    return TagLooks(
+        model,
+        names,
+        np.array(t),
+        np.array(antenna, dtype=np.int64),
+        np.array(rounds, dtype=np.int64),
+        np.array(hits, dtype=np.int64),
+        np.concatenate((given.tags.points[:, 2], np.full(others, height))),
+        np.concatenate((given.tags.facing, np.full(others, np.nan))),
+        np.concatenate((given.tags.points[:, :2], np.full((others, 2), np.nan))),
+    )
+
+
+def _rows(
+    m: RfidScan, antennas: dict[str, int], index: dict[str, int]
+) -> list[tuple[float, int, int, NDArray[np.int64]]]:
+    """A look for each antenna of the rig that listened: time, antenna, rounds, and hits (T,)."""
+    places = [antennas.get(name, -1) for name in m.antennas]
+    out = {a: (m.t, a, places.count(a), np.zeros(len(index), dtype=np.int64)) for a in sorted(set(places) - {-1})}
+    # a tag counts once a round, as often as it may answer in it
+    for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
+        if places[number] >= 0:
+            out[places[number]][3][index[name]] += 1
+    return list(out.values())

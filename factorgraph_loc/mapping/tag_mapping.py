@@ -1,0 +1,190 @@
+"""Maps of RFID tags from a log: along its reference, or from odometry and reads alone, and what they say about a given map.
+
+What is written is in the frame of the survey of the log's rig (``[survey]``), so that the map works with that rig as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.mapping import mapping
+from factorgraph_loc.mapping.mapping import LandmarkMap
+from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
+from factorgraph_loc.mapping.tag_search import Found, Mode, search, sigma
+from factorgraph_loc.mapping.tag_slam import tag_slam
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factors import se2
+from factors.se2 import Array
+
+START_SIGMA = 1e-3  # m and rad
+MAX_GAP = 0.5  # s between poses of the reference that are interpolated
+
+Poses = Literal["reference", "odometry"]
+
+
+@dataclass(frozen=True)
+class MadeTags:
+    """A map of tags: ``world`` to be written; ``made``: the same in the world's frame as of landmarks, with verdicts on the given
+    map; ``poses`` (N, 3): the way of the robot in that frame; ``open``: by EPC, why a tag was not located; ``modes``: where
+    ambiguous tags may be, in that frame."""
+
+    world: World
+    made: LandmarkMap
+    poses: Array
+    open: Mapping[str, str]
+    modes: Mapping[str, tuple[Mode, ...]]
+
+    @property
+    def rms(self) -> float | None:
+        """Root mean square distance [m] from the given to the learnt places, None where no tag has both."""
+        distances = [e.distance for e in self.made.entries if e.distance is not None and e.verdict != "given"]
+        return float(np.sqrt(np.mean(np.square(distances)))) if distances and self.made.judged else None
+
+
+def map_tags(
+    log: Log,
+    poses: Poses,
+    prior: PosePrior | None,
+    *,
+    extend: bool = False,
+    height: float | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> MadeTags:
+    """The map of the tags that a log read.
+
+    ``poses``: the reference's, or estimated together with the tags, from ``prior`` on, which defines the frame. Without a prior
+    the first pose is the origin, and the facings of the log's map, which mean nothing there, are not used. ``extend``: the tags of
+    the log's map stay as they are, and help to estimate the poses; else the map's places are only compared. ``height`` [m]: of
+    tags that the map lacks; else that of the antennas.
+
+    Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
+    """
+    looks = tag_looks(log, height)
+    given = np.isfinite(looks.positions[:, 0])
+    known = given if extend else np.zeros_like(given)
+    if poses == "reference":
+        learnt, facing, found, way = _along_reference(log, looks)
+        learnt = {tag: point for tag, point in learnt.items() if not known[tag]}
+    else:
+        if prior is None:
+            if extend:
+                raise InputError(f"{log.name}: to extend its map from odometry the start has to be known in it")
+            prior = PosePrior(log.span()[0], np.zeros(3), START_SIGMA**2 * np.eye(3))
+            looks = replace(looks, facing=np.full(len(given), np.nan))
+        slam = tag_slam(log, looks, prior, known, progress)
+        learnt, facing, found, way = slam.tags, slam.facing, slam.found, slam.poses
+    if not learnt and not extend:
+        raise RunFailedError(f"{log.name}: no tag was read so often, from such places, that it could be located")
+    names = looks.names
+    landmarks = {n: _as_landmark(log, n, p) for n, p, g in zip(names, looks.positions, given, strict=True) if g}
+    stand_in = replace(log, world=World(landmarks=landmarks))
+    by_name = {names[tag]: point for tag, point in learnt.items()}
+    made = mapping.make_map(stand_in, by_name, extend=extend, in_frame=poses == "reference")
+    turned = facing + made.frame[2]
+    same = poses == "reference" or made.judged or extend
+    world = _world(log, looks, made, {names[tag]: float(turned[tag]) for tag in learnt}, in_given_frame=same)
+    why = {
+        name: _why(one, int(looks.hits[:, i].sum()))
+        for i, (name, one) in enumerate(zip(names, found, strict=True))
+        if i not in learnt and not known[i]
+    }
+    doubtful = {
+        n: tuple(replace(m, position=se2.transform_from(made.frame, m.position)) for m in one.modes)
+        for n, one in zip(names, found, strict=True)
+        if n in why and one.is_explained and one.is_ambiguous
+    }
+    return MadeTags(world, made, se2.compose(made.frame, way), why, doubtful)
+
+
+def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint], Array, list[Found], Array]:
+    """Each tag on its own, by number; facings (T,); all that was found; and the poses (K, 3) of the looks."""
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference, expected one, or that the poses come from odometry")
+    if not log.reference.has_heading:
+        raise InputError(f"{log.name}: the heading of its reference means nothing, expected poses from odometry")
+    at = log.reference.at(looks.t, max_gap=MAX_GAP)
+    which = np.asarray(np.isfinite(at).all(axis=1))
+    if not which.any():
+        raise InputError(f"{log.name}: no tag was read where the reference has poses, expected poses from odometry")
+    found = search(looks.model, looks.along(at[which], which), looks.heights, looks.facing)
+    learnt = {
+        tag: LearntPoint(one.modes[0].position, one.modes[0].covariance)
+        for tag, one in enumerate(found)
+        if one.is_located
+    }
+    facing = looks.facing.copy()
+    for tag in learnt:
+        if np.isnan(facing[tag]):
+            facing[tag] = found[tag].modes[0].facing
+    return learnt, facing, found, at[which]
+
+
+def _why(one: Found, reads: int) -> str:
+    """Why a tag is not in the map, in words."""
+    if not reads:
+        return "never read"
+    count = f"read {reads} times" if reads > 1 else "read once"
+    if not one.is_explained:
+        return f"{count}: no place explains that clearly better than chance"
+    if one.is_ambiguous:
+        places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in one.modes[:3]]
+        return f"{count}: ambiguous, {' or '.join(places)}"
+    return f"{count}: too uncertain, sigma {sigma(one.modes[0].covariance):.1f} m"
+
+
+def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
+    """A given tag in the world's frame."""
+    tag = log.world.tags[name]
+    x, y = position.tolist()
+    if tag.covariance is None:
+        return Landmark.bounded(x=x, y=y, sigma=tag.sigma)
+    xx, xy, yy = tag.covariance
+    return Landmark.bounded(x=x, y=y, covariance=_turned(np.array(((xx, xy), (xy, yy))), float(log.rig.survey.heading)))
+
+
+def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array(((c, -s), (s, c)))
+    (xx, xy), (_, yy) = (turn @ covariance @ turn.T).tolist()
+    return xx, xy, yy
+
+
+def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool) -> World:
+    """The map as it is written: learnt tags in the frame of the rig's survey, those that were kept as they were given."""
+    survey: SurveySettings = log.rig.survey
+    transform = survey.transform()
+    tags: dict[str, Tag] = {}
+    for i, name in enumerate(looks.names):
+        landmark = made.world.landmarks.get(name)
+        if landmark is None:
+            continue
+        if name not in facing:
+            tags[name] = log.world.tags[name]
+            continue
+        x, y = se2.transform_to(transform, np.array((landmark.x, landmark.y))).tolist()
+        covariance = _turned(landmark.spread(), -float(transform[2]))
+        direction = facing[name] - float(transform[2])
+        given = log.world.tags.get(name)
+        if np.isnan(direction) and given is not None and given.facing is not None and in_given_frame:
+            direction = given.facing
+        tags[name] = Tag.bounded(
+            x=x,
+            y=y,
+            z=float(looks.heights[i]),
+            facing=None if np.isnan(direction) else se2.wrap_scalar(direction),
+            covariance=covariance,
+        )
+    # what else the log's map holds is right only in its frame
+    rest = log.world if in_given_frame else World()
+    return World(name=f"{log.name}-map", landmarks=rest.landmarks, tags=tags, walls=rest.walls)

@@ -1,0 +1,237 @@
+"""Where a tag may be, from looks along a known way: all places that explain the reads, not only the best one.
+
+A lattice of places is searched with the likelihood of all looks, and its best ones are refined by Fisher scoring. After a straight
+pass a tag on the left of the robot may be as likely as one on the right, where the antennas do not tell them apart: then there are
+two modes, and their weights say so. Weights are those of Laplace's method under a uniform prior.
+
+A facing that matters to the model and is not known is tried in :data:`DIRECTIONS`, then between the best of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.mapping.tag_refinement import Candidates, reach, refine
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.model import RfidModel
+from factors.se2 import Array, wrap, wrap_scalar
+
+CELL = 0.4  # m, of the lattice
+LEVEL = 0.2  # m: tags of about the same height share a lattice
+DIRECTIONS = 8
+CANDIDATES = 6  # of a tag, that are refined
+CUT = 40.0  # above the best of the lattice: a place is not a candidate, however far its optimum may be from the lattice
+APART = 0.9  # m or, of facings, rad, between candidates
+SAME = 0.05  # m between optima that are one
+MERGED = 0.5  # m, or
+OVERLAP = 9.0  # squared distance in units of their covariances, between modes that are counted as one
+COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad that looks may be apart to be merged, on the lattice and after
+GAIN = 8.0  # of the log-likelihood: less, the best of a few thousand places also gives to false reads
+SURE = 0.95  # weight of a mode that is the only one
+LARGEST_SIGMA = 1.0  # m
+LOOKS = 2000  # that are taken to the lattice at once, to bound the memory
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A place where a tag may be: ``position`` (2,) [m], its ``covariance`` (2, 2), ``facing`` [rad] or NaN; weights sum to one."""
+
+    weight: float
+    position: Array
+    covariance: Array
+    facing: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search for one tag found: ``modes``, the heaviest first; ``reads``: rounds that read it; ``gain``: by how much its
+    tempered log-likelihood at the best place is above that of a tag that is out of reach."""
+
+    modes: tuple[Mode, ...]
+    reads: int
+    gain: float
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether a place explains the reads clearly better than chance does."""
+        return bool(self.modes) and self.gain > GAIN
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether another place is not clearly worse than the best."""
+        return bool(self.modes) and self.modes[0].weight < SURE
+
+    @property
+    def is_located(self) -> bool:
+        """Whether there is one place, and its uncertainty is small enough to be of use."""
+        return self.is_explained and not self.is_ambiguous and sigma(self.modes[0].covariance) < LARGEST_SIGMA
+
+
+def sigma(covariance: Array) -> float:
+    """Standard deviation [m] in the least certain direction."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> list[Found]:
+    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: from known poses, as
+    seen from the world's origin."""
+    looks = merged(looks, *FINE)
+    uses_facing = any(m.uses_facing for m in model.models)
+    nothing = math.log1p(-model.false_read) * looks.rounds.sum()
+    reads = looks.hits.sum(axis=0)
+    odds = math.log(max(model.false_read, 1e-12)) - math.log1p(-model.false_read)
+    nowhere = -model.tempering * (nothing + reads * odds)
+    # a tag with fewer reads cannot be located, wherever it is
+    searched = -model.tempering * reads * odds > GAIN
+    coarse = _lattice_search(
+        model, merged(looks, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
+    )
+    if uses_facing and np.isnan(facing[coarse.tag]).any():
+        between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
+        sides = [Candidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
+        coarse = Candidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
+    fine, nll, covariances = refine(model, looks, heights, coarse)
+    out = []
+    for t in range(len(heights)):
+        mine = np.flatnonzero(fine.tag == t)
+        mine = mine[np.argsort(nll[mine], kind="stable")]
+        gain = float(nowhere[t] - nll[mine[0]]) if len(mine) else 0.0
+        out.append(Found(_modes(fine[mine], nll[mine], covariances[mine]), int(reads[t]), gain))
+    return out
+
+
+def merged(looks: Looks, distance: float, angle: float) -> Looks:
+    """The looks, those of one antenna counted together while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
+    group = np.empty(len(looks.antennas), dtype=np.int64)
+    first: dict[int, int] = {}
+    kept: list[int] = []
+    for k, antenna in enumerate(looks.antennas.tolist()):
+        i = first.get(antenna)
+        if i is not None:
+            x, y, turned = looks.offsets[k] - looks.offsets[kept[i]]
+            if math.hypot(x, y) > distance or abs(wrap_scalar(turned)) > angle:
+                i = None
+        if i is None:
+            i = first[antenna] = len(kept)
+            kept.append(k)
+        group[k] = i
+    rounds = np.zeros(len(kept), dtype=np.int64)
+    hits = np.zeros((len(kept), looks.hits.shape[1]), dtype=np.int64)
+    np.add.at(rounds, group, looks.rounds)
+    np.add.at(hits, group, looks.hits)
+    return Looks(looks.offsets[kept], looks.antennas[kept], rounds, hits)
+
+
+def _lattice_search(
+    model: RfidModel, looks: Looks, read: NDArray[np.bool_], heights: Array, facing: Array
+) -> Candidates:
+    """The best places of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
+    cells = _cells(looks.offsets[:, :2], reach(model))
+    uses_facing = any(m.uses_facing for m in model.models)
+    free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
+    levels = np.round(heights / LEVEL)
+    tables: list[list[tuple[Array, float]]] = [[] for _ in heights]
+    for level in np.unique(levels[read]):
+        here = read & (levels == level)
+        given = [(d, here & (facing == d)) for d in np.unique(facing[here & np.isfinite(facing)])]
+        for direction, wanted in (*given, *((d, here & np.isnan(facing)) for d in free)):
+            tags = np.flatnonzero(wanted)
+            if not len(tags):
+                continue
+            nll = _nll(model, looks, tags, cells, float(level) * LEVEL, float(direction))
+            for column, t in enumerate(tags.tolist()):
+                tables[t].append((nll[:, column], float(direction)))
+    rows = [(t, *c) for t, table in enumerate(tables) if table for c in _best(cells, table)]
+    out = np.array(rows).reshape(-1, 4)
+    return Candidates(out[:, 0].astype(np.int64), out[:, 1:3], out[:, 3])
+
+
+def _cells(places: Array, distance: float) -> Array:
+    """The lattice (G, 2) within a distance of any place."""
+    low, high = places.min(axis=0) - distance, places.max(axis=0) + distance
+    axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True)]
+    x, y = np.meshgrid(*axes, indexing="ij")
+    cells = np.column_stack((x.ravel(), y.ravel()))
+    coarse = np.unique(np.round(places / CELL), axis=0) * CELL
+    near = np.zeros(len(cells), dtype=bool)
+    for place in coarse:
+        near |= np.sum((cells - place) ** 2, axis=1) < distance**2
+    return cells[near]
+
+
+def _nll(
+    model: RfidModel, looks: Looks, tags: NDArray[np.int64], cells: Array, height: float, direction: float
+) -> Array:
+    """Tempered negative log-likelihood (G, S) of S ``tags`` at all cells."""
+    points = np.column_stack((cells, np.full(len(cells), height)))
+    likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
+    out = np.zeros((len(cells), len(tags)))
+    for antenna in range(len(model.antennas)):
+        mine = np.flatnonzero(looks.antennas == antenna)
+        for first in range(0, len(mine), LOOKS):
+            part = mine[first : first + LOOKS]
+            q = np.clip(likelihood.probabilities(looks.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
+            missed = np.log1p(-q)
+            out -= (looks.rounds[part] @ missed)[:, None]
+            hits = looks.hits[np.ix_(part, tags)]
+            some = hits.any(axis=1)
+            out -= (np.log(q[some]) - missed[some]).T @ hits[some]
+    return model.tempering * out
+
+
+def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, float, float]]:
+    """The best places (x, y, facing), apart from each other."""
+    nll = np.stack([column for column, _ in table])
+    directions = np.array([direction for _, direction in table])
+    out: list[tuple[float, float, float]] = []
+    highest = nll.min() + CUT
+    for _ in range(CANDIDATES):
+        d, g = np.unravel_index(np.argmin(nll), nll.shape)
+        if not nll[d, g] < highest:
+            break
+        out.append((float(cells[g, 0]), float(cells[g, 1]), float(directions[d])))
+        near = np.sum((cells - cells[g]) ** 2, axis=1) < APART**2
+        turned = np.abs(np.nan_to_num(wrap(directions - directions[d]))) < APART
+        nll[np.ix_(turned, near)] = np.inf
+    return out
+
+
+def _modes(found: Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...]:
+    """Optima of one tag, the best first, as modes: those that are near each other, which differ in facing, are one."""
+    kept: list[int] = []
+    for i in range(len(nll)):
+        apart = np.hypot(*(found.places[kept] - found.places[i]).T)
+        turned = np.abs(np.nan_to_num(wrap(found.facing[kept] - found.facing[i])))
+        if not np.any((apart < SAME) & (turned < SAME)):
+            kept.append(i)
+    if not kept:
+        return ()
+    weights = np.exp(nll[kept].min() - nll[kept]) * np.sqrt(np.linalg.det(covariances[kept]))
+    weights /= weights.sum()
+    groups: list[list[int]] = []
+    for k, i in enumerate(kept):
+        for group in groups:
+            head = kept[group[0]]
+            off = found.places[head] - found.places[i]
+            if np.hypot(*off) < MERGED or off @ np.linalg.solve(covariances[head] + covariances[i], off) < OVERLAP:
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    out = []
+    for group in groups:
+        members = [kept[k] for k in group]
+        share = (
+            weights[group] / weights[group].sum()
+            if weights[group].sum() > 0.0
+            else np.full(len(group), 1.0 / len(group))
+        )
+        mean = share @ found.places[members]
+        off = found.places[members] - mean
+        spread = np.einsum("k,kij->ij", share, covariances[members] + off[:, :, None] * off[:, None, :])
+        out.append(Mode(float(weights[group].sum()), mean, spread, float(found.facing[members[int(share.argmax())]])))
+    return tuple(sorted(out, key=lambda mode: -mode.weight))

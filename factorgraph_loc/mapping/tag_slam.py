@@ -1,0 +1,218 @@
+"""Tags and the robot's way at once, from odometry and reads alone.
+
+The way is built a stretch at a time, so that odometry drifts little beyond what is known of the tags: the poses of a stretch and
+all before are optimised with the tags that are in the map (:class:`factors.rfid.tag_factor.RfidTagFactor`), then those that are not
+are searched along the way (:mod:`factorgraph_loc.mapping.tag_search`), and come in as soon as one place alone explains their
+reads. At the end all tags are searched once more along the whole way, and the problem is solved again where one lies elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.fusion.marginals import IndeterminateError
+from factorgraph_loc.fusion.problem import Problem
+from factorgraph_loc.fusion.variables import ODOMETRY_KEY, Values, landmark_key, pose_key
+from factorgraph_loc.mapping.tag_looks import TagLooks
+from factorgraph_loc.mapping.tag_refinement import reach
+from factorgraph_loc.mapping.tag_search import Found, search
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factors import se2
+from factors.graph import Factor, PriorFactor, VectorPriorFactor
+from factors.motion import Increment
+from factors.odometry.model import PARAMETERS, OdometryFactor, recalibrated
+from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.factor import RfidFactor
+from factors.rfid.tag_factor import RfidTagFactor
+from factors.se2 import Array
+
+INTERVAL = 1.0  # s between keyframes
+STRETCH = 15  # keyframes that are added at a time
+WINDOW = 90  # keyframes back from the newest along which new tags are searched
+MARGIN = 1.0  # m beyond the reach: farther from a keyframe a tag that was not read there is left out
+ITERATIONS, FINAL_ITERATIONS = 4, 40
+ROUNDS = 3  # of searching all tags once more
+ELSEWHERE = 13.8  # 99.9 % of chi-square with two degrees of freedom
+FOREVER = 1e9  # s
+
+Factors = list[tuple[Factor, tuple[int, ...]]]
+
+
+@dataclass(frozen=True)
+class TagSlam:
+    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: by number, those that were located; ``facing`` (T,);
+    ``found``: what the last search said of each of T tags."""
+
+    t: Array
+    poses: Array
+    tags: dict[int, LearntPoint]
+    facing: Array
+    found: list[Found]
+
+
+def tag_slam(
+    log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
+) -> TagSlam:
+    """Map the tags that are not ``known`` (T,); those stay where ``looks.positions`` has them. The frame is the prior's."""
+    way = _Way(log, looks, prior, known)
+    count = len(way.t)
+    for end in (*range(STRETCH, count, STRETCH), count):
+        way.extend(end)
+        way.solve(ITERATIONS)
+        way.take_in(way.search(~way.mapped, max(0, end - WINDOW)))
+        progress(end / count)
+    for _ in range(ROUNDS):
+        way.solve(FINAL_ITERATIONS)
+        found = way.search(~known, 0)
+        if not way.take_in(found):
+            break
+    return way.result(found)
+
+
+class _Way:
+    """The problem as far as it has been built."""
+
+    def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
+        self._looks, self._prior, self._known = looks, prior, known
+        self._constants = log.rig.estimated_odometry()
+        sensors = ("odometry", "imu") if "imu" in log.rig.sensors else ("odometry",)
+        motion = Motion(log.rig, sensors, Diagnostics())
+        motion.keep(FOREVER)
+        for m in log.measurements(sensors):
+            if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
+                motion.add(m)
+        last = max(float(looks.t[-1]), prior.t)
+        self.t = _keyframes(prior.t, last, np.append(looks.t, log.streams["odometry"].t))
+        states = [motion.state(float(t)) for t in self.t]
+        self._steps = [motion.relative(a, b) for a, b in pairwise(states)]
+        self._used = looks.t >= prior.t
+        self._keyframe = np.searchsorted(self.t, looks.t, side="right") - 1
+        self._offsets = np.zeros((len(looks.t), 3))
+        for k in np.flatnonzero(self._used):
+            self._offsets[k] = motion.relative(states[self._keyframe[k]], motion.state(float(looks.t[k]))).delta
+        self._reach = reach(looks.model) + MARGIN
+        self._facing = looks.facing.copy()
+        self.mapped = known.copy()
+        self._values: Values = {pose_key(0): np.array(prior.pose)}
+        if self._constants.names:
+            self._values[ODOMETRY_KEY] = np.zeros(len(self._constants.names))
+        self._count = 1
+
+    def extend(self, count: int) -> None:
+        """Poses up to ``count`` keyframes, by odometry."""
+        for i in range(self._count, count):
+            step = self._recalibrated(self._steps[i - 1])
+            self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)
+        self._count = max(self._count, count)
+
+    def search(self, wanted: NDArray[np.bool_], first: int) -> list[Found]:
+        """Search the ``wanted`` (T,) tags by the looks from keyframe ``first`` on; nothing is found of the others."""
+        which = self._used & (self._keyframe >= first) & (self._keyframe < self._count)
+        poses = se2.compose(self._poses()[self._keyframe[which]], self._offsets[which])
+        along = self._looks.along(poses, which)
+        tags = np.flatnonzero(wanted)
+        out = [Found((), 0, 0.0) for _ in wanted]
+        if len(tags) and len(poses):
+            mine = Looks(along.offsets, along.antennas, along.rounds, np.ascontiguousarray(along.hits[:, tags]))
+            found = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
+            for tag, one in zip(tags.tolist(), found, strict=True):
+                out[tag] = one
+        return out
+
+    def take_in(self, found: list[Found]) -> bool:
+        """Put tags where the search located them, those that are in the map only if that is clearly elsewhere; whether any."""
+        changed = False
+        for tag, one in enumerate(found):
+            if self._known[tag] or not one.is_located:
+                continue
+            mode, key = one.modes[0], landmark_key(tag)
+            if self.mapped[tag]:
+                off = mode.position - self._values[key]
+                if off @ np.linalg.solve(mode.covariance, off) < ELSEWHERE:
+                    continue
+            self._values[key] = mode.position
+            self.mapped[tag], changed = True, True
+            if np.isnan(self._looks.facing[tag]):
+                self._facing[tag] = mode.facing
+        return changed
+
+    def solve(self, iterations: int) -> None:
+        self._values = self._problem().solve(self._values, iterations).values
+
+    def result(self, found: list[Found]) -> TagSlam:
+        tags = np.flatnonzero(self.mapped & ~self._known).tolist()
+        keys = [landmark_key(i) for i in tags]
+        try:
+            covariances = self._problem().covariances(self._values, keys).by_key
+        except IndeterminateError as error:
+            raise RunFailedError(f"{len(tags)} tags were located, but the reads do not determine how well") from error
+        learnt = {i: LearntPoint(self._values[key], covariances[key]) for i, key in zip(tags, keys, strict=True)}
+        return TagSlam(self.t, self._poses(), learnt, self._facing, found)
+
+    def _poses(self) -> Array:
+        return np.array([self._values[pose_key(i)] for i in range(self._count)])
+
+    def _recalibrated(self, increment: Increment) -> Array:
+        if not self._constants.names:
+            return increment.delta
+        changes = self._constants.full(self._values[ODOMETRY_KEY], len(PARAMETERS))
+        return recalibrated(increment, changes)[0]
+
+    def _problem(self) -> Problem:
+        body = se2.world_to_body(self._prior.pose, self._prior.covariance)
+        factors: Factors = [(PriorFactor(self._prior.pose, body), (pose_key(0),))]
+        shared: tuple[int, ...] = ()
+        if self._constants.names:
+            shared = (ODOMETRY_KEY,)
+            factors.append((VectorPriorFactor(np.zeros(len(self._constants.names)), self._constants.sigmas), shared))
+        for i in range(1, self._count):
+            step = OdometryFactor(self._steps[i - 1], self._constants.indices)
+            factors.append((step, (pose_key(i - 1), pose_key(i), *shared)))
+        return Problem(factors + self._tag_factors())
+
+    def _tag_factors(self) -> Factors:
+        looks, out = self._looks, list[tuple[Factor, tuple[int, ...]]]()
+        points = np.column_stack((np.nan_to_num(looks.positions), looks.heights))
+        everything = RfidLikelihood(looks.model, TagArray(points, self._facing))
+        fixed = np.flatnonzero(self._known)
+        map_ = RfidLikelihood(looks.model, TagArray(points[fixed], self._facing[fixed]))
+        variable = np.flatnonzero(self.mapped & ~self._known)
+        places = np.array([self._values[landmark_key(i)] for i in variable.tolist()]).reshape(-1, 2)
+        order = np.flatnonzero(self._used & (self._keyframe < self._count))
+        bounds = np.searchsorted(self._keyframe[order], np.arange(self._count + 1))
+        for i in range(self._count):
+            rows = order[bounds[i] : bounds[i + 1]]
+            if not len(rows):
+                continue
+            hits = looks.hits[rows]
+            here = Looks(self._offsets[rows], looks.antennas[rows], looks.rounds[rows], hits)
+            if len(fixed):
+                mine = Looks(here.offsets, here.antennas, here.rounds, np.ascontiguousarray(hits[:, fixed]))
+                out.append((RfidFactor(map_, mine), (pose_key(i),)))
+            near = np.hypot(*(places - self._values[pose_key(i)][:2]).T) < self._reach
+            for tag in variable[near | hits[:, variable].any(axis=0)].tolist():
+                out.append((RfidTagFactor(everything, tag, here), (pose_key(i), landmark_key(tag))))
+        return out
+
+
+def _keyframes(begin: float, end: float, stamps: Array) -> Array:
+    """Times ``INTERVAL`` apart from ``begin`` to ``end`` [s], without those inside of long gaps between ``stamps``: a clock that
+    jumps makes no keyframes. Before the first stamp behind a gap there is one."""
+    measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
+    gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)
+    firsts = np.append(0, ((measured[gaps + 1] - begin) / INTERVAL).astype(np.int64))
+    lasts = ((np.append(measured[gaps], end) - begin) / INTERVAL).astype(np.int64)
+    numbers = [np.arange(first, last + 1) for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True)]
+    return np.asarray(begin + INTERVAL * np.concatenate(numbers))

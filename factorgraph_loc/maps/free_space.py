@@ -1,0 +1,143 @@
+"""Where a robot can drive: cells of a grid that are free, distances to walls, and shortest paths over the cells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.world import World
+from factors.se2 import Array
+
+CELL = 0.2  # m
+SPACING = 0.05  # m, between the points of a path
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Cells of :data:`CELL` that are free and connected: ``centres`` (K, 2), the ``graph`` (K, K) of distances between neighbours,
+    ``index`` (NX, NY): places among them, -1 elsewhere, and ``origin`` (2,) of the first cell's corner. ``distance`` (NX, NY) [m]:
+    from the middle of each cell to the nearest wall; ``clearance`` [m]: what free cells keep to walls."""
+
+    centres: Array
+    graph: sparse.csr_matrix
+    index: NDArray[np.int64]
+    origin: Array
+    distance: Array
+    clearance: float
+
+    def cells(self, points: Array) -> NDArray[np.int64]:
+        """Places (N,) among the free cells of those in which points (N, 2) lie, -1 where they are not free."""
+        places = np.floor((points - self.origin) / CELL).astype(np.int64)
+        inside = np.all((places >= 0) & (places < self.index.shape), axis=-1)
+        i, j = np.where(inside[:, None], places, 0).T
+        return np.where(inside, self.index[i, j], -1)
+
+    def clear(self, a: Array, b: Array) -> bool:
+        """Whether the straight line between two points runs over free cells alone."""
+        return bool(_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
+
+
+def free_space(world: World, clearance: float) -> FreeSpace:
+    """Where a robot may be that keeps ``clearance`` [m] to all walls of the world; the largest connected part."""
+    walls = np.array(world.walls).reshape(-1, 2, 2)
+    if not len(walls):
+        raise InputError(f"world {world.name}: has no walls, expected some around the space to drive in")
+    origin = walls.min(axis=(0, 1))
+    shape = np.maximum(np.ceil((walls.max(axis=(0, 1)) - origin) / CELL).astype(int), 1)
+    i, j = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
+    centres = origin + (np.stack((i, j), axis=-1) + 0.5) * CELL
+    distance = distance_to_walls(world, centres.reshape(-1, 2)).reshape(i.shape)
+    free = distance > clearance
+    labels, count = ndimage.label(free)
+    if not count:
+        raise InputError(f"world {world.name}: has no place that is {clearance:g} m from all walls")
+    largest = 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    inside = labels == largest
+    index = np.full(i.shape, -1, dtype=np.int64)
+    index[inside] = np.arange(int(inside.sum()))
+    return FreeSpace(centres[inside], _graph(index), index, origin, distance, clearance)
+
+
+def distance_to_walls(world: World, points: Array) -> Array:
+    """Distance [m] (N,) from points (N, 2) to the nearest wall."""
+    out = np.full(len(points), np.inf)
+    for x1, y1, x2, y2 in world.walls:
+        start, along = np.array((x1, y1)), np.array((x2 - x1, y2 - y1))
+        share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+        out = np.minimum(out, np.hypot(*(points - start - share[:, None] * along).T))
+    return out
+
+
+def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
+    """Corners (N, 2) of a short path between two cells: a shortest one on the grid, straightened where the way is clear."""
+    _, before = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
+    return straightened(space, space.centres[chain(before, start)])
+
+
+def chain(before: NDArray[np.int32], start: int) -> list[int]:
+    """The cells from ``start`` to the root of a tree of shortest paths, of which ``before`` (K,) has each cell's next."""
+    cells = [start]
+    while before[cells[-1]] >= 0:
+        cells.append(int(before[cells[-1]]))
+    return cells
+
+
+def straightened(space: FreeSpace, points: Array) -> Array:
+    """Those of the points (N, 2) of a path that are its corners, once the way is straight wherever that is clear."""
+    corners, i = [0], 0
+    while i < len(points) - 1:
+        # the farthest point in sight, by bisection: nearer ones are in sight where farther ones are, nearly always
+        low, high = i + 1, len(points) - 1
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if space.clear(points[i], points[middle]) else (low, middle - 1)
+        corners.append(low)
+        i = low
+    return np.asarray(points[corners])
+
+
+def dense(corners: Array, spacing: float = SPACING) -> Array:
+    """Points ``spacing`` [m] apart on the way through ``corners`` (N, 2), the first left out."""
+    along = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
+    s = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))[1:]
+    return np.column_stack((np.interp(s, along, corners[:, 0]), np.interp(s, along, corners[:, 1])))
+
+
+def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
+    """Edges to the eight neighbours; to the diagonal ones only where both cells beside them are free."""
+    rows, columns, weights = [], [], []
+    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        nx, ny = index.shape
+        a = index[: nx - dx, max(0, -dy) : ny - max(0, dy)]
+        b = index[dx:, max(0, dy) : ny - max(0, -dy)]
+        keep = (a >= 0) & (b >= 0)
+        if dx and dy:
+            beside = index[dx:, max(0, -dy) : ny - max(0, dy)], index[: nx - dx, max(0, dy) : ny - max(0, -dy)]
+            keep &= (beside[0] >= 0) & (beside[1] >= 0)
+        rows.append(a[keep])
+        columns.append(b[keep])
+        weights.append(np.full(int(keep.sum()), CELL * math.hypot(dx, dy)))
+    count = int(index.max()) + 1
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_matrix(entries, shape=(count, count))
+
+
+@numba.njit(cache=True)
+def _clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bool:
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    count = max(2, math.ceil(math.hypot(dx, dy) / SPACING))
+    step = 1.0 / (count - 1)
+    for k in range(count):
+        share = k * step if k < count - 1 else 1.0
+        i = math.floor((a[0] + share * dx - origin[0]) / CELL)
+        j = math.floor((a[1] + share * dy - origin[1]) / CELL)
+        if i < 0 or j < 0 or i >= index.shape[0] or j >= index.shape[1] or index[i, j] < 0:
+            return False
+    return True

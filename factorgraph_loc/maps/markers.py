@@ -1,0 +1,86 @@
+"""Fiducial markers of a map: squares whose four corners a camera sees as points with names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc.files.models import Coordinate, FileModel
+from factorgraph_loc.maps.points import PointMap
+from factors.se2 import Array
+
+# AprilTags as tagBITShDISTANCE, others by the side of their grid of bits and how many there are
+MarkerFamily = Literal[
+    "tag16h5",
+    "tag25h9",
+    "tag36h10",
+    "tag36h11",
+    "aruco_original",
+    "aruco_mip_36h12",
+    "4x4_50",
+    "4x4_100",
+    "4x4_250",
+    "4x4_1000",
+    "5x5_50",
+    "5x5_100",
+    "5x5_250",
+    "5x5_1000",
+    "6x6_50",
+    "6x6_100",
+    "6x6_250",
+    "6x6_1000",
+    "7x7_50",
+    "7x7_100",
+    "7x7_250",
+    "7x7_1000",
+]
+
+Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
+# right and up as seen from the front, in the order in which detectors of ArUco markers name them
+CORNERS = np.array(((0.0, -0.5, 0.5), (0.0, 0.5, 0.5), (0.0, 0.5, -0.5), (0.0, -0.5, -0.5)))
+
+
+class Marker(FileModel):
+    """A square marker: its middle [m] in the world, the length of its sides (``size`` [m], of the black square), and how it hangs.
+
+    ``facing``: where its front looks, as of a tag; ``pitch``: how far that is upwards, -pi/2 on a ceiling; ``roll``: how it is
+    turned counter-clockwise, seen from the front. ``sigma`` [m]: standard deviation of each coordinate of a corner.
+    """
+
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+    size: Annotated[float, Field(ge=1e-3, le=10.0, description="m")]
+    facing: Turn
+    pitch: Annotated[float, Field(ge=-1.6, le=1.6, description="rad, not degrees")] = 0.0
+    roll: Turn = 0.0
+    sigma: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
+
+    def corners(self) -> Array:
+        """The corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
+        turn = Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
+        return np.asarray(turn.apply(self.size * CORNERS) + np.array((self.x, self.y, self.z)))
+
+
+class MarkerSettings(FileModel):
+    """Which markers are looked for in a log's images."""
+
+    family: MarkerFamily
+
+
+def corner_names(marker: str) -> list[str]:
+    """The names of its corners as points of a map, in the order of :meth:`Marker.corners`."""
+    return [f"{marker}/{i}" for i in range(len(CORNERS))]
+
+
+def corner_points(markers: Mapping[str, Marker]) -> PointMap:
+    """The corners of all markers as points that are known by name."""
+    names = [name for marker in markers for name in corner_names(marker)]
+    positions = np.array([marker.corners() for marker in markers.values()]).reshape(-1, 3)
+    spread = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(-1, 3, 3)
+    return PointMap.of(names, positions, spread)

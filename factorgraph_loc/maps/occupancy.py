@@ -1,0 +1,101 @@
+"""Occupancy maps of ROS's map_server as walls: an image of cells and a YAML file that says what its greys mean."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.bounded import IMAGE, opened
+from factorgraph_loc.files.images import pillow_image
+from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model
+from factorgraph_loc.files.yaml import read_yaml
+from factors import se2
+from factors.se2 import Array
+
+Wall = tuple[float, float, float, float]
+Yaw = Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an aslant line is half a cell off them
+MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
+
+
+def _zero_or_one(value: Any) -> Any:
+    """``negate`` as Nav2 also takes it: true or false."""
+    return {"false": 0, "true": 1}.get(value.lower(), value) if isinstance(value, str) else value
+
+
+class MapFile(FileModel):
+    """What map_server of ROS or of Nav2 writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
+
+    image: str
+    resolution: Annotated[float, Field(ge=1e-4, le=10.0, description="m per cell")]
+    origin: tuple[Coordinate, Coordinate, Yaw]
+    occupied_thresh: Share = 0.65
+    free_thresh: Share = 0.196
+    negate: Annotated[Literal[0, 1], BeforeValidator(_zero_or_one)] = 0
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
+    map_type: Literal["occupancy"] = "occupancy"
+
+
+def read_walls(path: Path) -> tuple[Wall, ...]:
+    """The outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
+
+    They run through the middles of the outermost occupied cells, within :data:`TOLERANCE`; groups of less than :data:`MIN_EXTENT`
+    are left out. InputError names the file and what is wrong.
+    """
+    stated = parse_model(MapFile, read_yaml(path), path)
+    if stated.free_thresh >= stated.occupied_thresh:
+        raise bad_field(
+            path, "free_thresh", stated.free_thresh, f"less than occupied_thresh, {stated.occupied_thresh:g}"
+        )
+    # maps made by a saver name their image without a folder, but nav stacks also write absolute paths
+    image = inside(path.parent, Path(stated.image).name if Path(stated.image).is_absolute() else stated.image, path)
+    occupied = _occupied(image, stated)
+    if not occupied.any():
+        raise InputError(
+            f"{image}: has no occupied cells, expected some above occupied_thresh {stated.occupied_thresh:g}"
+        )
+    lines = _outlines(occupied)
+    if not len(lines):
+        raise InputError(f"{image}: has only single occupied cells, expected walls of several")
+    height = occupied.shape[0]
+    columns, rows = lines[:, 0::2] + 0.5, height - (lines[:, 1::2] + 0.5)
+    ends = np.stack((columns, rows), axis=-1).reshape(-1, 2) * stated.resolution
+    placed: Array = se2.transform_from(np.array(stated.origin), ends).reshape(-1, 4)
+    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in np.round(placed, 6).tolist())
+
+
+def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
+    """Which cells (rows, columns) are occupied; a transparent one is unknown."""
+    with opened(path, IMAGE) as file, pillow_image(file, path) as image:
+        # colours count by the mean of their channels, as in map_server
+        channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
+    values = np.asarray(channels, dtype=np.uint8)
+    grey = values[:, :, :3].mean(axis=2)
+    if stated.mode == "raw":  # the occupancy in percent, 255 where it is unknown
+        return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))
+    occupancy = grey / 255.0 if stated.negate else 1.0 - grey / 255.0
+    opaque = values[:, :, 3] > 0 if values.shape[2] == 4 else np.ones(grey.shape, dtype=bool)
+    return np.asarray((occupancy > stated.occupied_thresh) & opaque)
+
+
+def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Segments (W, 4) of column, row, column, row."""
+    import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
+
+    contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    found: dict[tuple[int, int, int, int], None] = {}
+    for contour in contours:
+        if math.hypot(*np.ptp(contour[:, 0], axis=0).tolist()) < MIN_EXTENT:
+            continue
+        corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0].tolist()
+        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if start != end:  # a wall of one cell is followed there and back
+                found[(*min(start, end), *max(start, end))] = None
+    return np.array(list(found), dtype=np.int64).reshape(-1, 4)

@@ -1,0 +1,200 @@
+"""A map of 3-D points with what they look like, kept as ``NAME.points.parquet`` beside a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.columns import POINTS
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.parquet import read_parquet, text_column
+from factorgraph_loc.text import listed
+from factorgraph_loc.vision.settings import FrontendSettings
+from factors.se2 import Array
+
+POINTS_SUFFIX = ".points.parquet"
+COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+VIEW = ("from_x", "from_y", "from_z", "size")
+KINDS: tuple[str, ...] = get_args(FrontendSettings.model_fields["feature"].annotation)
+LARGEST_VALUE = 1e6  # of a descriptor
+ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
+
+
+@dataclass(frozen=True, eq=False)
+class PointMap:
+    """P points and V views of them.
+
+    ``names``: P, unique; ``positions`` (P, 3) [m] in the world's frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
+    the views' ``descriptors`` (V, D), empty where points are identified by name alone (V = 0). ``owners`` (V,): which point a view
+    shows; ``seen_from`` (V, 3) [m]: where the camera was; ``sizes`` (V,) [px]: of the feature in that image.
+    """
+
+    names: tuple[str, ...]
+    positions: Array
+    covariances: Array
+    feature: str
+    owners: NDArray[np.int64]
+    descriptors: NDArray[Any]
+    seen_from: Array
+    sizes: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PointMap):
+            return NotImplemented
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """The place of each name."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    @classmethod
+    def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
+        """Points that are known by name alone; exact where no covariances are given."""
+        spread = np.zeros((len(names), 3, 3)) if covariances is None else covariances
+        nothing = np.empty(0)
+        return cls(
+            tuple(names),
+            positions,
+            spread,
+            "",
+            np.empty(0, dtype=np.int64),
+            np.empty((0, 0)),
+            np.empty((0, 3)),
+            nothing,
+        )
+
+    def with_points(self, others: PointMap, source: object) -> PointMap:
+        """The same with ``others`` that are known by name alone; InputError at a name that is there already."""
+        if double := [name for name in others.names if name in self.index]:
+            raise InputError(f"{source}: the point {double[0]} is there twice, expected names that differ")
+        return replace(
+            self,
+            names=(*self.names, *others.names),
+            positions=np.concatenate((self.positions, others.positions)),
+            covariances=np.concatenate((self.covariances, others.covariances)),
+        )
+
+
+def write_points(points: PointMap, path: Path) -> None:
+    """Write ``NAME.points.parquet``: one row a view; a point without views has one row without a descriptor."""
+    seen = np.zeros(len(points), dtype=bool)
+    seen[points.owners] = True
+    unseen = np.flatnonzero(~seen)
+    rows = np.concatenate((points.owners, unseen))
+    order = np.argsort(rows, kind="stable")
+    rows, views = rows[order], np.concatenate((np.arange(len(points.owners)), np.full(len(unseen), -1)))[order]
+    columns: dict[str, Any] = {"point": [points.names[i] for i in rows.tolist()]}
+    columns |= {name: points.positions[rows, axis] for axis, name in enumerate("xyz")}
+    columns |= {name: points.covariances[rows, i, j] for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True)}
+    columns["feature"] = [points.feature if v >= 0 else "" for v in views.tolist()]
+    if len(points.owners):
+        shown = views >= 0
+        for axis, name in enumerate(VIEW[:3]):
+            columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
+        columns["size"] = np.where(shown, points.sizes[views], np.nan)
+        columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
+    with replacing(path) as temporary:
+        pl.DataFrame(columns).write_parquet(temporary)
+
+
+def read_points(path: Path) -> PointMap:
+    """Read ``NAME.points.parquet``; InputError names file, row (from 1) and column of what is wrong.
+
+    Rows of one point must agree on its place. Covariances must be positive semi-definite.
+    """
+    table = read_parquet(path)
+    missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
+    if missing:
+        raise InputError(f"{path}: has no column {missing[0]}, expected {', '.join((*COLUMNS, 'feature'))}")
+    every = np.arange(len(table))
+    numbers = {name: _numbers(table, name, every, path) for name in COLUMNS[1:]}
+    rows: dict[str, int] = {}
+    labels = text_column(table, "point", path)
+    if "" in labels:
+        raise bad_field(path, "point", "", "the name of a point", row=labels.index("") + 1)
+    owner = np.array([rows.setdefault(name, len(rows)) for name in labels], dtype=np.int64)
+    _, first = np.unique(owner, return_index=True)
+    for name, values in numbers.items():
+        expected = values[first][owner]
+        if len(bad := np.flatnonzero(values != expected)):
+            i = int(bad[0])
+            stated = f"{float(expected[i])!r} as in row {first[owner[i]] + 1} of point {labels[i]}"
+            raise bad_field(path, name, float(values[i]), stated, row=i + 1)
+    positions = np.column_stack([numbers[axis] for axis in "xyz"])
+    covariances = np.empty((len(rows), 3, 3))
+    for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
+        covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
+    _check_covariances(covariances, tuple(rows), first, path)
+    features = text_column(table, "feature", path)
+    kinds = sorted({name for name in features if name})
+    if unknown := [name for name in kinds if name not in KINDS]:
+        raise bad_field(path, "feature", unknown[0], " or ".join(KINDS), row=features.index(unknown[0]) + 1)
+    if len(kinds) > 1:
+        raise InputError(f"{path}: has features of the kinds {listed(kinds)}, expected one kind")
+    if not kinds:
+        return PointMap.of(tuple(rows), positions[first], covariances)
+    shown = np.flatnonzero([bool(name) for name in features])
+    columns = [_numbers(table, name, shown, path) for name in VIEW]
+    return PointMap(
+        tuple(rows),
+        positions[first],
+        covariances,
+        kinds[0],
+        owner[shown],
+        _descriptors(table, shown, kinds[0], path),
+        np.column_stack(columns[:3]),
+        columns[3],
+    )
+
+
+def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
+    """The numbers (R,) of a column in ``rows`` (R,), within its bounds."""
+    if name not in table.columns or not table[name].dtype.is_numeric():
+        raise InputError(f"{path}: has no column {name} of numbers")
+    values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
+    POINTS[name].require(path, rows + 1, values)
+    return values
+
+
+def _check_covariances(covariances: Array, names: Sequence[str], first: NDArray[np.int64], path: Path) -> None:
+    least, _, most = np.linalg.eigvalsh(covariances).T
+    if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
+        i = int(bad[0])
+        given = tuple(float(covariances[i][place]) for place in UPPER)
+        raise bad_field(
+            path,
+            f"covariance ({', '.join(COLUMNS[4:])}) of point {names[i]}",
+            given,
+            "a positive semi-definite matrix",
+            row=int(first[i]) + 1,
+        )
+
+
+def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, path: Path) -> NDArray[Any]:
+    kind = np.uint8 if feature == "orb" else np.float32
+    if "descriptor" not in table.columns or table["descriptor"].dtype != pl.Binary:
+        raise InputError(f"{path}: has no column descriptor of bytes")
+    content = table["descriptor"].to_list()
+    chosen = [content[i] or b"" for i in rows.tolist()]
+    if len({len(row) for row in chosen}) != 1 or not chosen[0] or len(chosen[0]) % np.dtype(kind).itemsize:
+        raise InputError(f"{path}: descriptors differ in their length, expected one length for feature {feature}")
+    values = np.frombuffer(b"".join(chosen), dtype=kind).reshape(len(chosen), -1).copy()
+    if len(bad := np.flatnonzero(~(np.abs(values) <= LARGEST_VALUE).all(axis=1))):
+        raise bad_field(path, "descriptor", "values that are none", "finite numbers", row=int(rows[bad[0]]) + 1)
+    return values

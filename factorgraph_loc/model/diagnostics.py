@@ -1,0 +1,146 @@
+"""Counts and consistency figures of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How much :class:`Diagnostics` held at a time: numbers of rows, and counts."""
+
+    nis: Mapping[str, int]
+    residuals: Mapping[str, int]
+    ignored: Mapping[str, int]
+    rejected: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was added to :class:`Diagnostics`: its rows, and by how much its counts rose."""
+
+    nis: Mapping[str, Sequence[tuple[float, float, int]]]
+    residuals: Mapping[str, Sequence[float]]
+    ignored: Mapping[str, int]
+    rejected: Mapping[str, int]
+
+
+NOTHING_WRITTEN = Written({}, {}, {}, {})
+
+
+@dataclass
+class Diagnostics:
+    """Counts and consistency figures of a run.
+
+    ``residuals``: by sensor and value (``bearing_range.range`` in m), measurement less prediction, before the update. ``nis``: by
+    sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by reason.
+    ``events``: (t, what happened), for example a rebuilt graph. ``dead_tags``: tags of the map that are believed dead now, with the
+    probability of it.
+    """
+
+    nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    residuals: dict[str, list[float]] = field(default_factory=dict)
+    ignored: dict[str, int] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    late: dict[str, int] = field(default_factory=dict)
+    events: list[tuple[float, str]] = field(default_factory=list)
+    dead_tags: dict[str, float] = field(default_factory=dict)
+    # the last mark, while nothing is written after it: most of what is taken writes nothing
+    _mark: Mark | None = field(default=None, init=False, repr=False, compare=False)
+
+    def ignore(self, reason: str, count: int = 1) -> None:
+        self._mark = None
+        self.ignored[reason] = self.ignored.get(reason, 0) + count
+
+    def reject(self, reason: str, count: int = 1) -> None:
+        self._mark = None
+        self.rejected[reason] = self.rejected.get(reason, 0) + count
+
+    def drop_late(self, sensor: str, count: int = 1) -> None:
+        self.late[sensor] = self.late.get(sensor, 0) + count
+
+    def innovation(self, sensor: str, t: float, nis: float, dof: int) -> None:
+        self._mark = None
+        self.nis.setdefault(sensor, []).append((t, nis, dof))
+
+    def add_residuals(self, name: str, values: Iterable[float]) -> None:
+        self._mark = None
+        self.residuals.setdefault(name, []).extend(values)
+
+    def keep_last(self, rows: int) -> None:
+        """Forget all but the last ``rows`` of each list."""
+        self._mark = None
+        for innovations in self.nis.values():
+            del innovations[:-rows]
+        for residuals in self.residuals.values():
+            del residuals[:-rows]
+        del self.events[:-rows]
+
+    def copy(self) -> Diagnostics:
+        """One of its own with the same content."""
+        return Diagnostics(
+            {name: list(rows) for name, rows in self.nis.items()},
+            {name: list(values) for name, values in self.residuals.items()},
+            dict(self.ignored),
+            dict(self.rejected),
+            dict(self.late),
+            list(self.events),
+            dict(self.dead_tags),
+        )
+
+    def mark(self) -> Mark:
+        """What there is now, for :meth:`since`."""
+        if self._mark is None:
+            self._mark = self._counted()
+        return self._mark
+
+    def _counted(self) -> Mark:
+        rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
+        return Mark(rows, values, dict(self.ignored), dict(self.rejected))
+
+    def since(self, mark: Mark) -> Written:
+        """What was added since then."""
+        if mark is self._mark:
+            return NOTHING_WRITTEN
+        return Written(
+            {name: rows[mark.nis.get(name, 0) :] for name, rows in self.nis.items()},
+            {name: values[mark.residuals.get(name, 0) :] for name, values in self.residuals.items()},
+            _risen(self.ignored, mark.ignored),
+            _risen(self.rejected, mark.rejected),
+        )
+
+    def take_back(self, written: Written) -> None:
+        """Take out what was added, as what it tells of will be taken once more: a measurement counts once, however often an
+        estimator goes back in time. Rows may be gone by now: a robot that runs for long keeps the last ones. What was ``late``
+        stays, and so do ``events``, which did happen."""
+        self._mark = None
+        _remove(self.nis, written.nis)
+        _remove(self.residuals, written.residuals)
+        for totals, counts in ((self.ignored, written.ignored), (self.rejected, written.rejected)):
+            for name, count in counts.items():
+                totals[name] -= count
+                if not totals[name]:
+                    del totals[name]
+
+
+def _risen(counts: Mapping[str, int], before: Mapping[str, int]) -> dict[str, int]:
+    """By how much each of those counts rose that did."""
+    rises = {name: count - before.get(name, 0) for name, count in counts.items()}
+    return {name: rise for name, rise in rises.items() if rise}
+
+
+_Row = TypeVar("_Row")
+
+
+def _remove(lists: dict[str, list[_Row]], taken: Mapping[str, Sequence[_Row]]) -> None:
+    """Take rows out of lists, each where it is found last; a list without rows goes too."""
+    for name in taken.keys() & lists.keys():
+        rows = lists[name]
+        for row in reversed(taken[name]):
+            found = next((i for i in reversed(range(len(rows))) if rows[i] is row or rows[i] == row), None)
+            if found is not None:
+                del rows[found]
+        if not rows:
+            del lists[name]

@@ -1,0 +1,167 @@
+"""A logged run: rig, world, measurements by sensor, and the reference trajectory if there is one."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.stream import Stream, joined, selected
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.text import well_formed
+from factors.se2 import Array
+
+MOTION = ("odometry", "imu", "twist")  # streams of how the robot moves
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """A known start: ``t`` [s], ``pose`` (3,) and standard deviations (3,) of x, y, heading."""
+
+    t: float
+    pose: Array
+    sigmas: Array
+
+
+@dataclass(frozen=True)
+class Log:
+    """A run. ``streams`` by sensor name (odometry, imu, twist, bearing_range, rfid, camera, sightings,
+    sightings_right); ``t0_ns``: absolute time of t = 0 in nanoseconds.
+
+    ``reference3``: the true robot in space, of a log that was not recorded on a floor. ``warnings``: what the reader mended or
+    left out, one line each. ``metadata``: licence, origin and the like.
+    """
+
+    name: str
+    rig: Rig
+    world: World
+    streams: Mapping[str, Stream]
+    reference: Trajectory | None = None
+    start: StartPose | None = None
+    t0_ns: int = 0
+    warnings: tuple[str, ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    reference3: Trajectory3 | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", well_formed(self.name))  # it may be that of a file
+
+    def span(self) -> tuple[float, float]:
+        """First and last stamp of all streams [s]."""
+        stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
+        if not stamps:
+            return 0.0, 0.0
+        return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
+
+    def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
+        """The measurements of ``sensors`` in the order in which they arrived, stamps corrected by the rig's offsets.
+
+        A late one keeps its stamp and follows those that arrived before it. At equal times odometry comes first.
+        """
+
+        def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
+            latest = -np.inf
+            for i, m in enumerate(self.streams[name].measurements(self.rig.time_offset(name))):
+                latest = max(latest, m.t)
+                yield latest, rank, i, m
+
+        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (s not in MOTION, s != "odometry", s))
+        for _, _, _, m in heapq.merge(*(arrivals(rank, name) for rank, name in enumerate(order))):
+            yield m
+
+
+def cut(log: Log, start: float, end: float) -> Log:
+    """The part of a log with stamps in [start, end) seconds, each sensor's by its own clock; the reference's likewise.
+
+    Stamps and name stay as they are; a known start is dropped. A velocity from before ``start`` is not held into the part, and the
+    first increment of odometry still is the motion since the row before it. InputError if no measurement is left.
+    """
+
+    def inside(t: Array) -> NDArray[np.bool_]:
+        return np.asarray((t >= start) & (t < end))
+
+    streams = {name: selected(stream, inside(stream.t)) for name, stream in log.streams.items()}
+    if not any(len(stream.t) for stream in streams.values()):
+        first, last = log.span()
+        raise InputError(
+            f"{log.name}: has no measurements in {start:g} to {end:g} s, expected times in {first:g} to {last:g} s"
+        )
+    reference = log.reference
+    if reference is not None:
+        keep = inside(reference.t)
+        covariances = None if reference.covariances is None else reference.covariances[keep]
+        reference = replace(reference, t=reference.t[keep], poses=reference.poses[keep], covariances=covariances)
+    in_space = log.reference3
+    if in_space is not None:
+        keep = inside(in_space.t)
+        in_space = Trajectory3(in_space.t[keep], in_space.positions[keep], in_space.rotations[keep])
+    return replace(
+        log,
+        streams=streams,
+        reference=reference if reference and len(reference) else None,
+        reference3=in_space if in_space and len(in_space) else None,
+        start=None,
+    )
+
+
+def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
+    """A kidnapped robot: ``second`` begins ``gap`` seconds after the end of ``first``, wherever the robot is then.
+
+    All stamps of ``second`` are shifted alike, those of the reference too; in a gap between its poses nothing is scored. The last
+    velocity of ``first`` is held until the first row of ``second``. The first increment of ``second`` becomes zero: wheels do not
+    feel how they are carried. Start, metadata and absolute time are those of ``first``. InputError if rig, map or kind of
+    odometry differ, or if ``gap`` is not above zero.
+    """
+    if gap <= 0.0:
+        raise InputError(f"the gap between {first.name} and {second.name} is {gap:g} s, expected more than 0")
+    for what, same in (("rig", first.rig == second.rig), ("map", first.world == second.world)):
+        if not same:
+            raise InputError(f"{first.name} and {second.name} differ in their {what}, expected one robot in one map")
+    shift = _extent(first)[1] + gap - _extent(second)[0]
+    streams = dict(first.streams)
+    for name, stream in second.streams.items():
+        later = replace(stream, t=stream.t + shift)
+        if isinstance(later, IncrementStream):
+            moves = np.arange(len(later.t)) > 0
+            later = replace(later, dx=later.dx * moves, dy=later.dy * moves, dtheta=later.dtheta * moves)
+        streams[name] = joined(streams[name], later) if name in streams else later
+    return replace(
+        first,
+        name=f"{first.name}+{second.name}",
+        streams=streams,
+        reference=_joined_references(first.reference, second.reference, shift),
+        warnings=(*first.warnings, *second.warnings),
+    )
+
+
+def _joined_references(first: Trajectory | None, second: Trajectory | None, shift: float) -> Trajectory | None:
+    """Covariances are kept only if both parts have them, the heading only counts if it does in both."""
+    later = None if second is None else replace(second, t=second.t + shift)
+    if first is None or later is None:
+        return first or later
+    covariances = None
+    if first.covariances is not None and later.covariances is not None:
+        covariances = np.concatenate((first.covariances, later.covariances))
+    return Trajectory(
+        np.concatenate((first.t, later.t)),
+        np.concatenate((first.poses, later.poses)),
+        covariances,
+        first.has_heading and later.has_heading,
+    )
+
+
+def _extent(log: Log) -> tuple[float, float]:
+    """First and last stamp of streams and reference [s]."""
+    first, last = log.span()
+    if log.reference is None or not len(log.reference):
+        return first, last
+    return min(first, float(log.reference.t[0])), max(last, float(log.reference.t[-1]))

@@ -1,0 +1,147 @@
+"""Stamped planar poses with covariances; interpolation; the TUM text format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.columns import LATEST, POSES
+from factorgraph_loc.files.models import read_text, write_text
+from factorgraph_loc.model.planar import on_floor, rotations_of
+from factors import se2
+from factors.se2 import Array, Integers
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """``t`` (N,) seconds, strictly increasing; ``poses`` (N, 3) robot in world; ``covariances`` (N, 3, 3) of (x, y, heading) in
+    the world's frame, or None. ``has_heading`` is False where the source's heading means nothing and is not scored."""
+
+    t: Array
+    poses: Array
+    covariances: Array | None = None
+    has_heading: bool = True
+
+    def __post_init__(self) -> None:
+        if self.poses.shape != (len(self.t), 3):
+            raise ValueError(f"poses have shape {self.poses.shape}, expected ({len(self.t)}, 3)")
+        if len(self.t) > 1 and not np.all(np.diff(self.t) > 0.0):
+            raise ValueError("stamps of a trajectory must increase")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
+        """Poses (M, 3) at times ``t`` (M,), along the arc between neighbours; NaN outside and in gaps above ``max_gap``."""
+        out = np.full((len(t), 3), np.nan)
+        if len(self.t) == 0:
+            return out
+        before, after, fraction, valid = neighbours(self.t, t, max_gap)
+        start = self.poses[before]
+        twist = se2.log(se2.between(start, self.poses[after]))
+        out[valid] = se2.compose(start, se2.exp(fraction[:, None] * twist))[valid]
+        return out
+
+    def covariances_at(self, t: Array, *, max_gap: float = np.inf) -> Array:
+        """Covariances (M, 3, 3) at times ``t`` (M,), averages of those of the neighbours by how near they are; NaN outside and in
+        gaps above ``max_gap``. ValueError for a trajectory without covariances."""
+        if self.covariances is None:
+            raise ValueError("the trajectory has no covariances")
+        out = np.full((len(t), 3, 3), np.nan)
+        if len(self.t) == 0:
+            return out
+        before, after, fraction, valid = neighbours(self.t, t, max_gap)
+        out[valid] = averaged(self.covariances, before, after, fraction)[valid]
+        return out
+
+
+def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
+    """Of times ``t`` (M,) the ``stamps`` (N,), ascending, N > 0, between which they lie: their indices, twice the same where a time
+    is a stamp; what share of the way there; and whether a time lies inside, and not in a gap above ``max_gap``."""
+    t = np.asarray(t, dtype=float)
+    after = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
+    before = np.where(stamps[after] == t, after, np.maximum(after - 1, 0))
+    gap = stamps[after] - stamps[before]
+    valid = (t >= stamps[0]) & (t <= stamps[-1]) & (gap <= max_gap + 1e-9)
+    fraction = np.where(gap > 0.0, (t - stamps[before]) / np.where(gap > 0.0, gap, 1.0), 0.0)
+    return before, after, fraction, valid
+
+
+def averaged(covariances: Array, before: Integers, after: Integers, fraction: Array) -> Array:
+    """Covariances (M, D, D) between neighbours among ``covariances`` (N, D, D): see :func:`neighbours`."""
+    weight = fraction[:, None, None]
+    return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
+
+
+def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
+    """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
+
+    InputError names file and row of what is not so, and of a stamp that is not after the one before; and where poses rise by more
+    than :data:`factorgraph_loc.model.planar.MOST`.
+    """
+    rows, t_ns, table = read_tum_rows(Path(path))
+    poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), [])
+    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
+    if len(stuck):
+        i = int(stuck[0])
+        raise bad_field(path, "t", f"{t_ns[i]} ns", "a stamp after that of the row before", row=int(rows[i]))
+    return Trajectory(np.asarray((t_ns - t0_ns) / 1e9, dtype=float), poses, has_heading=has_heading)
+
+
+def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
+    """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds, and (N, 7) x, y, z [m] and
+    the quaternion x, y, z, w."""
+    rows: list[int] = []
+    stamps: list[int] = []
+    values: list[list[float]] = []
+    lines = read_text(path).split("\n")
+    for row, line in enumerate(lines, start=1):
+        parts = line.split()
+        if not parts or parts[0].startswith("#"):
+            continue
+        if len(parts) != 8:
+            raise bad_field(path, "row", line.strip(), "8 values: t x y z qx qy qz qw", row=row)
+        try:
+            stamps.append(nanoseconds(parts[0]))
+            values.append([float(p) for p in parts[1:]])
+        except (ValueError, OverflowError):
+            raise bad_field(path, "row", line.strip(), "8 finite numbers", row=row) from None
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: holds no poses, expected at least one row")
+    table = np.array(values)
+    bad = np.flatnonzero(~np.all(np.isfinite(table), axis=1))
+    if len(bad):
+        raise bad_field(path, "row", lines[rows[bad[0]] - 1].strip(), "8 finite numbers", row=rows[bad[0]])
+    numbers = np.array(rows, dtype=np.int64)
+    for column, found in zip(POSES.columns[1:8], table.T, strict=True):
+        column.require(path, numbers, found)
+    return numbers, np.array(stamps, dtype=np.int64), table
+
+
+def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
+    """Write a TUM file with absolute stamps in decimal seconds."""
+    rows = []
+    for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
+        t_ns = t0_ns + round(t * 1e9)
+        sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
+        qz, qw = np.sin(heading / 2.0), np.cos(heading / 2.0)
+        rows.append(f"{sign}{whole}.{fraction:09d} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
+    write_text(Path(path), "".join(rows))
+
+
+def nanoseconds(stamp: str) -> int:
+    """A stamp in decimal seconds as nanoseconds, without losing those of an absolute time."""
+    whole, _, fraction = stamp.partition(".")
+    if whole.lstrip("+-").isdigit() and (fraction == "" or fraction.isdigit()):
+        ns = int((fraction + "000000000")[:9])
+        total = int(whole) * 10**9 + (-ns if whole.startswith("-") else ns)
+    else:
+        total = round(float(stamp) * 1e9)
+    if abs(total) > LATEST:
+        raise OverflowError(f"{stamp} s is beyond 64 bits of nanoseconds")
+    return total

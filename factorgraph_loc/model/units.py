@@ -1,0 +1,15 @@
+"""Bounded numbers of settings, with their units; the bounds are there to catch wrong units (degrees for radians, mm for m)."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from pydantic import Field
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Scale = Annotated[float, Field(ge=0.2, le=5.0, description="true over reported")]
+Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
+Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
+Noise = Annotated[float, Field(ge=0.0, le=5.0)]

@@ -1,0 +1,252 @@
+"""From images to features and tracks: computed in parallel once, and kept in the user's cache folder.
+
+What is kept is named by a hash of an image's bytes, of what is looked for, and of the code that looks: a changed image or
+a changed feature is another name, and the same image in two logs is one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.files.bounded import IMAGE, read_bytes
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.processes import ProcessDiedError, run_each
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
+from factorgraph_loc.vision.features import Extractor, extractor
+from factorgraph_loc.vision.found import Found, decode, encode
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.images import read_image
+from factorgraph_loc.vision.keypoints import Integers
+from factorgraph_loc.vision.settings import FrontendSettings
+from factorgraph_loc.vision.tracks import follow
+from factors.camera.model import CameraModel
+
+# what the features of an image depend on, and what tracks depend on besides
+FEATURE_CODE = (
+    "colour.py",
+    "colour_features.py",
+    "descriptor.py",
+    "detector.py",
+    "features.py",
+    "found.py",
+    "images.py",
+    "kernels.py",
+    "keypoints.py",
+    "scale_space.py",
+    "weights.npz",
+    "weights.py",
+)
+TRACK_CODE = ("matching.py", "tracks.py")
+PART = 8  # images that a process is given at a time
+FEW = 64  # images: for fewer, processes take longer to start than the work takes
+
+Size = tuple[int, int]  # width, height
+
+
+@dataclass(frozen=True)
+class _Image:
+    """A file with the ``key`` of its features, and these if they are known; ``fault``: why it cannot have any."""
+
+    file: Path
+    key: str = ""
+    found: Found | None = None
+    fault: str = ""
+    other_size: Size | None = None
+
+
+def with_features(
+    log: Log, settings: FrontendSettings, progress: Callable[[float], None] | None = None
+) -> tuple[Log, tuple[str, ...]]:
+    """The log with features and tracks in place of its images, and what is wrong with these, one line each.
+
+    An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
+    ``progress`` is given the share done. Other processes are spawned for many images that are not in the cache, so a script that
+    calls this needs the usual ``if __name__ == "__main__"``.
+
+    InputError if the rig has no camera, or if it is calibrated for another size than all images have; RunFailedError if a
+    process dies. A log without images is given back as it is.
+    """
+    stream = log.streams.get("camera")
+    if not isinstance(stream, ImageStream):
+        return log, ()
+    if log.rig.camera is None:
+        raise InputError(
+            f"{log.name}: has images, but its rig {log.rig.name} has no [camera] that tells where they look"
+        )
+    camera = log.rig.camera.model()
+    kept = FeatureCache(cache_folder())
+    images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
+    _require_calibrated(log, images, camera)
+    found = [image.found or _nothing(settings) for image in images]
+    tracks = _tracks(stream, images, found, settings, camera, kept)
+    frames = [
+        CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers)
+        for t, f, numbers in zip(stream.t.tolist(), found, tracks, strict=True)
+    ]
+    streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
+    unkept = (f"features are not kept, {kept.fault}",) if kept.fault else ()
+    return replace(log, streams=streams), (*_doubts(log, images), *unkept)
+
+
+def _features(
+    files: Sequence[Path],
+    settings: FrontendSettings,
+    size: Size,
+    kept: FeatureCache,
+    progress: Callable[[float], None],
+) -> list[_Image]:
+    """The features of N images, from the cache where they are there."""
+    about = f"{settings.feature} {settings.count} {size} {code_version(FEATURE_CODE)} "
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing are done outside of the interpreter
+        images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
+    wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
+    new: dict[str, _Image] = {}
+    if wanted:
+        progress(0.0)
+        for key, answer in zip(wanted, _computed(list(wanted.values()), settings, size), strict=True):
+            new[key] = answer if isinstance(answer, _Image) else _Image(wanted[key], key, decode(answer))
+            if isinstance(answer, bytes):
+                kept.write(key, answer)
+            progress(len(new) / len(wanted))
+        kept.trim()
+    return [replace(new[image.key], file=image.file) if image.key in new else image for image in images]
+
+
+def _looked_up(file: Path, about: str, kept: FeatureCache) -> _Image:
+    try:
+        content = read_bytes(file, IMAGE)
+    except InputError as error:
+        return _Image(file, fault=str(error))
+    key = hashlib.sha256(about.encode() + content).hexdigest()
+    stored = kept.read(key)
+    return _Image(file, key, None if stored is None else decode(stored))
+
+
+def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _Image]:
+    """The features of each file as bytes, or what is wrong with it, in the order of the files."""
+    processes = min(os.cpu_count() or 1, len(files) // FEW)
+    if processes < 2:
+        yield from (_find(file, settings, size) for file in files)
+        return
+    parts = [files[i : i + PART] for i in range(0, len(files), PART)]
+    early: dict[int, list[bytes | _Image]] = {}  # of parts that come later
+    due = 0
+    for at, found in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
+        if isinstance(found, ProcessDiedError):
+            raise RunFailedError("a process died while it looked for features in images")
+        if isinstance(found, Exception):
+            raise found
+        early[at] = found
+        while due in early:
+            yield from early.pop(due)
+            due += 1
+
+
+def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _Image]:
+    """The same of some files, in a process among others."""
+    cv2.setNumThreads(1)
+    return [_find(file, settings, size) for file in files]
+
+
+def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _Image:
+    try:
+        image = read_image(file)
+    except InputError as error:
+        return _Image(file, fault=str(error))
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        fault = f"{file}: has {width} x {height} px, expected {size[0]} x {size[1]}"
+        return _Image(file, fault=fault, other_size=(width, height))
+    return encode(*_extractor(settings).detectAndCompute(image))
+
+
+@cache
+def _extractor(settings: FrontendSettings) -> Extractor:
+    """One for each process: it keeps its memory from image to image."""
+    return extractor(settings.feature, settings.count)
+
+
+def _nothing(settings: FrontendSettings) -> Found:
+    """What is found in an image that shows nothing."""
+    return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
+
+
+def _tracks(
+    stream: ImageStream,
+    images: list[_Image],
+    found: list[Found],
+    settings: FrontendSettings,
+    camera: CameraModel,
+    kept: FeatureCache,
+) -> list[Integers]:
+    """Numbers (K,) of each image's features, from the cache where they are there."""
+    order = np.argsort(stream.t, kind="stable").tolist()
+    about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
+    key = hashlib.sha256(
+        (about + " ".join(images[i].key if images[i].found else "-" for i in order)).encode()
+    ).hexdigest()
+    counts = [len(found[i].pixels) for i in order]
+    stored = kept.read(key)
+    if stored is not None and len(stored) == 4 * sum(counts):
+        numbers = np.frombuffer(stored, dtype="<i4").astype(np.int64)
+    else:
+        lists = follow(
+            [found[i].pixels for i in order],
+            [found[i].descriptors for i in order],
+            camera,
+            binary=_extractor(settings).binary,
+        )
+        numbers = np.concatenate([*lists, np.empty(0, dtype=np.int64)])
+        kept.write(key, numbers.astype("<i4").tobytes())
+    tracks: list[Integers] = [numbers[:0]] * len(order)
+    for i, part in zip(order, np.split(numbers, np.cumsum(counts)[:-1]), strict=False):
+        tracks[i] = part
+    return tracks
+
+
+def _require_calibrated(log: Log, images: list[_Image], camera: CameraModel) -> None:
+    """InputError if images can be decoded, but none has the size that the camera is calibrated for."""
+    sizes = [image.other_size for image in images if image.other_size is not None]
+    if sizes and not any(image.found for image in images):
+        width, height = sizes[0]
+        raise InputError(
+            f"{log.name}: the rig's camera is calibrated for images of {camera.width} x {camera.height} px, those of the "
+            f"log have {width} x {height} px, expected a calibration of their resolution"
+        )
+
+
+def _doubts(log: Log, images: list[_Image]) -> tuple[str, ...]:
+    doubts = []
+    for what, faults in (
+        ("cannot be read", [image.fault for image in images if image.fault and image.other_size is None]),
+        ("have another size", [image.fault for image in images if image.other_size is not None]),
+    ):
+        if faults:
+            doubts.append(
+                f"{log.name}: {len(faults)} of {len(images)} images {what} and are without features, the first is {faults[0]}"
+            )
+    if blank := sum(image.found is not None and len(image.found.pixels) == 0 for image in images):
+        doubts.append(f"{log.name}: {blank} of {len(images)} images show no features")
+    return tuple(doubts)
+
+
+@cache
+def code_version(names: tuple[str, ...]) -> str:
+    """A hash of files of this package, and of the versions of what they call."""
+    package = resources.files("factorgraph_loc.vision")
+    digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
+    for name in names:
+        digest.update(package.joinpath(name).read_bytes())
+    return digest.hexdigest()

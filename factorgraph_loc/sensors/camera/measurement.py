@@ -1,0 +1,18 @@
+"""Identified points in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, slots=True)
+class PixelSightings:
+    """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: by the second
+    camera of a stereo pair."""
+
+    t: float
+    points: tuple[str, ...]
+    pixels: Array
+    right: bool = False

@@ -1,0 +1,290 @@
+"""Points of the map seen by a camera, as all estimators take them in: by name, or as features that are found in the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from statistics import median
+
+import numpy as np
+
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.model.variable import Estimated
+from factorgraph_loc.sensors.camera.clock_check import ClockCheck
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
+from factorgraph_loc.vision.spread import spread_out
+from factors import se2
+from factors.camera import model as reprojection
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
+from factors.motion import Increment, propagate
+from factors.se2 import Array
+from factors.update import Update, robust_update, update_state
+
+DISAGREES = "camera: does not agree with the others"  # why a sighting is rejected
+CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
+FEW_SHARE = 0.3  # of named points, and
+FEW, MANY = 6, 20  # of points that are found by what they look like, where so many are expected: they are missed
+UNSURE = 1.0  # m: a prediction that is known no better may miss the map altogether
+MOST = 100  # points of one image that are used: more tell hardly more, as the errors of neighbours in a map are alike
+EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
+# A pixel is so sharp that one step from a poor prediction does not lead to the optimum
+ITERATIONS, SETTLED = 8, 1e-3  # m, rad: a step that needs no further one
+
+Pixels = PixelSightings | CameraFrame  # what a camera sees
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What is expected when an image is taken: the ``pose`` (3,) of the variable that a factor hangs on, with its body-frame
+    ``covariance`` (3, 3); and of the camera's constants that are estimated their changes (P,) and ``spread`` (P, P)."""
+
+    pose: Array
+    covariance: Array
+    constants: Array | None = None
+    spread: Array | None = None
+
+
+class KnownPoints:
+    """Turns what a camera sees into factors; what the map or the rig lacks is counted as ignored, what cannot be right as rejected.
+
+    ``estimated``: the camera's constants that are estimated. ``use``: see
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``motion``: of the robot, to check the stamps of images by.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        diagnostics: Diagnostics,
+        estimated: Estimated,
+        use: MapUse = "known",
+        motion: Motion | None = None,
+    ) -> None:
+        used = any(sensor in setup.sensors for sensor in CAMERAS)
+        settings = setup.rig.camera if used else None
+        self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
+        self._tempering = 1.0 if settings is None else settings.tempering  # of points that are found in the map
+        self.map = PointMap.of((), np.empty((0, 3)))
+        if setup.world.points is not None and use != "unknown":
+            self.map = setup.world.points
+        self._others_matter = use != "known"
+        self.used = np.empty(0, dtype=np.int64)  # features of the last image that show points of the map
+        self._estimated = estimated
+        self._diagnostics = diagnostics
+        self.associator: Associator | None = None
+        if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
+            self.associator = Associator(self.map, self.model)
+        self._clock: ClockCheck | None = None
+        if motion is not None and not self.needs_twist:
+            self._clock = ClockCheck(motion, diagnostics)
+        self.missed = False  # whether points of the map were not where they were expected in the last image
+        self._map_matters = False
+        if settings is not None and len(self.map):
+            worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
+            self._map_matters = worst > (EXACT * settings.pixel_sigma / settings.fx) ** 2
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a camera that is used, and a point in the map."""
+        return self.model is not None and len(self.map) > 0
+
+    @property
+    def needs_twist(self) -> bool:
+        """Whether the camera's time offset is estimated."""
+        return TIME_OFFSET in self._estimated.indices
+
+    def named(self, m: PixelSightings) -> ReprojectionFactor | None:
+        """All points of the map that are named, none of them doubted, on the pose at their time."""
+        if self.model is None:
+            self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        places = [self.map.index.get(name, -1) for name in m.points]
+        pixels = m.pixels
+        if -1 in places:
+            rows = [i for i, place in enumerate(places) if place >= 0]
+            if not self._others_matter:
+                self._diagnostics.ignore("point not in the map", len(places) - len(rows))
+            places, pixels = [places[i] for i in rows], pixels[rows]
+        return self._factor(self.model, places, pixels) if places else None
+
+    def factor(
+        self, m: Pixels, predicted: Predicted, offset: Increment | None = None, twist: Array | None = None
+    ) -> ReprojectionFactor | None:
+        """The factor of the known points, on the pose at the image's time, or on the one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity then, where the camera's time offset is estimated.
+        """
+        self.used = np.empty(0, dtype=np.int64)
+        factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
+        if factor is None:
+            return None
+        if offset is not None:
+            factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
+        if self._estimated.indices:
+            factor = replace(factor, estimated=self._estimated.indices, twist=twist)
+        here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
+        camera = self._camera(here, predicted)
+        focal = 0.0
+        if predicted.spread is not None and FOCAL in self._estimated.indices:
+            place = self._estimated.indices.index(FOCAL)
+            focal = math.sqrt(predicted.spread[place, place])
+        if isinstance(m, CameraFrame):
+            return self._found(m, factor, here.model, camera, focal)
+        right = _agreeing(here, camera, focal)
+        agreed = int(np.count_nonzero(right))
+        self.missed = agreed < FEW_SHARE * len(right)
+        if agreed == len(right):
+            return factor
+        self._diagnostics.reject(DISAGREES, len(right) - agreed)
+        return _rows(factor, right) if agreed else None
+
+    def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
+        """The pose that an image tells without a prediction, None where it tells none, and how many points it seemed to show."""
+        if self.model is None or not self.known:
+            return None, 0
+        if isinstance(m, PixelSightings):
+            rows = [i for i, name in enumerate(m.points) if name in self.map.index]
+            points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
+            spreads = self.map.covariances[points] if self._map_matters else None
+            return found_on_floor(self.model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
+        found = None if self.associator is None else self.associator.relocalized(m)
+        if found is None:
+            return None, 0
+        position, rotation, covariance, seen = found
+        spreads = self.map.covariances[seen.points] if self._map_matters else None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        camera = CameraPose(position, rotation, covariance)
+        return on_floor(self.model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
+
+    def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
+        """Record the innovation of an update at time ``t``."""
+        self._diagnostics.innovation("camera", t, update.nis, update.dof)
+        u, v = (-factor.model.sigma * update.residual.T).tolist()
+        self._diagnostics.add_residuals("camera.u", u)
+        self._diagnostics.add_residuals("camera.v", v)
+        if self._clock is not None:
+            self._clock.add(t, median(u) / factor.model.fx)
+
+    def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
+
+    def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
+        """A factor of no points yet, where features can be found in the map."""
+        if self.model is None or self.associator is None:
+            if self.model is None or not self._others_matter:
+                self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        if m.feature != self.map.feature:
+            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
+            return None
+        return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
+
+    def _found(
+        self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
+    ) -> ReprojectionFactor | None:
+        """A factor of the points that are found in a frame."""
+        assert self.associator is not None
+        seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        self.used = seen.features
+        unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
+        self.missed = len(seen) < FEW and (unsure or min(seen.expected, len(m.pixels)) >= MANY)
+        if seen.rejected:
+            self._diagnostics.reject(DISAGREES, seen.rejected)
+        if len(seen) == 0:
+            return None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        chosen = spread_out(pixels, MOST)
+        points = seen.points[chosen]
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
+
+    def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
+        """Where the camera is when the image is taken, with what is not known of its constants."""
+        pose, covariance = predicted.pose, predicted.covariance
+        if here.offset is not None:
+            noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
+            since = Increment(here.offset, noise, 0.0)
+            pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
+        camera = lifted(here.model, pose, covariance)
+        if predicted.spread is None:
+            return camera
+        model = here.model
+        full = np.zeros((6, len(predicted.spread)))
+        for column, place in enumerate(self._estimated.indices):
+            if place < 3:
+                full[3:, column] = model.rotation[place]
+            elif place < FOCAL:
+                full[:3, column] = model.rotation[place - 3]
+            elif place == TIME_OFFSET and here.twist is not None:
+                full[:, column] = _lift(model) @ here.twist
+        return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
+
+
+def pixel_update(
+    factor: ReprojectionFactor,
+    pose: Array,
+    covariance: Array,
+    constants: Array | None = None,
+    spread: Array | None = None,
+) -> Update:
+    """Kalman update, up to the optimum, of ``pose`` (3,) with body-frame ``covariance`` (3, 3), then of the changes of the camera's
+    constants (P,), with their ``spread`` (P, P), where they are estimated."""
+    if constants is None or spread is None:
+        return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
+    size = 3 + len(constants)
+    both = np.zeros((size, size))
+    both[:3, :3], both[3:, 3:] = covariance, spread
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), constants + delta[3:]])
+        return residual, np.concatenate(blocks, axis=2)
+
+    return update_state(linearize, both, factor.weight, ITERATIONS, factor.dof(), SETTLED)
+
+
+def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
+    """The camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
+    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, *arrays))
+
+
+def _lift(model: CameraModel) -> Array:
+    """The camera's perturbation (6, 3), turn first, in its own frame, by that of the robot's planar pose."""
+    x, y, _ = model.position
+    lift = np.zeros((6, 3))
+    lift[:3, 2] = model.rotation[2]
+    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
+    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
+    return lift
+
+
+def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
+    """Which points agree near what is predicted; all where too few are seen to tell. ``focal``: standard deviation of the logarithm
+    of the focal length."""
+    model, count = here.model, len(here.pixels)
+    if count < FEWEST:
+        return np.ones(count, dtype=bool)
+    if here.point_covariances is None:
+        spreads = np.zeros((count, 2, 2))
+        spreads[:, (0, 1), (0, 1)] = model.sigma**2
+    else:
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
+        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
+    if focal > 0.0:
+        away = focal * (here.pixels - (model.cx, model.cy))
+        spreads = spreads + away[:, :, None] * away[:, None, :]
+    return agreeing(model, camera, here.points, here.pixels, spreads)
+
+
+def _rows(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
+    spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
+    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)

@@ -1,0 +1,71 @@
+"""Pixels of named points in sight, drawn from the camera's model without any image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
+from factorgraph_loc.sensors.camera.stream import SightingStream
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+NEAR = 0.3  # m of depth, below which no point is recognized
+OBLIQUE = math.radians(75.0)  # from a surface's normal, beyond which nothing on it is recognized
+
+
+def pixel_stream(
+    model: CameraModel, world: World, times: Array, poses: Array, settings: PixelSettings, rng: np.random.Generator
+) -> SightingStream:
+    """What the camera identifies at ``times`` (N,) from ``poses`` (N, 3) of the robot: points of the map that are in the image,
+    not too far, on a surface that is not seen too obliquely, and not behind a wall or furniture, however high."""
+    points = world.points
+    assert points is not None, "the world has points"
+    positions, normals = points.positions, surface_normals(world, points.positions[:, :2])
+    cameras = np.array([reprojection.camera_pose(model, pose)[0] for pose in poses]).reshape(-1, 3)
+    rows, columns, pixels = [], [], []
+    for i, pose in enumerate(poses):
+        uv, depth = reprojection.predict(model, pose, positions)
+        rays = cameras[i] - positions
+        front = (rays[:, :2] * normals).sum(axis=1) >= math.cos(OBLIQUE) * np.linalg.norm(rays, axis=1)
+        k = np.flatnonzero(front & (depth >= NEAR) & (depth <= settings.max_depth) & model.contains(uv))
+        rows.append(np.full(len(k), i))
+        columns.append(k)
+        pixels.append(uv[k])
+    n, k, uv = np.concatenate(rows), np.concatenate(columns), np.concatenate(pixels)
+    seen = ~crosses(world, cameras[n, :2], positions[k, :2])
+    n, k, uv = n[seen], k[seen], uv[seen]
+    chosen = _at_most(settings.max_points, n, rng)
+    n, k = n[chosen], k[chosen]
+    uv = uv[chosen] + model.sigma * rng.standard_normal((len(n), 2))
+    wrong = rng.random(len(n)) < settings.wrong
+    anywhere = rng.uniform((-0.5, -0.5), (model.width - 0.5, model.height - 0.5), (len(n), 2))
+    uv = np.where(wrong[:, None], anywhere, uv)
+    return SightingStream(times[n], [points.names[j] for j in k.tolist()], uv[:, 0], uv[:, 1])
+
+
+def surface_normals(world: World, places: Array) -> Array:
+    """Unit vectors (K, 2) away from the wall that is nearest to each of ``places`` (K, 2), to the side that the place is on."""
+    best = np.full(len(places), np.inf)
+    out = np.zeros((len(places), 2))
+    for x1, y1, x2, y2 in world.walls:
+        start, along = np.array((x1, y1)), np.array((x2 - x1, y2 - y1))
+        share = np.clip((places - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+        away = places - start - share[:, None] * along
+        distance = np.hypot(*away.T)
+        normal = np.array((-along[1], along[0])) / max(math.hypot(*along), 1e-12)
+        nearer = distance < best
+        best[nearer] = distance[nearer]
+        out[nearer] = np.where((away @ normal < 0.0)[:, None], -normal, normal)[nearer]
+    return out
+
+
+def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
+    """Places of at most ``count`` rows, drawn at random, of each of the ``frames`` (K,), which are in order."""
+    shuffled = np.lexsort((rng.random(len(frames)), frames))
+    starts = np.searchsorted(frames, frames)
+    return np.sort(shuffled[np.arange(len(frames)) - starts < count])

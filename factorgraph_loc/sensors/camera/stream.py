@@ -1,0 +1,64 @@
+"""The rows of cameras: identified points, images and their features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.vision.frame import CameraFrame
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class SightingStream:
+    """One row an identified point in an image: its name and pixel (``u``, ``v``) [px]. Rows of one stamp belong together."""
+
+    t: Array
+    point: Sequence[str]
+    u: Array
+    v: Array
+    right: ClassVar[bool] = False
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
+        for i, j in pairwise(bounds):
+            pixels = np.column_stack((self.u[i:j], self.v[i:j]))
+            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels, self.right)
+
+
+@dataclass(frozen=True)
+class RightSightingStream(SightingStream):
+    """The same of the second camera of a stereo pair (``rig.camera_right``)."""
+
+    right: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class ImageStream:
+    """Images that were taken: files (N) by their paths. :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+
+    t: Array
+    file: Sequence[Path]
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        raise InputError("images are no measurements before their features are found")
+
+
+@dataclass(frozen=True)
+class FeatureStream:
+    """What was found in images: ``frame`` (N), whose own stamps do not count."""
+
+    t: Array
+    frame: Sequence[CameraFrame]
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        for t, frame in zip((self.t + offset).tolist(), self.frame, strict=True):
+            yield replace(frame, t=t)

@@ -1,0 +1,219 @@
+"""A sensor of identified landmarks: its constants and scatter, from sightings at the poses of the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from factorgraph_loc.fitting.robust import Constant, Fit, Integers, blocks, fit, spread
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.odometry.calibration.windows import REFERENCE_GAP
+from factors.landmarks import model as bearing_range
+from factors.se2 import Array
+
+MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
+BLOCK = 20.0  # s; errors in one block may be correlated
+INLIER = 4.0  # standard deviations beyond which a sighting has no part in the scatter
+LAGS = np.concatenate(([0.0], np.geomspace(0.15, 60.0, 16)))  # s, edges of the bins of the autocorrelation
+NEIGHBOURS = 200  # of a sighting, in its track, that the autocorrelation looks at
+MIN_PAIRS = 30  # in a bin, below which it says nothing
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """K sightings of landmarks of the map: stamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2), ``ranges`` and ``bearings``
+    (K,), and the number of the landmark in the map, ``track`` (K,)."""
+
+    log: Log
+    t: Array
+    points: Array
+    ranges: Array
+    bearings: Array
+    track: Integers
+
+    def thinned(self, count: int) -> Sightings:
+        """About ``count`` of them, all of a stamp or none: every so many stamps."""
+        _, stamp = np.unique(self.t, return_inverse=True)
+        return self._part(stamp % max(1, round(len(self.t) / count)) == 0)
+
+    def halves(self) -> tuple[Sightings, Sightings]:
+        """The first and the second half in time."""
+        half = len(self.t) // 2
+        early = np.arange(len(self.t)) < half
+        return self._part(early), self._part(~early)
+
+    def residuals(self, settings: BearingRangeSettings) -> Array:
+        """Range and bearing (K, 2), predicted less measured, in standard deviations; zero where not measured."""
+        assert self.log.reference is not None
+        poses = self.log.reference.at(self.t + settings.time_offset)
+        return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
+
+    def errors(self, settings: BearingRangeSettings) -> Array:
+        """The same in m and rad, NaN where not measured."""
+        out = self.residuals(settings) * bearing_range.sigmas(settings.model(), self.ranges)
+        out[np.isnan(self.ranges), 0] = np.nan
+        out[np.isnan(self.bearings), 1] = np.nan
+        return out
+
+    def _part(self, rows: NDArray[np.bool_]) -> Sightings:
+        ranges, bearings = self.ranges[rows], self.bearings[rows]
+        return Sightings(self.log, self.t[rows], self.points[rows], ranges, bearings, self.track[rows])
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How alike neighbouring residuals of one landmark are, of range and bearing (2,).
+
+    ``next_one``: correlation of consecutive sightings; ``time`` [s]: until it falls below 1/e; ``lags`` (B,) [s] and ``function``
+    (B, 2). NaN where there are too few.
+    """
+
+    next_one: Array
+    time: Array
+    lags: Array
+    function: Array
+
+
+def sightings_of(log: Log) -> Sightings:
+    """The sightings of landmarks of the map where the reference has poses, with a margin for the clocks."""
+    stream = log.streams["bearing_range"]
+    assert isinstance(stream, BearingRangeStream)
+    assert log.reference is not None
+    numbers = {name: i for i, name in enumerate(log.world.landmarks)}
+    track = np.array([numbers.get(name, -1) for name in stream.landmark], dtype=np.int64)
+    good = (track >= 0) & np.isfinite(log.reference.at(stream.t, max_gap=REFERENCE_GAP)[:, 0])
+    good &= (stream.t > log.reference.t[0] + MAX_OFFSET) & (stream.t < log.reference.t[-1] - MAX_OFFSET)
+    bearings = stream.bearing if log.reference.has_heading else np.full_like(stream.bearing, np.nan)
+    good &= np.isfinite(stream.range) | np.isfinite(bearings)
+    points = log.world.positions()[track[good]]
+    return Sightings(log, stream.t[good], points, stream.range[good], bearings[good], track[good])
+
+
+def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> tuple[Constant, ...]:
+    """What may be fitted; neutral are the values of the rig. Without the reference's heading this is the range scale alone."""
+    has_range = any(np.isfinite(one.ranges).any() for one in seen)
+    has_bearing = any(np.isfinite(one.bearings).any() for one in seen)
+    has_heading = all(one.log.reference is not None and one.log.reference.has_heading for one in seen)
+    found = []
+    if has_heading:
+        found += [Constant("x", settings.x, 0.05, -10.0, 10.0), Constant("y", settings.y, 0.05, -10.0, 10.0)]
+    if has_bearing:
+        found += [Constant("bearing_bias", settings.bearing_bias, 0.02, -np.pi, np.pi)]
+    if has_range:
+        found += [Constant("range_scale", settings.range_scale, 0.02, 0.2, 5.0)]
+    if settings.range_kind == "depth":
+        found += [Constant("depth_axis", settings.depth_axis, 0.02, -np.pi, np.pi)]
+    if has_heading:
+        found += [Constant("time_offset", settings.time_offset, 0.05, -MAX_OFFSET, MAX_OFFSET)]
+    return tuple(found)
+
+
+def could_be_depths(seen: Sequence[Sightings]) -> bool:
+    """Whether the logs can tell distances from depths along one axis: there must be bearings beside the ranges."""
+    return any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in seen)
+
+
+def range_spread(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
+    """Robust standard deviation of the ranges' residuals [m]."""
+    return float(spread(np.concatenate([one.errors(settings) for one in seen]))[0])
+
+
+def fit_sensor(
+    seen: Sequence[Sightings], settings: BearingRangeSettings, constants: Sequence[Constant], start: Mapping[str, float]
+) -> Fit:
+    """The ``constants`` of one or several logs together, with the noise and the other constants of ``settings``."""
+    names = [c.name for c in constants]
+
+    def whitened(values: Array) -> Array:
+        changed = settings.model_copy(update=dict(zip(names, values.tolist(), strict=True)))
+        return np.concatenate([one.residuals(changed) for one in seen])
+
+    return fit(constants, np.array([start[n] for n in names]), whitened, blocks([one.t for one in seen], BLOCK))
+
+
+def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> BearingRangeSettings:
+    """The settings with the scatter of the residuals as noise: maximum likelihood of the inliers.
+
+    The variance of a range is that of a constant and of a share of the range.
+    """
+    errors = np.concatenate([one.errors(settings) for one in seen])
+    ranges = np.concatenate([one.ranges for one in seen])
+    found: dict[str, float] = {}
+    measured = np.isfinite(errors[:, 0])
+    if measured.any():
+        constant, relative = _range_scatter(errors[measured, 0], ranges[measured])
+        found |= {"range_sigma": constant, "range_sigma_relative": relative}
+    bearings = errors[np.isfinite(errors[:, 1]), 1]
+    if len(bearings):
+        sigma = float(spread(bearings[:, None])[0])
+        for _ in range(5):
+            sigma = float(np.std(bearings[np.abs(bearings) < INLIER * sigma]))
+        found |= {"bearing_sigma": float(np.clip(sigma, 1e-4, 0.5))}
+    return settings.model_copy(update=found)
+
+
+def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
+    """Autocorrelation of the residuals of one log within the track of each landmark, outliers left out."""
+    whitened = seen.errors(settings) / bearing_range.sigmas(settings.model(), seen.ranges)
+    whitened[np.abs(whitened) > INLIER] = np.nan
+    count = len(LAGS) - 1
+    products, pairs = np.zeros((count, 2)), np.zeros((count, 2))
+    neighbour, neighbours = np.zeros(2), np.zeros(2)
+    for track in np.unique(seen.track):
+        rows = np.flatnonzero(seen.track == track)
+        t, values = seen.t[rows], whitened[rows]
+        for step in range(1, min(NEIGHBOURS, len(rows))):
+            product = values[step:] * values[:-step]
+            bins = np.searchsorted(LAGS, t[step:] - t[:-step]) - 1
+            good = np.isfinite(product) & ((bins >= 0) & (bins < count))[:, None]
+            for column in range(2):
+                use = good[:, column]
+                np.add.at(products[:, column], bins[use], product[use, column])
+                np.add.at(pairs[:, column], bins[use], 1.0)
+            if step == 1:
+                neighbour += np.nansum(product, axis=0)
+                neighbours += np.isfinite(product).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variance = np.nansum(whitened**2, axis=0) / np.isfinite(whitened).sum(axis=0)
+        function = np.where(pairs >= MIN_PAIRS, products / pairs, np.nan) / variance
+        next_one = np.where(neighbours >= MIN_PAIRS, neighbour / neighbours, np.nan) / variance
+    lags = 0.5 * (LAGS[1:] + LAGS[:-1])
+    return Correlation(next_one, np.array([_falls(lags, function[:, i]) for i in range(2)]), lags, function)
+
+
+def _falls(lags: Array, function: Array) -> float:
+    """The lag at which the correlation falls below 1/e; the last lag looked at where it never does."""
+    known = np.flatnonzero(np.isfinite(function))
+    if not len(known):
+        return float("nan")
+    below = known[function[known] < np.exp(-1.0)]
+    if not len(below):
+        return float(lags[known[-1]])
+    before = known[known < below[0]]
+    if not len(before):
+        return float(lags[below[0]])
+    i, j = int(before[-1]), int(below[0])
+    share = (function[i] - np.exp(-1.0)) / (function[i] - function[j])
+    return float(lags[i] + share * (lags[j] - lags[i]))
+
+
+def _range_scatter(errors: Array, ranges: Array) -> tuple[float, float]:
+    """Standard deviation of a range: constant part [m] and share of the range."""
+    constant, relative = float(spread(errors[:, None])[0]), 0.0
+    for _ in range(5):
+        inside = np.abs(errors) < INLIER * np.hypot(constant, relative * ranges)
+        inliers, near = errors[inside], ranges[inside]
+
+        def cost(logs: Array, inliers: Array = inliers, near: Array = near) -> float:
+            variance = np.exp(2.0 * logs[0]) + np.exp(2.0 * logs[1]) * near**2
+            return float(np.mean(np.log(variance) + inliers**2 / variance))
+
+        start = np.log((max(constant, 1e-3), max(relative, 0.01)))
+        constant, relative = np.exp(minimize(cost, start, method="Nelder-Mead").x).tolist()
+    return float(np.clip(constant, 1e-3, 10.0)), 0.0 if relative < 1e-3 else min(relative, 1.0)

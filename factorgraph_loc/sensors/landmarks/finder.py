@@ -1,0 +1,242 @@
+"""Where the robot is, from identified landmarks alone: for an unknown start, and after being carried elsewhere.
+
+The sightings of the last seconds are chained by odometry to the present. Poses that few of them determine are candidates (one
+landmark: a circle around it; two: the alignment of two points); each is scored against all sightings by the robust likelihood,
+the best are refined by Gauss-Newton, and those that remain apart are hypotheses. Their weights are posterior probabilities
+under a flat prior, by Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6):
+likelihood times the volume of the mode. Where the start is known but for its heading, it takes the place of the flat prior, and
+candidates are made from it too. Hypotheses made from few features and tested by the others: Jensfelt, Kristensen,
+IEEE Transactions on Robotics and Automation 17(5), 2001.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.fusion.known_position import KnownPosition
+from factorgraph_loc.model.belief import PosePrior, Status
+from factorgraph_loc.sensors.landmarks.window import Sighting, Window
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factors import positive, se2
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import BearingRangeModel, robust_loss
+from factors.motion import ChainState
+from factors.se2 import Array
+from factors.update import GATE
+
+DURATION = 60.0  # s, how far back sightings count
+INTERVAL = 1.0  # s: errors of one landmark's sightings closer than that are nearly the same, so that they count as one
+ROWS = 60  # the newest sightings that count
+REFINED = 24  # candidates
+# Mahalanobis distances squared: of poses that are one hypothesis, and of one from where its sightings together lead
+SAME, DIVERGED = 9.0, 25.0
+NEGLIGIBLE = 1e-3  # weight of a hypothesis
+MARGIN = 5.0  # m, how far beyond the landmarks of the map the robot may be
+WIDE = 3.0  # m, standard deviation of a hypothesis that is no Gaussian
+# what a hypothesis must explain to refute a track: that many landmarks and that share of the sightings, and so much more of them
+REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
+
+CLEAR_WEIGHT = 0.99
+# the largest standard deviations of a clear hypothesis: m (or that of a single range, where this is larger), rad
+CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
+CLEAR_SIGHTINGS = 4
+FOUND_HEADING = 0.3  # rad, of a heading where the position was known: there is no other place to take it for
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose (3,) with covariance (3, 3) in the world's frame, and its posterior probability.
+
+    ``explained``: how many sightings lie within the gate; ``share``: of all; ``landmarks``: of how many different ones.
+    """
+
+    weight: float
+    pose: Array
+    covariance: Array
+    explained: int
+    share: float
+    landmarks: int
+
+
+class Relocalizer:
+    """Hypotheses of the present pose from the last sightings; see the module. ``positions`` (L, 2): of the map's landmarks."""
+
+    def __init__(self, motion: Motion, positions: Array) -> None:
+        self._motion = motion
+        extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(2)
+        self._log_volume = math.log(2.0 * math.pi * np.prod(extent + 2.0 * MARGIN))
+        self._model = BearingRangeModel()
+        self._sightings: dict[tuple[float, float], list[Sighting]] = {}
+        self._window: Window | None = None
+        self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._best: PosePrior | None = None
+        self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """Those of the last search, the likeliest first."""
+        return self._hypotheses
+
+    @property
+    def best(self) -> PosePrior | None:
+        """The pose at the last sighting if one hypothesis is clear, else None."""
+        return self._best
+
+    @property
+    def status(self) -> Status:
+        """``unlocalized`` without a hypothesis, ``localized`` if one is clear."""
+        if self._best is not None:
+            return "localized"
+        return "ambiguous" if self._hypotheses else "unlocalized"
+
+    def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
+        """Take the landmarks seen when the odometry was at ``odometry``; late ones, and those taken before, may come again."""
+        self._model = seen.model
+        for point, distance, bearing in zip(seen.points, seen.ranges, seen.bearings, strict=True):
+            rows = self._sightings.setdefault((float(point[0]), float(point[1])), [])
+            rows[:] = [r for r in rows if r.odometry.t != odometry.t]
+            rows.append(Sighting(odometry, point, float(distance), float(bearing)))
+            rows.sort(key=lambda r: r.odometry.t)
+            rows[:] = _thinned(rows)
+        self.forget(odometry.t - DURATION)
+
+    def forget(self, before: float) -> None:
+        """Drop the sightings older than ``before`` [s]."""
+        for key, rows in list(self._sightings.items()):
+            rows[:] = [r for r in rows if r.odometry.t >= before]
+            if not rows:
+                del self._sightings[key]
+
+    def search(self) -> None:
+        """Find the hypotheses for the time of the last sighting."""
+        rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
+        earlier, before = self._hypotheses, self._window
+        self._hypotheses, self._best, self._window = (), None, None
+        if not rows:
+            return
+        window = self._window = Window(self._model, rows, self._motion, self.start)
+        poses = np.concatenate((window.starts(), window.alignments(), window.circles()))
+        if before is not None and earlier:
+            since = self._motion.relative(before.now, window.now).delta
+            poses = np.concatenate((se2.compose(np.array([h.pose for h in earlier]), since), poses))
+        grain = window.grain()
+        coarse, fine = window.whitener(grain), window.whitener()
+        losses = window.losses(poses, coarse, grain)
+        poses = poses[_apart(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
+        poses, _ = window.refined(poses, coarse, iterations=4, spread=grain)
+        poses, covariances = window.refined(poses, fine, iterations=6)
+        squared = window.squared(poses, fine)
+        logs = -robust_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(window, poses, covariances)
+        self._hypotheses = self._weighed(window, poses, covariances, squared, logs)
+        self._best = self._clear(window)
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Poses (N, 3) at the last sighting, drawn from the hypotheses; in place of those that are too wide to be Gaussian, from
+        the likelihood of that sighting alone (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
+        if self._window is None:
+            return np.empty((0, 3))
+        narrow = [h for h in self._hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
+        weights = np.array([h.weight for h in narrow])
+        counts = rng.multinomial(count, np.append(weights, max(0.0, 1.0 - weights.sum())))
+        poses = [self._window.drawn(rng, int(counts[-1]))]
+        for h, n in zip(narrow, counts, strict=False):
+            body = se2.world_to_body(h.pose, h.covariance)
+            poses.append(se2.compose(h.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, int(n)))))
+        return np.concatenate(poses)
+
+    def refutes(self, pose: Array, covariance: Array) -> bool:
+        """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: the clear
+        hypothesis explains nearly all sightings, and far more of them. Landmarks that the map has in wrong places also
+        agree on some place, but on one that the others speak against."""
+        if self._best is None or self._window is None:
+            return False
+        if self._hypotheses[0].share < REFUTING_SHARE or self._hypotheses[0].landmarks < REFUTING_LANDMARKS:
+            return False
+        window, scale = self._window, self._model.robust
+        track = robust_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
+        other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
+        return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
+
+    def _log_prior(self, window: Window, poses: Array, covariances: Array) -> Array:
+        """Log of the prior probability (N,) of modes with these body-frame covariances (N, 3, 3)."""
+        volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
+        density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
+        return np.asarray(np.minimum(volume + density, 0.0))
+
+    def _weighed(
+        self, window: Window, poses: Array, covariances: Array, squared: Array, logs: Array
+    ) -> tuple[Hypothesis, ...]:
+        """Those that differ, with their posterior probabilities beside that of being elsewhere, where nothing is explained."""
+        covariances = se2.body_to_world(poses, covariances)
+        kept: list[int] = []
+        for i in np.argsort(-logs):
+            if all(_distance(poses[i], poses[k], covariances[k]) > SAME for k in kept):
+                kept.append(int(i))
+        logs = np.append(logs[kept], -0.5 * self._model.robust**2 * squared.shape[1])
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        inside = squared < GATE
+        return tuple(
+            Hypothesis(
+                weight=float(weight),
+                pose=poses[i],
+                covariance=covariances[i],
+                explained=int(inside[i].sum()),
+                share=float(inside[i].mean()),
+                landmarks=len(np.unique(window.points[inside[i]], axis=0)),
+            )
+            for i, weight in zip(kept, weights, strict=False)
+            if weight > NEGLIGIBLE
+        )
+
+    def _clear(self, window: Window) -> PosePrior | None:
+        """The likeliest hypothesis if it is clear, with the moments of all its sightings together."""
+        if not self._hypotheses:
+            return None
+        best = self._hypotheses[0]
+        if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
+            return None
+        # one landmark alone may be a wrong one, unless the start agrees with it
+        if best.explained < CLEAR_SIGHTINGS or best.landmarks < (2 if self.start is None else 1):
+            return None
+        pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
+        covariance = se2.body_to_world(pose, covariance)
+        if _distance(pose, best.pose, best.covariance + covariance) > DIVERGED:
+            return None
+        position = max(CLEAR_POSITION, self._model.range_sigma)
+        heading = CLEAR_HEADING if self.start is None else FOUND_HEADING
+        if np.linalg.eigvalsh(covariance[:2, :2])[-1] > position**2 or covariance[2, 2] > heading**2:
+            return None
+        return PosePrior(window.now.t, pose, covariance)
+
+
+def _thinned(rows: list[Sighting]) -> list[Sighting]:
+    """Of the sightings of one landmark those that lie an interval apart, and the last."""
+    kept = rows[:1]
+    for row in rows[1:]:
+        if row.odometry.t >= kept[-1].odometry.t + INTERVAL:
+            kept.append(row)
+    return kept if kept[-1] is rows[-1] else [*kept, rows[-1]]
+
+
+def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
+    """Indices of at most ``count`` poses (N, 3) in the order of their losses (N,), without those near a better one."""
+    kept: list[int] = []
+    losses = losses.copy()
+    while len(kept) < count and np.isfinite(losses).any():
+        kept.append(int(np.argmin(losses)))
+        difference = poses - poses[kept[-1]]
+        difference[:, 2] = se2.wrap(difference[:, 2])
+        losses[np.all(np.abs(difference) < apart, axis=1)] = np.inf
+    return np.array(kept, dtype=np.int64)
+
+
+def _distance(pose: Array, other: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance between two poses (3,) under a covariance (3, 3) in the world's frame."""
+    difference = pose - other
+    difference[2] = se2.wrap_scalar(difference[2])
+    return float(positive.squared(difference, covariance))

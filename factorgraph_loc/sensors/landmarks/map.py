@@ -1,0 +1,32 @@
+"""Landmarks of the map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.files.models import Coordinate, FileModel
+from factorgraph_loc.model.survey import Covariance
+from factors.se2 import Array
+
+
+class Landmark(FileModel):
+    """A point landmark: position [m] in the world's frame, and how well it is known.
+
+    ``sigma``: standard deviation of its survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], in place of ``sigma``, where
+    the map was made from a log and the errors in x and y differ or go together.
+    """
+
+    x: Coordinate
+    y: Coordinate
+    sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: Covariance | None = None
+
+    def spread(self) -> Array:
+        """The covariance (2, 2) of the position [m^2]."""
+        if self.covariance is None:
+            return self.sigma**2 * np.eye(2)
+        xx, xy, yy = self.covariance
+        return np.array(((xx, xy), (xy, yy)))

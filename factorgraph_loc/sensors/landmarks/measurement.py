@@ -1,0 +1,20 @@
+"""What a sensor of identified landmarks reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, slots=True)
+class BearingRange:
+    """Identified landmarks seen at one time.
+
+    ``landmarks``: K names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor's frame]: NaN where not measured.
+    """
+
+    t: float
+    landmarks: tuple[str, ...]
+    range: Array
+    bearing: Array

@@ -1,0 +1,144 @@
+"""Identified landmarks, as all estimators take them in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import BearingRangeModel, sigmas
+from factors.motion import Increment
+from factors.se2 import Array
+from factors.update import Update
+
+EXACT = 0.1  # a survey that is so much better than the sensor (as a share of its sigma) is taken as exact
+
+
+class KnownLandmarks:
+    """Turns measurements into factors; what the map or the rig lacks is counted as ignored.
+
+    ``use`` of the map: ``known`` takes its landmarks as they are and ignores others, ``extended`` estimates the others, ``unknown``
+    estimates all, as if there were no map. ``estimated``: places of the sensor's constants that are estimated.
+    """
+
+    def __init__(
+        self, setup: Setup, diagnostics: Diagnostics, use: MapUse = "known", estimated: tuple[int, ...] = ()
+    ) -> None:
+        settings = setup.rig.bearing_range if "bearing_range" in setup.sensors else None
+        self._model = None if settings is None else settings.model()
+        landmarks = {} if use == "unknown" else setup.world.landmarks
+        self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
+        self._surveys = {name: m.spread() for name, m in landmarks.items()}
+        worst = max((float(np.trace(spread)) for spread in self._surveys.values()), default=0.0)
+        self._survey_matters = settings is not None and worst > (EXACT * settings.range_sigma) ** 2
+        self._maps_others = use != "known"
+        self._estimated = estimated
+        self._diagnostics = diagnostics
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a sensor of landmarks, and a landmark in the map."""
+        return self._model is not None and bool(self._positions)
+
+    def factor(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> BearingRangeFactor | None:
+        """The factor of the known landmarks, on the pose at its time, or on the one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity then, where the sensor's time offset is estimated.
+        """
+        if self._model is None:
+            self._diagnostics.ignore("bearing_range", len(m.landmarks))
+            return None
+        known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
+        rows = [i for i in known if not (np.isnan(m.range[i]) and np.isnan(m.bearing[i]))]
+        if len(known) < len(m.landmarks) and not self._maps_others:
+            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
+        if len(rows) < len(known):
+            self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
+        if not rows:
+            return None
+        points = np.array([self._positions[m.landmarks[i]] for i in rows])
+        factor = self._factor(self._model, m, rows, points, offset, twist)
+        if self._survey_matters:
+            spreads = np.array([self._surveys[m.landmarks[i]] for i in rows])
+            factor = replace(factor, point_covariances=spreads)
+        return factor
+
+    def others(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> list[tuple[str, BearingRangeFactor]]:
+        """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
+        if self._model is None or not self._maps_others:
+            return []
+        found = []
+        for i, name in enumerate(m.landmarks):
+            if name in self._positions:
+                continue
+            if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
+                self._diagnostics.ignore("unknown landmark without range and bearing")
+            else:
+                factor = self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist)
+                found.append((name, replace(factor, free=True)))
+        return found
+
+    def _factor(
+        self,
+        model: BearingRangeModel,
+        m: BearingRange,
+        rows: list[int],
+        points: Array,
+        offset: Increment | None,
+        twist: Array | None,
+    ) -> BearingRangeFactor:
+        return BearingRangeFactor(
+            model,
+            points,
+            m.range[rows],
+            m.bearing[rows],
+            None if offset is None else offset.delta,
+            None if offset is None else offset.covariance,
+            estimated=self._estimated,
+            twist=twist,
+            in_look=None if offset is None else self._count(m),
+        )
+
+    def _count(self, m: BearingRange) -> int:
+        """How many landmarks of a measurement are used: those of the map with either value, others with both."""
+        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
+        return sum(
+            not (no_range and no_bearing)
+            if name in self._positions
+            else self._maps_others and not (no_range or no_bearing)
+            for name, no_range, no_bearing in lacks
+        )
+
+    def report(self, t: float, factor: BearingRangeFactor, update: Update) -> None:
+        """Record the innovation of an update at time ``t``."""
+        self._diagnostics.innovation("bearing_range", t, update.nis, update.dof)
+        errors = -update.residual * sigmas(factor.model, factor.ranges)
+        for i, (name, measured) in enumerate((("range", factor.ranges), ("bearing", factor.bearings))):
+            found = errors[~np.isnan(measured), i].tolist()
+            self._diagnostics.add_residuals(f"bearing_range.{name}", found)
+
+
+def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
+    """Factors on one pose alone, of one measurement, as one."""
+    first, *others = factors
+    if not others:
+        return first
+    covariances = [
+        np.zeros((len(f.points), 2, 2)) if f.point_covariances is None else f.point_covariances for f in factors
+    ]
+    return replace(
+        first,
+        points=np.concatenate([f.points for f in factors]),
+        ranges=np.concatenate([f.ranges for f in factors]),
+        bearings=np.concatenate([f.bearings for f in factors]),
+        point_covariances=np.concatenate(covariances),
+    )

@@ -1,0 +1,49 @@
+"""Range and bearing of landmarks in sight, drawn from the model of a rig."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factors import se2
+from factors.landmarks import model as bearing_range
+from factors.landmarks.model import BearingRangeModel
+from factors.se2 import Array
+
+
+def sighting_stream(
+    model: BearingRangeModel,
+    world: World,
+    times: Array,
+    poses: Array,
+    settings: SightingSettings,
+    rng: np.random.Generator,
+) -> BearingRangeStream:
+    """What the sensor reports at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in view and not behind a wall."""
+    points, names = world.positions(), list(world.landmarks)
+    n, k = in_sight(model, world, poses, settings)
+    ranges, bearings = bearing_range.predict(model, poses[n], points[k])
+    sigma = bearing_range.sigmas(model, ranges)
+    noise = sigma * rng.standard_normal((len(n), 2))
+    # a range is above zero whatever the noise
+    ranges = np.maximum(ranges + noise[:, 0], 1e-3)
+    return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
+
+
+def in_sight(
+    model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which of ``poses`` (N, 3) see which landmarks: places (K,) in both."""
+    points = world.positions()
+    sensors = se2.compose(poses, np.array(model.mounting))
+    local = se2.transform_to(sensors[:, None], points[None])
+    distance = np.hypot(local[..., 0], local[..., 1])
+    direction = np.arctan2(local[..., 1], local[..., 0])
+    near = (distance <= settings.max_range) & (np.abs(direction) <= settings.field_of_view / 2.0)
+    n, k = np.nonzero(near)
+    visible = ~crosses(world, sensors[n, :2], points[k])
+    return n[visible], k[visible]

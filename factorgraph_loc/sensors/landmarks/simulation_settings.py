@@ -1,0 +1,19 @@
+"""What is simulated of a sensor of landmarks."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.simulation_units import Hertz, Metres
+
+
+class SightingSettings(FileModel):
+    """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
+    axis, and not through walls."""
+
+    rate: Hertz = 2.0
+    max_range: Metres = 6.0
+    field_of_view: Annotated[float, Field(ge=0.01, le=6.3, description="rad")] = 6.3

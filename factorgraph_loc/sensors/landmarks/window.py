@@ -1,0 +1,215 @@
+"""The last sightings of landmarks as constraints on the present pose, many poses at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from factorgraph_loc.fusion.known_position import KnownPosition
+from factorgraph_loc.sensors.odometry.motion import Motion
+from factors import positive, se2
+from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, robust_loss, robust_weight, sigmas
+from factors.motion import ChainState
+from factors.se2 import Array
+
+RECENT = 6  # landmarks from whose last sightings candidates are made
+CIRCLE = 72  # candidates around a landmark
+HEADINGS = 24  # of each of them, where no bearing tells the heading
+RADII = (0.7, 1.5, 3.0, 6.0)  # m, where no range tells the distance
+BASELINE = 0.3  # m, of two landmarks that are aligned
+FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the flat prior: 1/m^2, 1/m^2, 1/rad^2
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One landmark, seen when the odometry was at ``odometry``; ``point`` (2,) is its place in the map."""
+
+    odometry: ChainState
+    point: Array
+    range: float
+    bearing: float
+
+
+class Window:
+    """K sightings as constraints on the present pose, and the start where that is known but for its heading. ``now``: the odometry
+    at the last one; ``points`` (K, 2): in the map."""
+
+    def __init__(
+        self, model: BearingRangeModel, rows: list[Sighting], motion: Motion, start: KnownPosition | None = None
+    ) -> None:
+        self._model, self._motion, self._start = model, motion, start
+        self._times = [r.odometry for r in rows]
+        self.now = rows[-1].odometry
+        self.points = np.array([r.point for r in rows])
+        self._ranges, self._bearings = np.array([(r.range, r.bearing) for r in rows]).T
+        since = [motion.relative(r.odometry, self.now) for r in rows]
+        self._forth = np.array([i.delta for i in since])
+        self._back = se2.inverse(self._forth)  # the pose at each sighting in the frame of the present one
+        self._carried = se2.adjoint(self._forth)  # of a perturbation of the present pose to that at the sighting
+        self._covariance = np.array([i.covariance for i in since])
+        self._drift = self._carried @ self._covariance @ self._carried.transpose(0, 2, 1)
+        self._missing = np.isnan(np.column_stack((self._ranges, self._bearings)))
+        self._sigmas = sigmas(model, self._ranges)
+
+    def starts(self) -> Array:
+        """Present poses (N, 3) that come from the start, none where that is not known."""
+        return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
+
+    def circles(self) -> Array:
+        """Present poses (N, 3) that put the landmark seen last on its range and bearing, in all directions from it."""
+        k = len(self.points) - 1
+        ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
+        bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
+        grid = np.meshgrid(np.arange(CIRCLE) * 2.0 * np.pi / CIRCLE, np.array(ranges), np.array(bearings))
+        return self._placed(k, *(g.ravel() for g in grid))
+
+    def drawn(self, rng: np.random.Generator, count: int) -> Array:
+        """Present poses (N, 3) drawn from the start, where that is not known from the likelihood of the last sighting alone."""
+        if self._start is not None:
+            return self._start.drawn(rng, count, self.now)
+        k, noise = len(self.points) - 1, rng.standard_normal((2, count))
+        headings = rng.uniform(-np.pi, np.pi, count)
+        ranges = np.abs(self._ranges[k] + self._sigmas[k, 0] * noise[0])
+        bearings = self._bearings[k] + self._sigmas[k, 1] * noise[1]
+        if self._missing[k, 0]:
+            ranges = rng.uniform(RADII[0], RADII[-1], count)
+        if self._missing[k, 1]:
+            bearings = rng.uniform(-np.pi, np.pi, count)
+        return self._placed(k, headings, ranges, bearings)
+
+    def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
+        """Present poses (N, 3) that had the headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
+        turned = np.column_stack((np.zeros((len(headings), 2)), headings))
+        there = se2.transform_from(turned, located(self._model, ranges, bearings))
+        return se2.compose(np.column_stack((self.points[k] - there, headings)), self._forth[k])
+
+    def alignments(self) -> Array:
+        """Present poses (N, 3) that put two landmarks seen with range and bearing where the map has them."""
+        full = [k for k in self._recent() if not self._missing[k].any()]
+        pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
+        there, here = self.points[pairs], self._from_present()[pairs]
+        for_world, for_robot = there[:, 1] - there[:, 0], here[:, 1] - here[:, 0]
+        wide = np.minimum(np.hypot(*for_world.T), np.hypot(*for_robot.T)) > BASELINE
+        heading = np.arctan2(for_world[:, 1], for_world[:, 0]) - np.arctan2(for_robot[:, 1], for_robot[:, 0])
+        turned = np.column_stack((np.zeros((len(pairs), 2)), heading))
+        middle = se2.transform_from(turned, here.mean(axis=1))
+        poses = np.column_stack((there.mean(axis=1) - middle, se2.wrap(heading)))
+        return np.asarray(poses[wide])
+
+    def grain(self) -> Array:
+        """Covariance (3, 3) of what a candidate stands for: the distance to its neighbours, and the noise it was made from."""
+        heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
+        distances = self._ranges[~self._missing[:, 0]]
+        position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
+        return np.diag(np.square((position, position, heading)))
+
+    def whitener(self, spread: Array | None = None) -> Array:
+        """Whiteners (K, 2, 2) of the residuals, for the noise widened by the odometry's error, and by that of the present pose,
+        with body-frame covariance ``spread`` (3, 3). The geometry is that of the measured range and bearing."""
+        error = self._drift
+        if spread is not None:
+            error = error + self._carried @ spread @ self._carried.transpose(0, 2, 1)
+        jacobian = (
+            jacobians(self._model, np.zeros((len(self.points), 3)), self._from_robot())[0] / self._sigmas[..., None]
+        )
+        jacobian[self._missing] = 0.0
+        covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
+        # without a bearing the direction of the range is not known: the worst
+        worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
+        covariance[:, 0, 0] = np.where(self._missing[:, 1], 1.0 + worst, covariance[:, 0, 0])
+        return positive.whitener(covariance)
+
+    def squared(self, poses: Array, whitener: Array) -> Array:
+        """Squared whitened residuals (N, K) at present poses (N, 3)."""
+        return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
+
+    def losses(self, poses: Array, whitener: Array, spread: Array | None = None) -> Array:
+        """Losses (N,) of present poses (N, 3): the robust ones of the sightings, and that of the start."""
+        found: Array = robust_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
+        return found if self._start is None else found + self._start.loss(poses, self.now, spread)
+
+    def refined(
+        self, poses: Array, whitener: Array, iterations: int, spread: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Poses (N, 3) after iterations of Levenberg and Marquardt on the losses, with body-frame covariances (N, 3, 3)."""
+        damping = np.full((len(poses), 1, 1), 1e-2)
+        loss = self.losses(poses, whitener, spread)
+        for _ in range(iterations):
+            information, gradient = self._normal_equations(poses, whitener, spread)
+            damped = information + damping * np.eye(3) * np.einsum("nii->ni", information)[:, None]
+            step = np.clip(-np.linalg.solve(damped, gradient[..., None])[..., 0], -1.0, 1.0)
+            tried = se2.compose(poses, se2.exp(step))
+            tried_loss = self.losses(tried, whitener, spread)
+            better = tried_loss < loss
+            poses, loss = np.where(better[:, None], tried, poses), np.where(better, tried_loss, loss)
+            damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
+        return poses, np.asarray(np.linalg.inv(self._normal_equations(poses, whitener, spread)[0]))
+
+    def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
+        """A hypothesis (3,) after Gauss-Newton with the odometry's errors taken as what they are, common to all sightings before
+        them; and its body-frame covariance (3, 3). The path is marginalised out: with weighted Jacobians J by it, of covariance C,
+        residuals e have the covariance R = 1 + J C J', and those along the most likely path are R^-1 e."""
+        covariances = self._covariance
+        if self._start is not None:  # the first row, of which no robust loss takes anything
+            covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
+        rows = np.arange(len(covariances))
+        common = covariances[np.maximum(rows[:, None], rows)]
+        weight = np.ones(len(rows))
+        first = len(rows) - len(self.points)
+        weight[first:] = robust_weight(self.squared(pose[None], whitener)[0], self._model.robust)
+        for _ in range(iterations):
+            root = np.sqrt(np.maximum(weight, 1e-6))
+            jacobian, error = self._jacobians(pose[None])[0], self._residuals(pose[None])[0]
+            if self._start is not None:
+                told, by_pose, _ = self._start.whitened(pose, self.now)
+                jacobian, error = np.concatenate((by_pose[None], jacobian)), np.concatenate((told[None], error))
+            jacobian, error = root[:, None, None] * jacobian, (root[:, None] * error).ravel()
+            drift = np.einsum("iab,ijbc,jdc->iajd", jacobian, common, jacobian, optimize=True)
+            jacobian = jacobian.reshape(-1, 3)
+            solved = np.linalg.solve(np.eye(len(error)) + drift.reshape(len(error), -1), np.c_[jacobian, error])
+            covariance = np.linalg.inv(jacobian.T @ solved[:, :3] + FLAT)
+            step = -covariance @ (jacobian.T @ solved[:, 3])
+            pose = se2.compose(pose, se2.exp(step))
+            on_path = (solved[:, 3] + solved[:, :3] @ step).reshape(-1, 2) / root[:, None]
+            weight[first:] = robust_weight(np.sum(on_path[first:] ** 2, axis=1), self._model.robust)
+        return pose, covariance
+
+    def _recent(self) -> list[int]:
+        """The last sighting of each landmark, the newest first."""
+        last = {tuple(p): k for k, p in enumerate(self.points.tolist())}
+        return sorted(last.values(), reverse=True)[:RECENT]
+
+    def _from_robot(self) -> Array:
+        """The landmarks (K, 2) in the robot's frame when seen; a missing range is taken as medium, a missing bearing as zero."""
+        ranges = np.where(self._missing[:, 0], RADII[2], self._ranges)
+        return located(self._model, ranges, np.where(self._missing[:, 1], 0.0, self._bearings))
+
+    def _from_present(self) -> Array:
+        """The same (K, 2) in the robot's present frame."""
+        return se2.transform_from(self._back, self._from_robot())
+
+    def _residuals(self, poses: Array) -> Array:
+        """Residuals (N, K, 2) in units of the sensor's noise at present poses (N, 3)."""
+        at = se2.compose(poses[:, None], self._back)
+        return residuals(self._model, at, self.points, self._ranges, self._bearings)
+
+    def _jacobians(self, poses: Array) -> Array:
+        """Those of the residuals (N, K, 2, 3) by the present pose's perturbation."""
+        at = se2.compose(poses[:, None], self._back)
+        jacobian = jacobians(self._model, at, self.points)[0] / self._sigmas[..., None]
+        jacobian[:, self._missing] = 0.0
+        return np.asarray(jacobian @ self._carried)
+
+    def _normal_equations(self, poses: Array, whitener: Array, spread: Array | None) -> tuple[Array, Array]:
+        """Robustly weighted information (N, 3, 3), with that of a nearly flat prior or of the start, and gradient (N, 3)."""
+        jacobian = whitener @ self._jacobians(poses)
+        error = (whitener @ self._residuals(poses)[..., None])[..., 0]
+        weight = robust_weight(np.sum(error**2, axis=-1), self._model.robust)
+        weighted = np.swapaxes(weight[..., None, None] * jacobian, -1, -2)
+        information, gradient = np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)
+        if self._start is None:
+            return information, gradient[..., 0]
+        more, by_start = self._start.normal_equations(poses, self.now, spread)
+        return information + more, gradient[..., 0] + by_start

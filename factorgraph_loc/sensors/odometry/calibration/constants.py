@@ -1,0 +1,97 @@
+"""Constants of the wheels' odometry, from the relative motion of the reference over short windows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, loss, spread
+from factorgraph_loc.sensors.odometry.calibration.windows import Windows, odometry_of
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
+from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factors.odometry.model import OdometryModel
+from factors.se2 import Array
+
+WINDOW = 2.0  # s
+BLOCK = 20.0  # s; errors in one block may be correlated
+LAGGING_START = 0.05  # s; at a lag of zero the derivative says nothing
+
+
+# of the reference over a window: m, m, rad; residuals are not trusted to be smaller
+REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
+MIN_STOOD = 5  # windows at rest, below which they have no say
+MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which a window says how large errors are
+
+
+def scatter(windows: Sequence[Windows], model: OdometryModel) -> Array:
+    """Robust standard deviations (3,) of the residuals of windows in which the robot moves: along, lateral [m], heading [rad]."""
+    each = []
+    for one in windows:
+        start, end = one.states(model)
+        moved = (end - start)[:, 4:6] / (end - start)[:, :1]
+        each.append(one.residuals(model)[np.any(moved > MOVING, axis=1)])
+    residuals = np.concatenate(each)
+    return np.asarray(np.maximum(spread(residuals) if len(residuals) else 0.0, REFERENCE_SIGMAS))
+
+
+def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant, ...]:
+    """What may be fitted; neutral are the values of the rig."""
+    found = [
+        Constant("scale_distance", settings.scale_distance, 0.05, 0.2, 5.0),
+        Constant("scale_rotation", settings.scale_rotation, 0.05, 0.2, 5.0),
+        Constant("speed_bias", settings.speed_bias, 0.01, -1.0, 1.0),
+        Constant("heading_rate_bias", settings.heading_rate_bias, 0.005, -1.0, 1.0),
+        Constant("heading_drift", settings.heading_drift, 0.02, -1.0, 1.0),
+        Constant("direction", settings.direction, 0.05, -np.pi, np.pi),
+    ]
+    if isinstance(odometry_of(windows.log), VelocityStream):
+        found += [
+            Constant("delay", settings.delay, 0.1, 0.0, 2.0),
+            Constant("lag", settings.lag, 0.1, 0.0, 5.0),
+            Constant("turn_slowdown", settings.turn_slowdown, 0.05, 0.0, 5.0),
+        ]
+    return tuple(found)
+
+
+def denied_at_rest(found: Fit, windows: Sequence[Windows]) -> tuple[str, ...]:
+    """Names of biases that do not fit the windows in which the robot stood: what is reported at rest is known best there.
+
+    ``found``: of all ``windows`` together. Commands, for instance, are zero at rest, whatever is wrong with them on the way.
+    """
+    stood = np.all(np.abs(np.concatenate([one.motion for one in windows])) < REFERENCE_SIGMAS, axis=1)
+    denied = []
+    for p, c in enumerate(found.constants):
+        if c.name in ("speed_bias", "heading_rate_bias") and np.sum(stood) >= MIN_STOOD:
+            without = found.residuals + found.jacobian[..., p] * (c.neutral - found.values[p])
+            if loss(without[stood]) < loss(found.residuals[stood]):
+                denied.append(c.name)
+    return tuple(denied)
+
+
+def with_constants(model: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
+    """The model with some of its constants changed."""
+    changed: dict[str, Any] = dict(values)
+    return replace(model, **changed)
+
+
+def fit_odometry(
+    windows: Sequence[Windows],
+    model: OdometryModel,
+    constants: Sequence[Constant],
+    sigmas: Array,
+    start: Mapping[str, float],
+) -> Fit:
+    """The ``constants`` of one or several logs together, the others as in ``model``; ``sigmas`` (3,) of the residuals.
+
+    All windows count alike. Weights by the fitted noise would leave the choice to windows in which the robot hardly moves.
+    """
+    names = [c.name for c in constants]
+
+    def whitened(values: Array) -> Array:
+        changed = with_constants(model, dict(zip(names, values.tolist(), strict=True)))
+        return np.concatenate([one.residuals(changed) for one in windows]) / sigmas
+
+    return fit(constants, np.array([start[n] for n in names]), whitened, blocks([w.begin for w in windows], BLOCK))

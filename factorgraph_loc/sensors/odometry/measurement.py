@@ -1,0 +1,32 @@
+"""What wheel odometry and gyro report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityOdometry:
+    """Forward velocity ``v`` [m/s] and turn rate ``w`` [rad/s], held until the next row."""
+
+    t: float
+    v: float
+    w: float
+
+
+@dataclass(frozen=True, slots=True)
+class IncrementOdometry:
+    """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot's frame at the previous row."""
+
+    t: float
+    dx: float
+    dy: float
+    dtheta: float
+
+
+@dataclass(frozen=True, slots=True)
+class YawRate:
+    """Turn rate ``w`` [rad/s] of a gyro, held until the next row."""
+
+    t: float
+    w: float

@@ -1,0 +1,72 @@
+"""Settings of wheel odometry and gyro in the rig."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.units import Angle, Noise, Rate, Scale, Seconds
+from factors.odometry.model import Growth
+
+
+class GrowthSettings(FileModel):
+    """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) passed."""
+
+    per_distance: Noise = 0.0
+    per_rotation: Noise = 0.0
+    per_time: Noise = 0.0
+
+    def model(self) -> Growth:
+        return Growth(self.per_distance, self.per_rotation, self.per_time)
+
+
+class OdometryNoise(FileModel):
+    """How the error grows: along the track [m], across it [m], in heading [rad]. What is not given is that of wheels of which
+    nothing is known, indoors."""
+
+    along: GrowthSettings = GrowthSettings(per_distance=0.05, per_time=0.005)
+    lateral: GrowthSettings = GrowthSettings(per_distance=0.02, per_time=0.005)
+    heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05, per_time=0.002)
+
+
+class OdometryUncertainty(FileModel):
+    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
+
+    Those of the scales are shares of the scale; that of the heading-rate bias is in rad/s, that of the drift in rad/m.
+    """
+
+    scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s")] = 0.0
+    heading_drift: Annotated[float, Field(ge=0.0, le=1.0, description="rad/m")] = 0.0
+
+
+class OdometrySettings(FileModel):
+    """Wheel odometry. See :class:`factors.odometry.model.OdometryModel` for the model."""
+
+    time_offset: Seconds = 0.0
+    scale_distance: Scale = 1.0
+    scale_rotation: Scale = 1.0
+    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
+    heading_rate_bias: Rate = 0.0
+    heading_drift: Annotated[float, Field(ge=-1.0, le=1.0, description="rad/m")] = 0.0
+    direction: Angle = 0.0
+    delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
+    lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
+    turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0, description="m/rad")] = 0.0
+    max_hold: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.5
+    unknown_distance: Noise = 0.2
+    unknown_rotation: Noise = 0.2
+    noise: OdometryNoise = OdometryNoise()
+    uncertainty: OdometryUncertainty = OdometryUncertainty()
+
+
+class ImuSettings(FileModel):
+    """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``, of a rig without
+    these settings with the default ones."""
+
+    time_offset: Seconds = 0.0
+    bias: Rate = 0.0
+    heading: GrowthSettings = GrowthSettings(per_time=0.005)

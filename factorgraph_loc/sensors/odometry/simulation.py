@@ -1,0 +1,67 @@
+"""Wheel odometry made from a reference, for recordings whose own was not kept.
+
+Results with it must say that it was simulated: its errors are those of the model below, not of wheels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factors import se2
+from factors.se2 import Array
+
+RATE = 10.0  # Hz
+SCALE_SIGMA = 0.02  # of distance and of rotation, constant over a run
+DRIFT_SIGMA = math.radians(1.0)  # rad/m, constant over a run
+ALONG, LATERAL = 0.01, 0.005  # m per sqrt(m)
+HEADING = math.radians(1.5)  # rad per sqrt(m)
+
+DESCRIPTION = (
+    "simulated at 10 Hz from increments of the reference: scale errors of distance and rotation 2 %, heading drift 1 deg/m, "
+    "noise per sqrt(m) 0.01 m along, 0.005 m across, 1.5 deg in heading"
+)
+
+
+def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
+    """What wheels might have reported on the way of ``reference``, from its first pose on, which is a row without motion.
+
+    With increments (dx, dy, dyaw) of the reference over 0.1 s, in the body's frame, and ds = length of (dx, dy):
+
+    - dx' = (1 + s) dx + 0.01 sqrt(ds) n1
+    - dy' = (1 + s) dy + 0.005 sqrt(ds) n2
+    - dyaw' = (1 + g) dyaw + b ds + radians(1.5) sqrt(ds) n3
+
+    s, g ~ N(0, 0.02) and b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1). Drawn from ``default_rng(seed)`` in the
+    order s, b, g, then n1 and n2 of each row, then n3 of each row. There are no rows inside gaps of the reference of more than
+    60 s: the one behind such a gap has its whole way.
+    """
+    t = _grid(reference.t)
+    count = len(t) - 1
+    poses = reference.at(np.minimum(t, reference.t[-1]))
+    dx, dy, dyaw = se2.between(poses[:-1], poses[1:]).T
+    rng = np.random.default_rng(seed)
+    s, b, g = rng.normal(0.0, (SCALE_SIGMA, DRIFT_SIGMA, SCALE_SIGMA))
+    n1, n2 = rng.standard_normal((count, 2)).T
+    n3 = rng.standard_normal(count)
+    ds = np.hypot(dx, dy)
+    root = np.sqrt(ds)
+    rows = np.zeros((count + 1, 3))
+    rows[1:, 0] = (1.0 + s) * dx + ALONG * root * n1
+    rows[1:, 1] = (1.0 + s) * dy + LATERAL * root * n2
+    rows[1:, 2] = (1.0 + g) * dyaw + b * ds + HEADING * root * n3
+    return IncrementStream(t, *np.ascontiguousarray(rows.T))
+
+
+def _grid(stamps: Array) -> Array:
+    """Times (N,) at 10 Hz from the first of ``stamps`` on; those inside long gaps are left out, as a clock may jump by days."""
+    long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
+    begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
+    first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)
+    last = np.floor((ends - stamps[0]) * RATE + 1e-6).astype(int)
+    steps = [np.arange(i, j + 1) for i, j in zip(first, last, strict=True)]
+    return np.asarray(stamps[0] + np.concatenate(steps) / RATE)

@@ -1,0 +1,108 @@
+"""Pictures of a learnt model of detection: how reliable its probabilities are, and its field around the antenna."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.drawing.figures import COLOURS
+from factorgraph_loc.drawing.panels import axes_of, legend, name_axes, png
+from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
+from factors.rfid.model import probability
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+
+BINS = 12
+VIEW = 6.0  # m around the antenna
+_STEP = 0.1  # m
+_Z = 1.96  # of the 95 % interval
+
+
+def reliability_figure(found: RfidKnowledge) -> bytes:
+    """Held-out probabilities against how often tags were read then, and how many reads each probability stands for."""
+    figure, axes = axes_of(1, 2)
+    predicted, observed, low, high, count = reliability(found)
+    panel, amounts = axes[0]
+    panel.plot((0.0, 1.0), (0.0, 1.0), color="0.3", linestyle="--", label="ideal")
+    panel.errorbar(
+        predicted,
+        observed,
+        yerr=(observed - low, high - observed),
+        fmt=".-",
+        color=COLOURS[0],
+        capsize=3,
+        label="held-out reads, Wilson's 95 % interval",
+    )
+    name_axes(panel, "predicted probability of a read", "share of rounds with a read")
+    amounts.bar(predicted, count, width=0.7 / BINS, color=COLOURS[0])
+    amounts.set_yscale("log")
+    name_axes(amounts, "predicted probability of a read", "rounds times tags")
+    legend(figure, axes.flat)
+    return png(figure)
+
+
+def field_figure(found: RfidKnowledge) -> bytes:
+    """The probability of a read around the antenna: as seen, on the left, and by each model for tags that face it or not."""
+    facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in found.models) else (0.0,)
+    figure, axes = axes_of(len(found.models), 1 + len(facings), height=4.2)
+    axis = np.arange(-VIEW, VIEW + 1e-9, _STEP)
+    image = None
+    for row, model in enumerate(found.models):
+        mine = np.asarray(found.which)[found.pairs.antenna] == row
+        owners = ", ".join(a for a, w in zip(found.antennas, found.which, strict=True) if w == row)
+        heights = found.pairs.points[mine, 2]
+        z = float(np.median(heights)) if len(heights) else 0.0
+        image = _draw(axes[row, 0], axis, _observed(found, mine, axis))
+        axes[row, 0].set_title(f"share of rounds with a read ({owners})")
+        x, y = np.meshgrid(axis, axis, indexing="ij")
+        points = np.column_stack((x.ravel(), y.ravel(), np.full(x.size, z)))
+        for panel, facing in zip(axes[row, 1:], facings, strict=True):
+            image = _draw(panel, axis, probability(model, points, facing).reshape(x.shape))
+            panel.set_title(f"model, tag {z:+.1f} m high" + (f", facing {facing:+.0f}" if len(facings) > 1 else ""))
+    if image is not None:
+        figure.colorbar(image, ax=axes.ravel().tolist(), label="probability of a read in a round")
+    return png(figure)
+
+
+def reliability(found: RfidKnowledge) -> tuple[Array, Array, Array, Array, Array]:
+    """Mean prediction, share read, Wilson's interval (low, high) and rounds, of each bin of probability that has any."""
+    q, pairs = found.choice.best.predicted, found.pairs
+    bins = np.minimum((q * BINS).astype(np.int64), BINS - 1)
+    count, weighted, hits = (
+        np.bincount(bins, values, BINS).astype(float) for values in (pairs.count, pairs.count * q, pairs.hits)
+    )
+    used = count > 0.0
+    n: Array = count[used]
+    mean, share = weighted[used] / n, hits[used] / n
+    low, high = wilson(share, n)
+    return mean, share, low, high, n
+
+
+def wilson(share: Array, count: Array) -> tuple[Array, Array]:
+    """The 95 % interval of a probability of which ``share`` of ``count`` trials was seen (Wilson, JASA 22, 1927)."""
+    middle = (share + _Z**2 / (2.0 * count)) / (1.0 + _Z**2 / count)
+    half = _Z / (1.0 + _Z**2 / count) * np.sqrt(share * (1.0 - share) / count + _Z**2 / (4.0 * count**2))
+    return middle - half, middle + half
+
+
+def _observed(found: RfidKnowledge, mine: NDArray[np.bool_], axis: Array) -> Array:
+    """Share of rounds in which a tag at each place was read; NaN where there was none."""
+    edges = np.append(axis - 0.5 * _STEP, axis[-1] + 0.5 * _STEP)
+    x, y, _ = found.pairs.points[mine].T
+    bins = [edges, edges]
+    count = np.histogram2d(x, y, bins, weights=found.pairs.count[mine])[0]
+    hits = np.histogram2d(x, y, bins, weights=found.pairs.hits[mine])[0]
+    return np.asarray(np.where(count > 0.0, hits / np.maximum(count, 1e-9), np.nan))
+
+
+def _draw(panel: Axes, axis: Array, values: Array) -> QuadMesh:
+    image = panel.pcolormesh(axis, axis, values.T, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
+    panel.plot(0.0, 0.0, ">", color=COLOURS[1], markersize=9)
+    panel.set_aspect("equal")
+    name_axes(panel, "x, along the boresight [m]", "y, to the left [m]")
+    return image

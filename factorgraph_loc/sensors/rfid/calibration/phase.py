@@ -1,0 +1,171 @@
+"""Survey and antenna mounting from the phase of reads, which only a right geometry brings into focus.
+
+Along a reference trajectory the phases of one tag's reads within a short window agree, once twice the way of the carrier is taken
+away (:mod:`factors.rfid.phase`). How well they agree over a whole log says where the survey's frame lies in the world (shift,
+heading), and by how much the antennas sit elsewhere on the robot than the rig has it: a map that is focused, as in synthetic
+aperture radar. An error that all reads of a window share defocuses it but slowly, so a coarse grid finds the hill.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.text import listed
+from factors import se2
+from factors.rfid.detection import TagArray
+from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
+from factors.se2 import Array
+
+Rows = NDArray[np.int64]
+
+WINDOW = 2.0  # s
+MAX_GAP = 0.1  # s, of the reference around a read
+ENOUGH_READS = 1000
+SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m, of the coarse search
+HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad
+THINNING = 6  # of the windows, in the coarse search
+BLOCKS = 8  # of the windows, each left out once for the spread
+
+
+@dataclass(frozen=True)
+class PhaseFit:
+    """``survey``: where the survey's frame lies in the world; ``lever_arm`` (2,): to be added to x and y [m] of every antenna;
+    ``spread`` (5,): standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m];
+    ``before`` and ``after``: how well the phases agree, as mean resultant lengths (0 to 1); ``reads``: how many were used.
+
+    The gain in untempered log-likelihood a read is kappa times ``after - before``.
+    """
+
+    survey: SurveySettings
+    lever_arm: tuple[float, float]
+    spread: Array
+    before: float
+    after: float
+    reads: int
+
+
+def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
+    """Survey and lever arm by focusing the phases of all ``logs``, of one world; ``survey``: where the search starts.
+
+    The survey is turned about the middle of the tags. The spread is the jackknife's over blocks of time, which bears reads that
+    go together. InputError if a log has no reference, or the logs hold too few reads with a phase that are near their tags.
+    """
+    start = survey or SurveySettings()
+    focus = _Focus.of(logs, rfid)
+    origin = np.array((*se2.transform_from(start.transform(), focus.pivot) - focus.pivot, start.heading, 0.0, 0.0))
+    coarse = focus.near(origin)
+    if coarse.count < ENOUGH_READS:
+        names = listed(log.name for log in logs)
+        expected = f"expected at least {ENOUGH_READS} within {focus.model.max_range:g} m of their tags"
+        raise InputError(f"{names}: hold {coarse.count} reads with a phase, {expected}")
+    # reads of a wrong survey are near others than the true ones
+    fine = focus.near(coarse.climb(coarse.coarse(origin)))
+    found = fine.climb(coarse.coarse(origin))
+    parts = np.array([fine.without(block).climb(found) for block in range(BLOCKS)])
+    spread = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean(axis=0)) ** 2, axis=0))
+    lever_arm = (float(found[3]), float(found[4]))
+    return PhaseFit(fine.survey(found), lever_arm, spread, fine.agreement(origin), fine.agreement(found), fine.count)
+
+
+@dataclass(frozen=True)
+class _Focus:
+    """Reads along references, placed around the world's origin. States (5,): x, y, heading of the survey, lever arm x, y."""
+
+    reads: PhaseReads
+    model: PhaseModel
+    tags: TagArray  # as they were surveyed
+    pivot: Array
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], rfid: RfidSettings) -> _Focus:
+        tags = tag_map(logs[0].world, SurveySettings())
+        names = {name: i for i, name in enumerate(rfid.all_antennas())}
+        parts: list[PhaseReads] = []
+        first_window = 0
+        for log in logs:
+            parts.append(_reads_of(log, tags.index, names, first_window))
+            first_window = 1 + int(parts[-1].windows.max(initial=first_window))
+        reads = PhaseReads(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PhaseReads)))
+        model = PhaseModel(rfid.model().antennas, kappa=1.0, tempering=1.0)
+        return cls(reads, model, tags.tags, tags.tags.points[:, :2].mean(axis=0))
+
+    @property
+    def count(self) -> int:
+        return len(self.reads.tags)
+
+    def survey(self, state: Array) -> SurveySettings:
+        x, y, heading, px, py = map(float, (*state[:3], *self.pivot))
+        return SurveySettings.bounded(x=x, y=y, heading=heading, about_x=px, about_y=py)
+
+    def near(self, state: Array) -> _Focus:
+        """The reads that are near their tags, and many enough in their windows."""
+        return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
+
+    def without(self, block: int) -> _Focus:
+        """All but one of the blocks of windows."""
+        edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
+        inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
+        return replace(self, reads=self.reads.chosen(~inside))
+
+    def agreement(self, state: Array) -> float:
+        """Mean resultant length of the phases (0 to 1)."""
+        return 1.0 + float(self._likelihood(state).log_likelihood(self._pose(state)[None], self.reads)[0]) / self.count
+
+    def coarse(self, origin: Array) -> Array:
+        """The best survey around ``origin`` on a grid, by some of the windows."""
+        some = replace(self, reads=self.reads.chosen(self.reads.windows % THINNING == 0))
+        states = [origin + np.array((x, y, h, 0.0, 0.0)) for x, y, h in itertools.product(SHIFTS, SHIFTS, HEADINGS)]
+        return max(states, key=some.agreement)
+
+    def climb(self, state: Array) -> Array:
+        """The top of the hill that ``state`` lies on."""
+        # steps in metres at the end of a lever of a few metres, so that all five weigh alike
+        unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
+        result = minimize(lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4})
+        return np.asarray(result.x * unit)
+
+    def _pose(self, state: Array) -> Array:
+        """Of the world in the survey's frame: there the tags are where they were surveyed."""
+        return se2.inverse(self.survey(state).transform())
+
+    def _likelihood(self, state: Array) -> PhaseLikelihood:
+        x, y = map(float, state[3:])
+        antennas = tuple(replace(a, x=a.x + x, y=a.y + y) for a in self.model.antennas)
+        return PhaseLikelihood(replace(self.model, antennas=antennas), self.tags)
+
+
+def along_reference(
+    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
+) -> tuple[RfidStream, Rows, Array, Array, Rows, Rows]:
+    """The reads of known tags by known antennas where the reference tells the pose: the stream, R of its rows, times (R,) [s],
+    poses (R, 3) of the robot, and places (R,) of antennas and tags. InputError if the log has no reference or no reads."""
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference trajectory, expected one to calibrate with")
+    stream = log.streams.get("rfid")
+    if not isinstance(stream, RfidStream):
+        raise InputError(f"{log.name}: has no RFID reads, expected a log of them")
+    t = stream.t - stream.age + log.rig.time_offset("rfid")
+    tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
+    antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)
+    poses = log.reference.at(t, max_gap=MAX_GAP)
+    rows = np.flatnonzero((tag >= 0) & (antenna >= 0) & np.isfinite(poses[:, 0]))
+    return stream, rows, t[rows], poses[rows], antenna[rows], tag[rows]
+
+
+def _reads_of(log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], first_window: int) -> PhaseReads:
+    """The reads with a phase, in windows numbered from ``first_window``."""
+    stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
+    windows = first_window + np.floor((t - t.min(initial=np.inf)) / WINDOW).astype(np.int64)
+    reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)
+    return reads.chosen(np.isfinite(reads.phase) & np.isfinite(reads.frequency))

@@ -1,0 +1,101 @@
+"""What a calibration tells about RFID, as tables and plain values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
+
+Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
+
+
+def offsets_table(found: RfidKnowledge) -> Rows:
+    """Survey and mounting: what is changed of the input rig."""
+    header = ("survey and mounting", "change", "standard error", "why")
+    rows: list[tuple[str, ...]] = [
+        (
+            f"{o.what}.{o.name} [{'rad' if o.name in ('heading', 'yaw') else 'm'}]",
+            f"{o.change:.4f}",
+            f"{o.error:.4f}",
+            o.why,
+        )
+        for o in found.offsets
+    ]
+    return header, rows
+
+
+def models_table(found: RfidKnowledge, *, accepted: bool) -> Rows:
+    """The ways to model detection, by what they are worth on reads that had no part in the fit. ``accepted``: whether the rig has
+    the best."""
+    header = ("model of detection", "smoothness", "held-out nats a round and tag", "worst fold", "")
+    rows: list[tuple[str, ...]] = [
+        (
+            t.kind.label(),
+            f"{t.kind.smoothness:g}" if t.kind.smoothness else "-",
+            f"{t.nll:.4f}",
+            f"{max(t.by_fold):.4f}",
+            "" if t is not found.choice.best else "in the rig" if accepted else "refused",
+        )
+        for t in found.choice.trials
+    ]
+    return header, rows
+
+
+def tags_table(found: RfidKnowledge) -> Rows:
+    """Tags that seem to be elsewhere."""
+    header = ("tag", "distance [m]", "x [m]", "y [m]", "chance in a right map")
+    rows: list[tuple[str, ...]] = [
+        (d.name, f"{d.distance:.2f}", f"{d.shift[0]:.2f}", f"{d.shift[1]:.2f}", f"{d.p:.1g}") for d in found.doubts
+    ]
+    return header, rows
+
+
+def tempering_text(found: RfidKnowledge, rig: Rig) -> str:
+    """How much reads go together, in two sentences."""
+    assert rig.rfid is not None
+    return (
+        f"By their scatter along the reference, {1.0 / found.share:.0f} reads in a row tell as much as one that stands alone. "
+        f"The smoother is not too sure of itself with a tempering of {rig.rfid.tempering:.3g}, which the rig has."
+    )
+
+
+def dead_text(found: RfidKnowledge) -> str:
+    """How many tags are dead, in a sentence."""
+    return (
+        f"Of the tags of the maps {100.0 * found.dead.share:.1f} % are taken for dead before anything is heard of them; "
+        f"{len(found.dead.tags)} were never read, of which {len(found.dead.believed)} should have been."
+    )
+
+
+def rfid_document(found: RfidKnowledge, *, accepted: bool) -> dict[str, Any]:
+    """The same as plain values; ``accepted``: see :func:`models_table`."""
+    return {
+        "offsets": [
+            {
+                "what": o.what,
+                "name": o.name,
+                "change": o.change,
+                "standard_error": o.error,
+                "kept": o.kept,
+                "why": o.why,
+            }
+            for o in found.offsets
+        ],
+        "models": [
+            {
+                "model": t.kind.label(),
+                "smoothness": t.kind.smoothness,
+                "held_out_nll": t.nll,
+                "by_fold": list(t.by_fold),
+                "kept": accepted and t is found.choice.best,
+            }
+            for t in found.choice.trials
+        ],
+        "phase_agreement": None if found.phase is None else [found.phase.before, found.phase.after],
+        "independent_share": found.share,
+        "misplaced_tags": [{"tag": d.name, "x": d.shift[0], "y": d.shift[1], "p": d.p} for d in found.doubts],
+        "silent_tags": list(found.dead.tags),
+        "dead_share": found.dead.share,
+        "dead_tags": dict(found.dead.tags),
+    }

@@ -1,0 +1,98 @@
+"""How strong reads are received, learnt from logs with a reference: see :mod:`factors.rfid.strength`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import gammaln
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.calibration.phase import along_reference
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, RssiSettings, SurveySettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.text import listed
+from factors.rfid.strength import FEATURES, RssiReads, features
+from factors.se2 import Array
+
+ENOUGH_READS = 200
+ITERATIONS = 30
+DOF = (1.0, 100.0)
+
+
+@dataclass(frozen=True)
+class RssiFit:
+    """``settings``: the model; ``nll``: mean negative log-likelihood a read; ``nll_constant``: that of a model which knows neither
+    distance nor direction; ``reads``: how many there were."""
+
+    settings: RssiSettings
+    nll: float
+    nll_constant: float
+    reads: int
+
+
+def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiFit:
+    """The RSSI of all ``logs`` by maximum likelihood. InputError if a log has no reference, or too few reads have an RSSI.
+
+    Only reads are seen, not those too weak to be heard, so the path loss comes out flatter than in free space.
+    """
+    x, y = _table(logs, rfid, survey)
+    if len(y) < ENOUGH_READS:
+        names = listed(log.name for log in logs)
+        raise InputError(f"{names}: hold {len(y)} reads with an RSSI, expected at least {ENOUGH_READS}")
+    coefficients, sigma, dof = _fit(x, y)
+    _, sigma_0, dof_0 = flat = _fit(x[:, :1], y)
+    settings = RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
+    constant = _nll(y - x[:, :1] @ flat[0], sigma_0, dof_0)
+    return RssiFit(settings, _nll(y - x @ coefficients, sigma, dof), constant, len(y))
+
+
+def rssi_nll(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings, settings: RssiSettings) -> float:
+    """Mean untempered negative log-likelihood a read, of ``logs`` that may be others than those it was learnt from."""
+    x, y = _table(logs, rfid, survey)
+    return _nll(y - x @ np.array(settings.coefficients), settings.sigma, settings.dof)
+
+
+def _table(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> tuple[Array, Array]:
+    """Features (R, 6) and RSSI (R,) of the reads of all logs."""
+    names = {name: i for i, name in enumerate(rfid.all_antennas())}
+    tables: list[Array] = []
+    values: list[Array] = []
+    for log in logs:
+        tags = tag_map(log.world, survey)
+        stream, rows, _, poses, antenna, tag = along_reference(log, tags.index, names)
+        heard = np.isfinite(stream.rssi[rows])
+        reads = RssiReads(poses[heard], antenna[heard], tag[heard], stream.rssi[rows][heard])
+        tables.append(features(rfid.model().antennas, tags.tags, np.zeros(3), reads))
+        values.append(reads.rssi)
+    return np.concatenate(tables).reshape(-1, len(FEATURES)), np.concatenate(values)
+
+
+def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
+    """Coefficients, sigma and degrees of freedom, by conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
+    dof = 5.0
+    weights = np.ones(len(y))
+    for _ in range(ITERATIONS):
+        root = np.sqrt(weights)
+        coefficients: Array = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0].astype(float)
+        residuals = y - x @ coefficients
+        sigma = math.sqrt(np.mean(weights * residuals**2))
+        dof = _dof(residuals, sigma)
+        weights = (dof + 1.0) / (dof + (residuals / sigma) ** 2)
+    return coefficients, sigma, dof
+
+
+def _dof(residuals: Array, sigma: float) -> float:
+    """The most likely degrees of freedom."""
+    found = minimize_scalar(lambda v: _nll(residuals, sigma, math.exp(v)), bounds=np.log(DOF), method="bounded")
+    return math.exp(found.x)
+
+
+def _nll(residuals: Array, sigma: float, dof: float) -> float:
+    """Mean negative logarithm of Student's density."""
+    scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi) + math.log(sigma)
+    return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p((residuals / sigma) ** 2 / dof)))

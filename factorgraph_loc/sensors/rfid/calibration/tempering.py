@@ -1,0 +1,59 @@
+"""How much reads that follow each other go together: the first guess of the tempering, before an estimator runs.
+
+Were reads independent, the gradient of their log-likelihood by the pose would have Fisher's information as its covariance. Over
+windows of time it has more: by so much the likelihood is too sure (Varin, Reid and Firth, "An overview of composite likelihood
+methods", Statistica Sinica 21, 2011, section 2.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.calibration.fit import Floor
+from factorgraph_loc.sensors.rfid.calibration.pairs import modelled, nearby, pairs_of, terms
+from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
+from factors import se2
+from factors.rfid.model import DetectionModel
+
+WINDOW = 10.0  # s
+LEAST = 1e-3  # of the tempering
+_STEP = 1e-4  # m, rad, of numerical derivatives
+
+
+def tempered(rig: Rig, factor: float) -> Rig:
+    """The rig whose RFID weighs as if standard deviations were ``factor`` times those of independent reads, at least 1."""
+    assert rig.rfid is not None
+    tempering = min(1.0, max(factor**-2.0, LEAST))
+    return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"tempering": tempering})})
+
+
+def independent_share(
+    logs: Sequence[Rounds],
+    settings: RfidSettings,
+    survey: SurveySettings,
+    models: Sequence[DetectionModel],
+    which: Sequence[int],
+    floor: Floor,
+) -> float:
+    """The exponent, at most 1, with which the likelihood of rounds, not merged, is as sure as their scatter along the reference."""
+    outer, information = np.zeros((3, 3)), np.zeros((3, 3))
+    for log in logs:
+        within = [nearby(log, settings, survey)]
+        pairs = pairs_of([log], settings, survey, within)
+        here = modelled(models, which, pairs)
+        moved = [replace(log, poses=se2.compose(log.poses, e)) for e in _STEP * np.eye(3)]
+        jacobian = np.column_stack(
+            [(modelled(models, which, pairs_of([one], settings, survey, within)) - here) / _STEP for one in moved]
+        )
+        found = terms(here, pairs.hits, pairs.count, floor.false_read, floor.miss)
+        window = ((log.t - log.t.min()) // WINDOW).astype(np.int64)[within[0] // len(log.names)]
+        scores = np.zeros((int(window.max()) + 1, 3))
+        np.add.at(scores, window, found.gradient[:, None] * jacobian)
+        outer += scores.T @ scores
+        information += jacobian.T @ (found.information[:, None] * jacobian)
+    return float(np.clip(3.0 / np.trace(np.linalg.solve(information, outer)), LEAST, 1.0))

@@ -1,0 +1,57 @@
+"""Learnt detection grids on disk: ``.npz`` without pickles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.bounded import GRID
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.npz import read_npz
+from factors.rfid.model import GridModel
+
+FARTHEST = 1000.0  # m from the antenna
+FINEST = 1e-3  # m from knot to knot
+LARGEST = 20.0  # of a logit: beyond it a probability is 0 or 1 to nine digits, and nothing could ever move it
+
+
+def read_grid(path: str | Path) -> GridModel:
+    """Read a grid; logits that are infinite (a probability of exactly 0 or 1) are taken as very large ones.
+
+    InputError names what is missing or has a wrong shape.
+    """
+    found = {name: np.asarray(values, dtype=float) for name, values in read_npz(Path(path), GRID).items()}
+    for name in ("logits", "origin", "cell", "heights"):
+        if name not in found:
+            raise InputError(f"{path}: {name} is missing, expected logits, origin, cell, heights")
+    logits, origin, heights = found["logits"], found["origin"], np.atleast_1d(found["heights"])
+    if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
+        raise bad_field(path, "logits", f"an array of shape {logits.shape}", "(heights, facings, x, y)")
+    cell = found["cell"]
+    if origin.shape != (2,) or not np.all(np.abs(origin) <= FARTHEST):
+        raise bad_field(path, "origin", origin.tolist(), f"two numbers in {-FARTHEST:g} to {FARTHEST:g} m")
+    if cell.size != 1 or not FINEST <= cell.item() <= FARTHEST:
+        raise bad_field(path, "cell", cell.tolist(), f"{FINEST:g} to {FARTHEST:g} m")
+    if heights.ndim != 1 or not np.all(np.abs(heights) <= FARTHEST):
+        raise bad_field(path, "heights", heights.tolist(), f"numbers in {-FARTHEST:g} to {FARTHEST:g} m")
+    steps = np.diff(heights)
+    if len(steps) and not (np.all(steps >= FINEST) and np.allclose(steps, steps[0])):
+        raise bad_field(path, "heights", heights.tolist(), f"even steps upwards of {FINEST:g} m or more")
+    if np.any(np.isnan(logits)):
+        raise bad_field(path, "logits", "NaN", "numbers")
+    bounded = np.clip(logits, -LARGEST, LARGEST)
+    return GridModel(bounded, float(origin[0]), float(origin[1]), float(cell.item()), heights)
+
+
+def write_grid(grid: GridModel, path: str | Path) -> None:
+    """Write a grid at once or not at all."""
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            logits=grid.logits,
+            origin=np.array((grid.x0, grid.y0)),
+            cell=np.array(grid.cell),
+            heights=grid.heights,
+        )

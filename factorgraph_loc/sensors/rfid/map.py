@@ -1,0 +1,85 @@
+"""RFID tags of the map, and their tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from factorgraph_loc.errors import bad_field
+from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
+from factorgraph_loc.files.columns import TAGS
+from factorgraph_loc.files.csv_cells import read_cells
+from factorgraph_loc.files.models import Coordinate, FileModel, parse_model, write_text
+from factorgraph_loc.model.survey import Covariance
+from factors.se2 import Array
+
+TAGS_SUFFIX = ".tags.csv"
+TAG_COLUMNS = ("epc", "x", "y", "z", "facing")
+TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
+
+
+class Tag(FileModel):
+    """An RFID tag: position [m] as it was surveyed, and the direction that it faces [rad], None where that is not known.
+
+    ``sigma``: standard deviation of its survey in x and y [m]; ``covariance``: (xx, xy, yy) [m^2] in place of it, as of a
+    :class:`Landmark`.
+    """
+
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate = 0.0
+    facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")] | None = None
+    sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: Covariance | None = None
+
+
+class TagsFile(ColumnMapping):
+    """A table of tags as another program wrote it, with the columns epc, x, y and perhaps z, facing, sigma. ``epc_case``: in which
+    letters EPCs are compared with the reads."""
+
+    epc_case: EpcCase = "as written"
+
+
+def read_tags(path: Path) -> dict[str, Tag]:
+    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and, if they are known, sigma; a facing may be empty.
+
+    InputError names file, row and field of what is wrong. An EPC that stands there twice is an error: no estimator could tell which
+    of the two it hears, and only who surveyed them can.
+    """
+    cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
+    return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name, TAGS[name]) for name in shape[1:]})
+
+
+def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
+    """Read a table of another program; what is wrong with it is an InputError as of :func:`read_tags`."""
+    mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
+    numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.fields if name != "epc"}
+    return _tags(path, mapped.cells.rows, in_case(mapped.texts("epc"), mapping.epc_case), numbers)
+
+
+def _tags(path: Path, rows: Sequence[int], epcs: Sequence[str], numbers: Mapping[str, Array]) -> dict[str, Tag]:
+    tags: dict[str, Tag] = {}
+    found: dict[str, int] = {}
+    for i, (row, epc) in enumerate(zip(rows, epcs, strict=True)):
+        if not epc or epc in tags:
+            expected = f"another EPC than in row {found[epc]}" if epc else "the EPC of a tag"
+            raise bad_field(path, "epc", epc, expected, row=row)
+        values = {name: float(column[i]) for name, column in numbers.items() if not math.isnan(column[i])}
+        tags[epc] = parse_model(Tag, values, f"{path}:{row}")
+        found[epc] = row
+    return tags
+
+
+def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(TAG_COLUMNS_WITH_SIGMA)
+    # csv writes a float with all its digits, and None as an empty cell
+    rows.writerows((epc, tag.x, tag.y, tag.z, tag.facing, tag.sigma) for epc, tag in tags.items())
+    write_text(path, text.getvalue())

@@ -1,0 +1,211 @@
+"""What a rig says of its RFID antennas: where they sit, what they read, and the errors of the tags' survey.
+
+See :mod:`factors.rfid.model` for the models. Grids that were learnt lie as ``.npz`` beside the rig's file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, PrivateAttr, model_validator
+
+from factorgraph_loc.files.models import Coordinate, FileModel, inside
+from factorgraph_loc.sensors.rfid.grids import read_grid
+from factorgraph_loc.text import listed, quoted
+from factors import se2
+from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
+from factors.rfid.phase import PhaseModel
+from factors.rfid.strength import RssiModel
+from factors.se2 import Array
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
+Share = Annotated[float, Field(ge=0.0, lt=0.5)]
+
+
+class BeamSettings(FileModel):
+    """See :class:`factors.rfid.model.BeamModel`."""
+
+    kind: Literal["beam"] = "beam"
+    p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
+    r_max: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 4.5
+    s_r: Annotated[float, Field(ge=1e-3, le=10.0, description="m")] = 0.3
+    sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0, description="rad, not degrees")] = 0.698
+
+    def model(self) -> DetectionModel:
+        return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi)
+
+
+class LogisticSettings(FileModel):
+    """See :class:`factors.rfid.model.LogisticModel`; ``coefficients`` in the order of ``factors.rfid.model.FEATURES``."""
+
+    kind: Literal["logistic"] = "logistic"
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=11, max_length=11)]
+
+    def model(self) -> DetectionModel:
+        return LogisticModel(self.coefficients)
+
+
+class GridSettings(FileModel):
+    """A learnt field of detection probability: the name of an ``.npz`` in the folder of the rig's file."""
+
+    kind: Literal["grid"] = "grid"
+    file: str
+    _folder: Path = PrivateAttr(default=Path())
+
+    def model(self) -> GridModel:
+        """Read the grid; InputError names what is wrong with the file."""
+        return read_grid(self.path())
+
+    def path(self) -> Path:
+        return inside(self._folder, self.file, "grid")
+
+    def placed(self, folder: Path) -> GridSettings:
+        """The same, of a rig whose file is in ``folder``."""
+        out = self.model_copy()
+        out._folder = folder
+        return out
+
+
+ModelSettings = Annotated[BeamSettings | LogisticSettings | GridSettings, Field(discriminator="kind")]
+
+
+class AntennaSettings(FileModel):
+    """One antenna: place and boresight in the robot's frame (``pitch``: upwards), and the name of its model."""
+
+    x: Offset = 0.0
+    y: Offset = 0.0
+    z: Offset = 0.0
+    yaw: Angle = 0.0
+    pitch: Annotated[float, Field(ge=-1.6, le=1.6, description="rad, not degrees")] = 0.0
+    model: str = "default"
+
+
+class RssiSettings(FileModel):
+    """See :class:`factors.rfid.strength.RssiModel`; ``coefficients`` in the order of ``factors.rfid.strength.FEATURES``."""
+
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
+    sigma: Annotated[float, Field(ge=0.01, le=30.0, description="dB")]
+    dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of Student's density")]
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
+
+    def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
+        """The model for antennas at these places."""
+        return RssiModel(antennas, self.coefficients, self.sigma, self.dof, self.tempering)
+
+
+class PhaseSettings(FileModel):
+    """See :class:`factors.rfid.phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]: a read counts in several of
+    them, in each by the share of ``step`` in ``window``."""
+
+    kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
+    max_range: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 1.5
+    min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
+    window: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 2.0
+    step: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.0
+
+    @model_validator(mode="after")
+    def _has_no_gaps(self) -> PhaseSettings:
+        if self.step > self.window * (1.0 + 1e-9):
+            raise ValueError(f"step {self.step:g} s leaves gaps between windows, expected at most {self.window:g} s")
+        return self
+
+    def model(self, antennas: tuple[Antenna, ...]) -> PhaseModel:
+        """The model for antennas at these places, of one window."""
+        return PhaseModel(
+            antennas, self.kappa, self.tempering * self.step / self.window, self.max_range, self.min_reads
+        )
+
+
+RACKHAM_RADIUS = 0.25  # m
+
+
+def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
+    """Eight antennas around the body, as on the robot of the paper, at a height ``z`` [m]."""
+    out = {}
+    for i in range(8):
+        yaw = se2.wrap_scalar(i * math.pi / 4.0)
+        out[str(i + 1)] = AntennaSettings(
+            x=round(RACKHAM_RADIUS * math.cos(yaw), 6), y=round(RACKHAM_RADIUS * math.sin(yaw), 6), z=z, yaw=yaw
+        )
+    return out
+
+
+def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings]:
+    """The model of antennas that nothing was learnt of."""
+    return {"default": BeamSettings()}
+
+
+class RfidSettings(FileModel):
+    """The RFID reader. ``antennas`` by the name that reads give, or a ``preset`` of them at the height ``preset_z``.
+
+    ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
+    below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where
+    the log does not tell the rounds. ``dead_tags``: the share of a map's tags that are broken, hidden or gone, before anything is
+    heard of them. The default is a guess for an installation that is kept in order; ``fgloc calibrate`` learns it. ``rssi``,
+    ``phase``: what is made of them, where an estimator is given these sensors.
+    """
+
+    time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
+    preset: Literal["rackham"] | None = None
+    preset_z: Offset = 1.0
+    antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
+    models: dict[str, ModelSettings] = Field(default_factory=default_models)
+    false_read: Share = 1e-3
+    miss: Share = 0.0
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 1.0
+    round_gap: Annotated[float, Field(ge=1e-4, le=10.0, description="s")] = 0.05
+    dead_tags: Share = 0.03
+    rssi: RssiSettings | None = None
+    phase: PhaseSettings | None = None
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> RfidSettings:
+        if (self.preset is None) == (not self.antennas):
+            raise ValueError("expected either antennas or a preset of them")
+        for name, antenna in self.all_antennas().items():
+            if antenna.model not in self.models:
+                raise ValueError(
+                    f"antenna {name} has the model {quoted(antenna.model)}, expected one of {listed(self.models)}"
+                )
+        return self
+
+    def all_antennas(self) -> Mapping[str, AntennaSettings]:
+        return self.antennas if self.preset is None else rackham(self.preset_z)
+
+    def model(self) -> RfidModel:
+        """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""
+        names = list(self.models)
+        return RfidModel(
+            antennas=tuple(
+                Antenna(a.x, a.y, a.z, a.yaw, a.pitch, names.index(a.model)) for a in self.all_antennas().values()
+            ),
+            models=tuple(settings.model() for settings in self.models.values()),
+            false_read=self.false_read,
+            miss=self.miss,
+            tempering=self.tempering,
+        )
+
+
+class SurveySettings(FileModel):
+    """The frame in which the tags were surveyed, as it lies in the world: they are turned by ``heading`` about the point
+    (``about_x``, ``about_y``) of the survey, then shifted by ``x`` and ``y``."""
+
+    x: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
+    y: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
+    heading: Angle = 0.0
+    about_x: Coordinate = 0.0
+    about_y: Coordinate = 0.0
+
+    def transform(self) -> Array:
+        """The same as a pose (3,) of the survey's origin in the world."""
+        pivot = np.array((self.about_x, self.about_y))
+        turned = se2.transform_from(np.array((0.0, 0.0, self.heading)), pivot)
+        origin = pivot + np.array((self.x, self.y)) - turned
+        return np.array((origin[0], origin[1], self.heading))

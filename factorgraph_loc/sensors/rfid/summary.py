@@ -1,0 +1,135 @@
+"""What the reads of RFID tags in a log hold, and what looks wrong with them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+
+STOPPED = 10.0  # s: an antenna that is silent for longer before the end has stopped
+CLOCK_STEP = 1.0  # s
+SHOWN = 5  # names in a line
+
+
+@dataclass(frozen=True)
+class AntennaSummary:
+    """One antenna: its reads and rounds, rounds per second from the first to the last, rounds without a read, and the last
+    stamps [s] of a round and of a read (None without)."""
+
+    reads: int
+    rounds: int
+    rate: float
+    silent: int
+    last: float
+    last_read: float | None
+
+
+@dataclass(frozen=True)
+class RfidSummary:
+    """All reads. ``known``: how many tags of the map are read; ``unread``: those that never are; ``unknown``: reads by EPC that
+    the map lacks; ``late``: rounds with a stamp older than one before, and the largest step back [s]."""
+
+    reads: int
+    scans: int
+    rounds: int
+    antennas: Mapping[str, AntennaSummary]
+    known: int
+    unread: tuple[str, ...]
+    unknown: Mapping[str, int]
+    late: tuple[int, float]
+
+
+def summarize_rfid(log: Log) -> RfidSummary | None:
+    """What the stream ``rfid`` holds; None where there is none."""
+    stream = log.streams.get("rfid")
+    if not isinstance(stream, RfidStream):
+        return None
+    scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0)
+    _, first = np.unique(np.column_stack((scan, stream.round)), axis=0, return_index=True)
+    first.sort()  # the first row of each round
+    is_read = np.array([bool(epc) for epc in stream.epc], dtype=bool)
+    antenna = np.array(stream.antenna, dtype=str)
+    read_rounds = set(zip(scan[is_read].tolist(), stream.round[is_read].tolist(), strict=True))
+    silent = np.array([(int(scan[i]), int(stream.round[i])) not in read_rounds for i in first], dtype=bool)
+    antennas = {}
+    for name in dict.fromkeys(stream.antenna):
+        mine = antenna[first] == name
+        t, reads = stream.t[first[mine]], stream.t[is_read & (antenna == name)]
+        span = float(t.max() - t.min())
+        antennas[name] = AntennaSummary(
+            reads=len(reads),
+            rounds=len(t),
+            rate=(len(t) - 1) / span if span > 0.0 else 0.0,
+            silent=int(np.count_nonzero(silent & mine)),
+            last=float(t.max()),
+            last_read=float(reads.max()) if len(reads) else None,
+        )
+    counts = Counter(epc for epc in stream.epc if epc)
+    t = stream.t[first]
+    late = np.maximum.accumulate(t) - t if len(t) else t
+    return RfidSummary(
+        reads=int(np.count_nonzero(is_read)),
+        scans=int(scan[-1]) if len(scan) else 0,
+        rounds=len(first),
+        antennas=antennas,
+        known=sum(epc in counts for epc in log.world.tags),
+        unread=tuple(epc for epc in log.world.tags if epc not in counts),
+        unknown={epc: count for epc, count in counts.most_common() if epc not in log.world.tags},
+        late=(int(np.count_nonzero(late)), float(late.max(initial=0.0))),
+    )
+
+
+def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
+    """What looks wrong with the reads, as lines for people."""
+    out = []
+    if found.unread:
+        out.append(
+            f"{len(found.unread)} of {len(log.world.tags)} tags of the map are never read: {_some(found.unread)}"
+        )
+    if found.unknown:
+        reads = sum(found.unknown.values())
+        out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {_some(tuple(found.unknown))}")
+    carried = log.rig.rfid.all_antennas() if log.rig.rfid else {}
+    out += [
+        f"antenna {name} is not on the rig: {antenna.reads} reads, {antenna.rounds} rounds"
+        for name, antenna in found.antennas.items()
+        if name not in carried
+    ]
+    out += [f"antenna {name} of the rig never listens" for name in carried if name not in found.antennas]
+    last = max((antenna.last for antenna in found.antennas.values()), default=0.0)
+    for name, antenna in found.antennas.items():
+        if antenna.last < last - STOPPED:
+            out.append(f"antenna {name} stops at {antenna.last:.1f} s, {last - antenna.last:.1f} s before the others")
+        elif antenna.last_read is None:
+            out.append(f"antenna {name} reads nothing")
+        elif antenna.last_read < last - STOPPED:
+            out.append(f"antenna {name} reads nothing after {antenna.last_read:.1f} s")
+    return out + _clock_trouble(log, found)
+
+
+def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
+    out = []
+    count, step = found.late
+    if step > CLOCK_STEP:
+        out.append(
+            f"{count} rounds have stamps up to {step:.1f} s before an earlier one: did the clock of the reader jump?"
+        )
+    odometry = log.streams.get("odometry")
+    if odometry is None or not len(odometry.t) or not found.rounds:
+        return out
+    t = log.streams["rfid"].t + log.rig.time_offset("rfid")
+    wheels = odometry.t + log.rig.time_offset("odometry")
+    for side, excess in (("before", wheels.min() - t.min()), ("after", t.max() - wheels.max())):
+        if excess > CLOCK_STEP:
+            out.append(f"the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?")
+    return out
+
+
+def _some(names: tuple[str, ...]) -> str:
+    more = len(names) - SHOWN
+    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")

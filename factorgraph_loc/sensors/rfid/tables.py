@@ -1,0 +1,156 @@
+"""The two RFID tables of the native format: ``rfid.csv``, a row for each read, and ``inventories.csv``, one for each round.
+
+A read belongs to the round of its antenna that holds its stamp, or to the one that it names. Without the second table the rounds
+are found from the gaps between reads; then a round that read nothing is not known of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.errors import bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.columns import RFID
+from factorgraph_loc.files.tables import Table
+from factorgraph_loc.sensors.rfid.rounds import (
+    OUTSIDE,
+    ends_of,
+    make_rfid_stream,
+    rounds_from_gaps,
+    rounds_from_inventories,
+)
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factors.se2 import Array, Integers
+
+_READ = ("t_ns", "antenna", "epc")
+_SIGNALS = (("rssi", "phase", "frequency"), ("rssi",), ())  # what readers tell of a read
+READS = tuple((*_READ, *signals, *told) for signals in _SIGNALS for told in (("inventory",), ()))
+INVENTORIES = ("t_ns", "antenna", "duration")
+SIGNALS = _SIGNALS[0]
+
+Columns = Mapping[str, Array | Integers | Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """N reads, each in one of R rounds: see :func:`~factorgraph_loc.sensors.rfid.rounds.make_rfid_stream`."""
+
+    t_ns: Integers
+    number: Integers
+    epc: list[str]
+    columns: tuple[Array, Array, Array]
+    end_ns: Integers
+    antenna: list[str]
+
+    def stream(self, t0_ns: int) -> RfidStream:
+        return make_rfid_stream(self.t_ns, self.number, self.epc, self.columns, self.end_ns, self.antenna, t0_ns)
+
+
+def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warnings: list[str]) -> Rounds:
+    """The reads in their rounds; ``gap`` [s] between rounds where there are no ``inventories``.
+
+    InputError names file, row and field of what is wrong; reads outside every inventory are left out, with a warning.
+    """
+    if reads is not None:
+        check_reads(reads)
+    if inventories is not None:
+        return _from_inventories(reads, inventories, warnings)
+    assert reads is not None
+    checks.arrivals(reads.path, reads.rows, reads.t_ns, warnings)
+    order = np.argsort(reads.t_ns, kind="stable")
+    antenna = [reads.names["antenna"][i] for i in order.tolist()]
+    t_ns = reads.t_ns[order]
+    number = rounds_from_gaps(t_ns, antenna, gap)
+    end_ns = ends_of(t_ns, number, gap)
+    first = np.searchsorted(number, np.arange(len(end_ns)))
+    return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
+
+
+def _from_inventories(reads: Table | None, inventories: Table, warnings: list[str]) -> Rounds:
+    end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
+    duration = inventories.numbers["duration"]
+    # a reader's clock that jumps is a fault of the recording: what it stamped in the past is for the estimators to drop
+    checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
+    if reads is None:
+        nothing = np.zeros(0)
+        none = np.zeros(0, dtype=np.int64)
+        return Rounds(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
+    if "inventory" in reads.numbers:
+        number = _told(reads, end_ns, antenna)
+    else:
+        duration_ns = np.rint(duration * 1e9).astype(np.int64)
+        number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
+    keep = np.flatnonzero(number != OUTSIDE)
+    if left := len(number) - len(keep):
+        warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside every inventory and are left out")
+    return _rounds(reads, keep, number[keep], end_ns, antenna)
+
+
+def _told(reads: Table, end_ns: Integers, antenna: list[str]) -> Integers:
+    """The rounds (N,) that the reads themselves name, by their places in the other table, from 1."""
+    named = reads.numbers["inventory"]
+    with np.errstate(invalid="ignore"):
+        bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
+    expected = f"the number of a row of inventories, 1 to {len(end_ns)}"
+    if not bad.any():
+        number = named.astype(np.int64) - 1
+        bad = np.array([antenna[k] for k in number.tolist()], dtype=str) != np.array(reads.names["antenna"], dtype=str)
+        bad |= end_ns[number] < reads.t_ns
+        expected = "an inventory of the same antenna that ends after the read"
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
+        raise bad_field(reads.path, "inventory", float(named[i]), expected, row=int(reads.rows[i]))
+    return number
+
+
+def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
+    epc = [reads.names["epc"][i] for i in rows.tolist()]
+    unknown = np.full(len(reads.t_ns), np.nan)
+    rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
+    return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
+
+
+def check_reads(reads: Table) -> None:
+    """InputError for what no radio measures, as in another unit."""
+    for name in SIGNALS:
+        if name in reads.numbers:
+            RFID[name].require(reads.path, reads.rows, reads.numbers[name])
+
+
+def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
+    """The columns of both tables, rows in the order of the rounds; a round lasts from its first read to its end."""
+    number = _numbered(stream)
+    _, first = np.unique(number, return_index=True)
+    end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
+    age_ns = np.rint(stream.age * 1e9).astype(np.int64)
+    order = np.argsort(number, kind="stable")
+    reads = order[np.array([bool(stream.epc[i]) for i in order.tolist()], dtype=bool)]
+    duration_ns = np.zeros(len(first), dtype=np.int64)
+    np.maximum.at(duration_ns, number[reads], age_ns[reads])
+    return (
+        {
+            "t_ns": end_ns[reads] - age_ns[reads],
+            "antenna": [stream.antenna[i] for i in reads.tolist()],
+            "epc": [stream.epc[i] for i in reads.tolist()],
+            "rssi": stream.rssi[reads],
+            "phase": stream.phase[reads],
+            "frequency": stream.frequency[reads],
+            "inventory": number[reads] + 1,
+        },
+        {
+            "t_ns": end_ns[first],
+            "antenna": [stream.antenna[i] for i in first.tolist()],
+            "duration": duration_ns / 1e9,
+        },
+    )
+
+
+def _numbered(stream: RfidStream) -> Integers:
+    """The number (N,) of each row's round among all rounds, in the order in which they come."""
+    scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0).tolist()
+    numbers: dict[tuple[int, int], int] = {}
+    keys = zip(scan, stream.round.tolist(), strict=True)
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)

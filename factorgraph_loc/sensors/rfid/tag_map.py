@@ -1,0 +1,48 @@
+"""The tags of a map as arrays, in the world's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factors import se2
+from factors.rfid.detection import TagArray
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, eq=False)
+class TagMap:
+    """``names``: T EPCs; ``tags``: where they are in the world, the survey's errors corrected; ``index``: places by EPC."""
+
+    names: tuple[str, ...]
+    tags: TagArray
+    index: dict[str, int]
+
+
+def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
+    """The tags of a map, or those of ``names`` that it has."""
+    chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
+    points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
+    facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
+    transform = survey.transform()
+    points[:, :2] = se2.transform_from(transform, points[:, :2])
+    tags = TagArray(points, facing + transform[2])
+    return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)})
+
+
+MARGIN = 1.0  # m, how far beyond walls and tags the robot may be
+MARGIN_OF_TAGS = 3.0  # where there are no walls
+
+
+def extent(world: World, tags: TagArray) -> Array:
+    """Where a robot may be that hears these tags: lower and upper corner (2, 2) [m], by the walls or else by the tags."""
+    ends = np.array(world.walls).reshape(-1, 2)
+    margin = MARGIN if len(ends) else MARGIN_OF_TAGS
+    points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends
+    if not len(points):
+        return np.zeros((2, 2))
+    return np.array((points.min(axis=0) - margin, points.max(axis=0) + margin))

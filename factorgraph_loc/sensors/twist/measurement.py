@@ -1,0 +1,17 @@
+"""Measured motion in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """Motion in space of a robot that is carried: velocity ``v`` (3,) [m/s] and turn rate ``w`` (3,) [rad/s], both in its own
+    frame, held until the next row."""
+
+    t: float
+    v: Array
+    w: Array

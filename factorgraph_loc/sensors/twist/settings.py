@@ -1,0 +1,21 @@
+"""Settings of measured motion in space in the rig."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.units import Seconds
+
+PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)")]
+
+
+class TwistSettings(FileModel):
+    """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: standard deviations of the errors of
+    position and orientation along the robot's axes, which grow with the root of time."""
+
+    time_offset: Seconds = 0.0
+    shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
+    turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]

@@ -1,0 +1,22 @@
+"""The rows of measured motion in space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.sensors.twist.measurement import Twist
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class TwistStream:
+    """``v`` (N, 3) [m/s] and ``w`` (N, 3) [rad/s] in the robot's frame, each held until the next row."""
+
+    t: Array
+    v: Array
+    w: Array
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        return map(Twist, (self.t + offset).tolist(), self.v, self.w)

@@ -1,0 +1,70 @@
+"""Visual odometry in a graph: what tracks of no other use tell of the motion from one image's keyframe to the next one's.
+
+No pixel counts twice: tracks of points of the map, of the graph, and of those that wait for it are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.fusion.variables import Node
+from factorgraph_loc.vision.frame_motion import frame_motion
+from factors.camera.model import CameraModel
+from factors.camera.visual_odometry import SHARED, VisualOdometryFactor
+from factors.motion import Increment
+from factors.se2 import Array
+
+# m, rad, s: between images that are compared. Where the way is short against the noise of pixels its direction is biased
+# (towards where the camera looks), which adds up over many short ones
+LEAST_WAY, LEAST_TURN, LEAST_TIME = 0.25, 0.3, 1.5
+MAX_TIME = 2.0
+
+
+@dataclass(frozen=True)
+class _Image:
+    keyframe: Keyframe
+    pixels: dict[Hashable, Array]
+
+
+class FramePairs:
+    """Keeps the last image, and turns it with the next one into a factor."""
+
+    def __init__(self, model: CameraModel) -> None:
+        self._model = model
+        self._last: _Image | None = None
+
+    def previous(self, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> Keyframe | None:
+        """The keyframe of the last image, where it still is one of ``keyframes`` and not long before ``keyframe``."""
+        if self._last is None:
+            return None
+        before = self._last.keyframe
+        if not 0.0 < keyframe.t - before.t <= MAX_TIME:
+            return None
+        return before if before.index < len(keyframes) and keyframes[before.index] is before else None
+
+    def take(
+        self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None
+    ) -> Node | None:
+        """What is seen at ``pixels`` (K, 2) from a keyframe, by ``names`` of tracks; returned is the factor with the image before
+        it, from whose keyframe the robot is ``predicted`` to have moved, None where there is none or they tell nothing."""
+        last, here = self._last, _Image(keyframe, dict(zip(names, pixels, strict=True)))
+        if last is None or predicted is None:
+            self._last = here
+            return None
+        x, y, turn = predicted.delta
+        if math.hypot(x, y) < LEAST_WAY and abs(turn) < LEAST_TURN and predicted.duration < LEAST_TIME:
+            return None
+        self._last = here
+        common = [name for name in here.pixels if name in last.pixels]
+        first = np.array([last.pixels[name] for name in common]).reshape(-1, 2)
+        second = np.array([here.pixels[name] for name in common]).reshape(-1, 2)
+        found = frame_motion(self._model, first, second, predicted, np.random.default_rng(0))
+        if found is None:
+            return None
+        factor = VisualOdometryFactor(found.delta, SHARED * found.information)
+        return Node((last.keyframe.key, keyframe.key), factor, 3)

@@ -1,0 +1,71 @@
+"""The last keyframes and the points that wait there, adjusted together, where no points of the graph tell how the robot turned.
+
+Odometry alone may be off by many pixels from one image to the next, by more than the parallax that it is to triangulate. Points
+seen from several keyframes tell their turns much better (bundle adjustment: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle
+Adjustment, a Modern Synthesis", 2000). What comes out is a guess alone: the sightings enter the graph as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.fusion.problem import Problem
+from factorgraph_loc.fusion.variables import Values, point_key
+from factorgraph_loc.slam.new_points import FEWEST, Place, Sighting, agreed, apart
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel
+from factors.camera.native import PointSightings
+from factors.graph import PriorFactor
+from factors.odometry.model import OdometryFactor
+from factors.se2 import Array
+
+ROUGH = 0.5  # share of its depth, to which a place is told that is good enough to begin with
+ENOUGH = 8  # points
+ITERATIONS = 12
+ANCHOR = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: nothing moves the first keyframe
+
+
+def bundled(
+    model: CameraModel,
+    keyframes: Sequence[Keyframe],
+    poses: Sequence[Array],
+    slacks: Sequence[float],
+    waiting: Mapping[Hashable, Sequence[Sighting]],
+) -> list[Array] | None:
+    """Poses (3,) of successive ``keyframes`` from those of the guess ``poses``, which put points off by ``slacks`` [px], the first
+    one held; None where fewer than :data:`ENOUGH` points tell them."""
+    first = keyframes[0].index
+    places = [Place.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
+    values: Values = {k.key: pose for k, pose in zip(keyframes, poses, strict=True)}
+    make = PointSightings(model)
+    natives = []
+    often = [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
+    ends = [(seen[i], places[seen[i].keyframe - first]) for seen in often for i in (0, -1)]
+    often = [s for s, a, b in zip(often, ends[::2], ends[1::2], strict=True) if apart(model, *a, *b, ROUGH)]
+    if len(often) < ENOUGH:
+        return None
+    for seen in often:
+        found = agreed(model, seen, [places[s.keyframe - first] for s in seen], ROUGH)
+        if found is None:
+            continue
+        point, right = found
+        key = point_key(len(values))
+        values[key] = point.position
+        for s in right:
+            ours = ReprojectionFactor(model, np.zeros((1, 3)), s.pixel[None], free=True)
+            pose = keyframes[s.keyframe - first].key
+            natives.append((ours, (pose, key), make.factor(pose, key, s.pixel)))
+    if len(values) < len(keyframes) + ENOUGH:
+        return None
+    chain = [
+        (OdometryFactor(k.from_previous), (before.key, k.key))
+        for before, k in pairwise(keyframes)
+        if k.from_previous is not None
+    ]
+    problem = Problem([(PriorFactor(poses[0], ANCHOR), (keyframes[0].key,)), *chain], natives)
+    solved = problem.solve(values, ITERATIONS).values
+    return [solved[k.key] for k in keyframes]

@@ -1,0 +1,363 @@
+"""The paper's EKF (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3), which is that of monoSLAM: Davison et al., 2007.
+
+The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world's frame and its
+turn rate w^R in its own; points that are not in the map follow. The error state has 12, as an orientation has three degrees of
+freedom. The camera sits on R by the rig's extrinsic, so R stands in for the paper's camera frame.
+
+Odometry is read before the prediction that uses it and replaces the constant-velocity noise of x, y and heading; height, roll and
+pitch stay near those of a robot on the floor. A motion measured in space (``twist``) replaces all six. Without either, velocity
+is constant up to impulses. Points of the map are looked for where they are expected (:mod:`.monoslam_search`); others come into
+the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings
+from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
+from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.twist.measurement import Twist
+from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
+from factorgraph_loc.slam.monoslam_sighting import Looker, Match
+from factorgraph_loc.slam.monoslam_state import POSE, Eye, Innovation, MapPoint, SlamState, squared, widening
+from factorgraph_loc.slam.space_motion import (
+    PLANAR,
+    ROBOT,
+    UPRIGHT,
+    Origin,
+    RobotState,
+    Step,
+    TwistChain,
+    about_z,
+    constant_velocity,
+    measured,
+    on_the_floor,
+    planar,
+    standstill,
+)
+from factorgraph_loc.slam.space_pose import planar_estimate, planar_trajectory
+from factorgraph_loc.vision.consensus import CameraPose
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.relocalization import FLOATS, TILTS
+from factors import positive, se2
+from factors.camera.model import carrier, huber_weight
+from factors.motion import Increment
+from factors.se2 import Array
+
+SETTLED = 1e-3  # m, rad: a step of the iterated update that needs no further one
+HORIZON = 5.0  # s of measured motion that are kept
+VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s of the start
+LATELY = 5.0  # s: a point in the state that was not seen since may be hidden now
+LOST_AFTER = 5  # images in a row in which nothing is where it is expected
+VAGUE = 0.5  # m, rad: standard deviations beyond which a place is not known
+
+
+class MonoslamSettings(FilterSettings):
+    """``acceleration``, ``angular_acceleration``: standard deviations of the constant-velocity model, as published.
+
+    ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
+    space. ``landmarks``: use of the map's points, as of
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``max_points``: in the state; ``per_image``: new ones are
+    taken
+    in where fewer than these should be in view. ``iterations``: in a known map; 1 is the published update, more linearise again.
+    With points in the state it is always 1: what is linearised at other places again and again seems to tell more than it does.
+    ``smooth``: the final trajectory of a run in a known map is smoothed; with points in the state it is the causal one.
+    """
+
+    planar: bool | None = None
+    acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="m/s^2")] = 4.0
+    angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="rad/s^2")] = 6.0
+    height_sigma: Annotated[float, Field(ge=1e-5, le=1.0, description="m")] = 0.005
+    tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad")] = 0.005
+    landmarks: MapUse = "known"
+    max_points: Annotated[int, Field(ge=1, le=1000)] = 100
+    per_image: Annotated[int, Field(ge=1, le=1000)] = 20
+    iterations: Annotated[int, Field(ge=1, le=20)] = 3
+
+
+@dataclass(frozen=True)
+class _Record:
+    """``step`` led here from the record before; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the
+    place was found in the map, whatever was before."""
+
+    t: float
+    step: Step
+    predicted: Array
+    robot: RobotState
+    covariance: Array
+    anew: bool = False
+
+
+class Monoslam(Filter):
+    """The filter; see the module."""
+
+    takes_pixels = True
+    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
+    _state: SlamState
+
+    def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
+        super().__init__(setup, settings)
+        self._settings = settings
+        self._looker = Looker(setup, self.diagnostics, settings.landmarks)
+        twist = setup.rig.twist if "twist" in setup.sensors else None
+        self._twists = None if twist is None else TwistChain(twist, HORIZON)
+        self._planar = settings.planar is not False
+        self._wheels = "odometry" in setup.sensors
+        self._step: Step | None = None
+        self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
+        # without a map nothing tells of the start: its uncertainty is kept out of the state, where it would shrink as the
+        # linearization moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        self._origin: Origin | None = None
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        if isinstance(measurement, Twist) and self._twists is not None:
+            self._ahead = None
+            if not self._twists.add(measurement.t, measurement.v, measurement.w):
+                self.diagnostics.drop_late("twist")
+        else:
+            super().process(measurement)
+
+    def learnt(self) -> Learnt:
+        """Points in the state, as seen from above; those whose depth is unknown are left out."""
+        points = {}
+        if self._state is not None:
+            for point, start in zip(self._state.points, self._state.starts().tolist(), strict=True):
+                if not point.ray:
+                    part = slice(ROBOT + start, ROBOT + start + 3)
+                    position, spread = self._state.values[start : start + 3], self._state.covariance[part, part]
+                    if self._origin is not None:
+                        spread = spread + self._origin.of_point(position)
+                    points[point.name] = LearntPoint(position[:2], spread[:2, :2])
+        return Learnt(landmarks=points)
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past, seen from above; see :meth:`space_trajectory`."""
+        return planar_trajectory(self.space_trajectory())
+
+    def space_trajectory(self) -> Trajectory3:
+        """The poses in space at the stamps of the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or with
+        ``smooth`` off, the causal ones."""
+        found = self._past()
+        ticks = np.unique(np.array(self._ticks))
+        chosen = [found[i] for i in np.searchsorted([t for t, *_ in found], ticks, side="right") - 1]
+        return Trajectory3(
+            ticks,
+            np.array([r.position for _, r, _ in chosen]).reshape(-1, 3),
+            np.array([r.rotation for _, r, _ in chosen]).reshape(-1, 3, 3),
+            np.array([self._spread(r, c) for _, r, c in chosen]).reshape(-1, 6, 6),
+        )
+
+    def _past(self) -> list[tuple[float, RobotState, Array]]:
+        """Time, robot and covariance (12, 12) of each record."""
+        records: list[_Record] = self._records
+        smooth = self._smooth and self._settings.landmarks == "known"
+        size = ROBOT if self._by_velocity else POSE
+        if not records:
+            return []
+        newest = records[-1]
+        found = [(newest.t, newest.robot, newest.covariance)]
+        for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
+            robot, covariance = here.robot, here.covariance
+            if smooth and not after.anew:
+                robot, covariance = _smoothed(here, after, *found[-1][1:], size)
+            found.append((here.t, robot, covariance))
+        return found[::-1]
+
+    def _start(self, prior: PosePrior) -> SlamState:
+        s = self._settings
+        covariance = _starting()
+        self._planar = prior.space is None if s.planar is None else s.planar
+        if prior.space is not None:
+            position, rotation = prior.space.position, prior.space.rotation
+            covariance[:6, :6] = prior.space.covariance
+        else:
+            position, rotation = np.array((*prior.pose[:2], 0.0)), about_z(float(prior.pose[2]))
+            covariance[np.ix_(PLANAR, PLANAR)] = se2.world_to_body(prior.pose, prior.covariance)
+            covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
+        if s.landmarks == "unknown":
+            free = PLANAR if self._planar else list(range(6))
+            spread = np.zeros((6, 6))
+            spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
+            self._origin = Origin(robot, spread)
+            covariance[free] = covariance[:, free] = 0.0
+        return SlamState(robot, covariance)
+
+    @property
+    def _by_velocity(self) -> bool:
+        """Whether no motion is measured, so that the velocity tells where the robot goes."""
+        return self._twists is None and not (self._planar and self._wheels)
+
+    def _predict(self, increment: Increment) -> None:
+        s, robot, dt = self._settings, self._state.robot, increment.duration
+        if self._twists is not None:
+            step = measured(robot, self._twists.between(self._t, self._t + dt), dt)
+        elif not self._by_velocity:
+            step = measured(robot, planar(increment), dt)
+        else:
+            free = np.ones(3)
+            impulse, turning = s.acceleration * dt * free, s.angular_acceleration * dt * free
+            if self._planar:
+                impulse[2] = turning[0] = turning[1] = 0.0
+            step = constant_velocity(robot, dt, impulse, turning)
+        if self._planar:
+            step = on_the_floor(step, dt, s.height_sigma, s.tilt_sigma)
+        self._step = step
+        self._state = self._state.moved(step)
+        self._predicted = self._state.covariance[:ROBOT, :ROBOT]
+
+    def _update(self, m: BearingRange) -> None:
+        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+
+    def _look(self, m: PixelSightings | CameraFrame) -> None:
+        eye = self._looker.eye(m)
+        if eye is None:
+            self.diagnostics.ignore("camera", len(m.pixels))
+            return
+        match = self._looker.match(m, self._state, eye)
+        self._matched(m, match, eye)
+        state, self._anew = self._relocated(m, self._state, eye, match)
+        if len(match.pixels) and not self._anew and not self._vague(state):
+            state = self._corrected(m, state, eye, match)
+        if not self._anew and self._settings.landmarks != "known":
+            state = self._managed(m, state, eye, match)
+        self._state = state
+
+    def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
+        """Told of every image and what was found in it."""
+
+    def _corrected(self, m: PixelSightings | CameraFrame, prior: SlamState, eye: Eye, match: Match) -> SlamState:
+        """The Kalman update, iterated; pixels far off have their noise widened, then are weighted by Huber's loss."""
+        points, spreads = match.points, match.spreads
+        zero = np.zeros(len(prior.covariance))
+        sights = eye.all(prior, match.mapped, points, spreads)
+        innovation = Innovation.of(sights, prior.covariance)
+        residual = match.pixels - sights.pixels
+        noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
+        self._report(m, residual, innovation, sights.noise)
+        tempering = np.ones(len(residual))
+        tempering[len(match.mapped) :] = match.tempering
+        delta, root, spread = zero, np.empty(0), np.empty(0)
+        for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
+            if i:
+                moved = prior.plus(delta, prior.covariance)
+                sights = eye.all(moved, match.mapped, points, spreads)
+                innovation = Innovation.of(sights, prior.covariance)
+                residual = match.pixels - sights.pixels
+                weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
+                noise = sights.noise / weight[:, None, None]
+            root, spread = innovation.gain(noise / tempering[:, None, None])
+            whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
+            before, delta = delta, spread.T @ whitened
+            if np.abs((delta - before)[:6]).max() < SETTLED:
+                break
+        return prior.plus(delta, prior.covariance - spread.T @ spread)
+
+    def _report(self, m: PixelSightings | CameraFrame, residual: Array, innovation: Innovation, noise: Array) -> None:
+        sensor = "camera_right" if isinstance(m, PixelSightings) and m.right else "camera"
+        whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
+        self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
+        for i, name in enumerate("uv"):
+            self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
+
+    def _relocated(
+        self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match
+    ) -> tuple[SlamState, bool]:
+        """Where nothing is found where it is expected, image after image, or where the pose is hardly known, the place is looked
+        for in the whole map; whether it was found. Points in the state are given up with the old place."""
+        lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
+        camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
+        found = None if camera is None else self._standing(camera, eye)
+        if found is None:
+            return replace(state, lost=lost), False
+        self.diagnostics.events.append((m.t, "camera: found its place in the map"))
+        return found, True
+
+    def _vague(self, state: SlamState) -> bool:
+        """Whether the place in a known map is so little known that nothing can be linearised there."""
+        return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
+
+    def _standing(self, camera: CameraPose, eye: Eye) -> SlamState | None:
+        """The state of a robot whose ``camera`` was found; None if it would float or tilt on a floor."""
+        s = self._settings
+        position, rotation = carrier(eye.model, camera.position, camera.rotation)
+        robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
+        covariance = _starting()
+        back = np.linalg.inv(eye.lift)
+        covariance[:6, :6] = back @ camera.covariance @ back.T
+        if self._planar:
+            if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
+                return None
+            covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        return SlamState(robot, covariance)
+
+    def _managed(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match) -> SlamState:
+        """Points counted, deleted, made x, y, z, and taken in where there are too few."""
+        state = counted(state, match.expected, frozenset(match.mapped), m.t)
+        frame = m if isinstance(m, CameraFrame) else None
+        wanted = min(self._settings.per_image, self._settings.max_points)
+        room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - LATELY))
+        for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
+            name = m.points[row] if isinstance(m, PixelSightings) else f"met{state.met}"
+            descriptor = None if frame is None else frame.descriptors[row]
+            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
+            state = replace(grown, met=state.met + 1)
+        state, failed = pruned(state, self._settings.max_points)
+        if failed:
+            self.diagnostics.reject("camera: points that were not found again", failed)
+        state = settled(state, eye)
+        tracks = frozenset() if frame is None else frozenset(frame.tracks.tolist())
+        return replace(state, tracks=tracks)
+
+    def _estimate(self) -> PoseEstimate:
+        robot = self._state.robot
+        spread = self._spread(robot, self._state.covariance)
+        return planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
+
+    def _spread(self, robot: RobotState, covariance: Array) -> Array:
+        """The covariance (6, 6) of a pose, that of the start included."""
+        own = covariance[:6, :6]
+        return own if self._origin is None else own + self._origin.of_pose(robot)
+
+    def _record(self) -> _Record:
+        s = self._state
+        step, predicted = self._step or standstill(s.robot), self._predicted
+        if self._step is None:  # a second measurement of the same time
+            predicted = self._records[-1].covariance if self._records else s.covariance[:ROBOT, :ROBOT]
+            step = standstill(self._records[-1].robot if self._records else s.robot)
+        self._step, anew, self._anew = None, self._anew, False
+        return _Record(self._t, step, predicted.copy(), s.robot, s.covariance[:ROBOT, :ROBOT].copy(), anew)
+
+
+def _starting() -> Array:
+    """The covariance (12, 12) of a start, without that of the pose."""
+    return np.diag(np.square([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3))
+
+
+def _smoothed(
+    here: _Record, after: _Record, robot: RobotState, covariance: Array, size: int
+) -> tuple[RobotState, Array]:
+    """The robot of a record given what came later: ``robot`` and ``covariance`` (12, 12) are the smoothed ones of ``after``. The
+    first ``size`` values of the error are smoothed, on which the others have no influence later."""
+    transition, predicted = after.step.transition[:size, :size], after.predicted[:size, :size]
+    own = here.covariance[:size, :size]
+    gain = positive.solve(predicted, transition @ own).T
+    change = np.zeros(ROBOT)
+    change[:size] = gain @ robot.minus(after.step.robot)[:size]
+    smoothed = here.covariance.copy()
+    own = own + gain @ (covariance[:size, :size] - predicted) @ gain.T
+    smoothed[:size, :size] = 0.5 * (own + own.T)
+    return here.robot.plus(change), smoothed

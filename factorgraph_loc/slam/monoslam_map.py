@@ -1,0 +1,104 @@
+"""Points come into the state of the monoSLAM filter, become x, y, z, and leave it again.
+
+Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.G: a point that is often not found where it
+should be is deleted. Civera, Davison, Montiel, 2008: new points by inverse depth (:mod:`factors.camera.inverse_depth`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.slam.monoslam_state import Eye, Integers, MapPoint, SlamState
+from factorgraph_loc.slam.space_motion import ROBOT
+from factors.camera import inverse_depth
+from factors.se2 import Array
+
+NEAREST_POINT = 0.5  # m: new points are expected beyond, with 95 %
+TRIED, FOUND = 8, 0.5  # a point that should have been seen so often stays if it was found in this share
+
+
+def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
+    """The state with a new point, of unknown depth, seen at ``pixel`` (2,)."""
+    inverse = 0.5 / NEAREST_POINT  # two deviations below it is 0, two above the nearest point
+    position, rotation = eye.pose(state.robot)
+    ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, inverse)
+    by_pose = by_camera @ eye.lift
+    noise = np.diag((eye.model.sigma, eye.model.sigma, 0.5 * inverse)) ** 2
+    size, more = len(state.covariance), inverse_depth.SIZE
+    carried = by_pose @ state.covariance[:6]
+    covariance = np.empty((size + more, size + more))
+    covariance[:size, :size] = state.covariance
+    covariance[size:, :size], covariance[:size, size:] = carried, carried.T
+    covariance[size:, size:] = carried[:, :6] @ by_pose.T + by_seen @ noise @ by_seen.T
+    return replace(
+        state, points=(*state.points, point), values=np.concatenate((state.values, ray)), covariance=covariance
+    )
+
+
+def settled(state: SlamState, eye: Eye) -> SlamState:
+    """The state with x, y, z of the points whose depth is known well enough for that (the linearity index)."""
+    position, _ = eye.pose(state.robot)
+    rays = [i for i, p in enumerate(state.points) if p.ray]
+    if not rays:
+        return state
+    starts = state.starts()[rays]
+    values = state.values[starts[:, None] + np.arange(inverse_depth.SIZE)]
+    last = ROBOT + starts + inverse_depth.SIZE - 1
+    index = inverse_depth.linearity(values, np.sqrt(state.covariance[last, last]), position)
+    ripe = [i for i, linear in zip(rays, index.tolist(), strict=True) if linear < inverse_depth.LINEAR]
+    if not ripe:
+        return state
+    starts, kept = state.starts(), np.ones(len(state.values), dtype=bool)
+    points, moved, covariance = list(state.points), state.values.copy(), state.covariance.copy()
+    for i in ripe:
+        s, more = int(starts[i]), inverse_depth.SIZE
+        (moved[s : s + 3],), (by_ray,) = inverse_depth.positions(state.values[None, s : s + more])
+        c = ROBOT + s
+        covariance[c : c + 3] = by_ray @ covariance[c : c + more]
+        covariance[:, c : c + 3] = covariance[:, c : c + more] @ by_ray.T
+        kept[s + 3 : s + more] = False
+        points[i] = replace(points[i], ray=False)
+    rows = np.concatenate((np.arange(ROBOT), ROBOT + np.flatnonzero(kept)))
+    return replace(state, covariance=covariance[np.ix_(rows, rows)], points=tuple(points), values=moved[kept])
+
+
+def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
+    """The state whose points remember that ``expected`` of them should have been found, and ``matched`` were, at ``t``."""
+    points = list(state.points)
+    for i in expected:
+        hit = i in matched
+        p = points[i]
+        points[i] = replace(p, expected=p.expected + 1, matched=p.matched + hit, t=t if hit else p.t)
+    return replace(state, points=tuple(points))
+
+
+def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
+    """The state without points that failed to be found or that are beyond infinity, and how many these were; of more than
+    ``most`` points those go that were not seen for longest."""
+    failed = {
+        i
+        for i, (p, start) in enumerate(zip(state.points, state.starts().tolist(), strict=True))
+        if (p.expected >= TRIED and p.matched < FOUND * p.expected) or (p.ray and _beyond(state, start + 5))
+    }
+    left = [i for i in range(len(state.points)) if i not in failed]
+    spare = len(left) - most
+    dropped = set(sorted(left, key=lambda i: state.points[i].t)[:spare]) if spare > 0 else set()
+    return without(state, failed | dropped), len(failed)
+
+
+def _beyond(state: SlamState, place: int) -> bool:
+    """Whether an inverse depth is below zero for certain."""
+    return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[ROBOT + place, ROBOT + place]))
+
+
+def without(state: SlamState, which: Collection[int]) -> SlamState:
+    """The state without some of its points."""
+    if not which:
+        return state
+    kept = np.repeat([i not in which for i in range(len(state.points))], [p.size for p in state.points])
+    rows: Integers = np.concatenate((np.arange(ROBOT), ROBOT + np.flatnonzero(kept)))
+    points = tuple(p for i, p in enumerate(state.points) if i not in which)
+    return replace(state, covariance=state.covariance[np.ix_(rows, rows)], points=points, values=state.values[kept])

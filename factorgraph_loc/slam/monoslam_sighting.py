@@ -1,0 +1,217 @@
+"""What the monoSLAM filter makes of an image: which pixels are which points, of the map or of its own state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+
+import numpy as np
+
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.camera.sensor import DISAGREES, EXACT, MOST
+from factorgraph_loc.slam.monoslam_search import agreeing, find
+from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
+from factorgraph_loc.vision import consensus
+from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.consensus import FEWEST, CameraPose
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.relocalization import located
+from factorgraph_loc.vision.spread import spread_out
+from factors.se2 import Array
+
+APART = 15.0  # px between a new point and all others
+FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree on a place without a prediction, and their share
+
+
+@dataclass(frozen=True)
+class Match:
+    """Pixels (K, 2) that are taken, of the points ``mapped`` of the state, then of ``points`` (P, 3) of the map with covariances
+    ``spreads`` (P, 3, 3) and a likelihood of the exponent ``tempering``. ``taken``: rows of the image that they stand in, rejected
+    ones too. ``expected``: points of the state that should have been found. ``wanted``: 0 where so little was expected that nothing
+    follows if nothing is found."""
+
+    pixels: Array
+    mapped: tuple[int, ...]
+    points: Array
+    spreads: Array | None
+    taken: frozenset[int]
+    expected: tuple[int, ...]
+    wanted: int
+    tempering: float = 1.0
+
+
+class Looker:
+    """Associates; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
+
+    def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
+        self._diagnostics = diagnostics
+        sensors, rig = setup.sensors, setup.rig
+        used = "camera" in sensors or "sightings" in sensors
+        self._left_eye = Eye.of(rig.camera.model()) if used and rig.camera else None
+        right = rig.camera_right if "sightings_right" in sensors else None
+        self._right_eye = Eye.of(right.model()) if right else None
+        self._grows = use != "known"
+        nothing = PointMap.of((), np.empty((0, 3)))
+        self._map = nothing if use == "unknown" or setup.world.points is None else setup.world.points
+        self._associator: Associator | None = None
+        if self._left_eye is not None and "camera" in sensors and len(self._map.owners):
+            self._associator = Associator(self._map, self._left_eye.model)
+        self._spreads_matter = False
+        if self._left_eye is not None and len(self._map):
+            worst = float(np.trace(self._map.covariances, axis1=1, axis2=2).max())
+            self._spreads_matter = worst > (EXACT * self._left_eye.model.sigma / self._left_eye.model.fx) ** 2
+
+    def eye(self, m: PixelSightings | CameraFrame) -> Eye | None:
+        """The camera that took an image."""
+        return self._right_eye if isinstance(m, PixelSightings) and m.right else self._left_eye
+
+    def match(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye) -> Match:
+        """The pixels that belong to points, those that cannot be right left out and counted as rejected."""
+        if isinstance(m, PixelSightings):
+            return self._named(m, state, eye)
+        return self._searched(m, state, eye)
+
+    def new(
+        self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]
+    ) -> list[int]:
+        """Rows of an image that may become points: what has no name yet in map and state, or was followed from the image before
+        (``tracks``) and lies far from what is matched and expected."""
+        if isinstance(m, PixelSightings):
+            there = {p.name for p in state.points}
+            return [i for i, name in enumerate(m.points) if i not in match.taken and name not in there]
+        followed = np.isin(m.tracks, list(tracks))
+        expected = eye.mapped(state, range(len(state.points))).pixels
+        occupied = np.concatenate((m.pixels[list(match.taken)].reshape(-1, 2), expected))
+        chosen: list[int] = []
+        for i in np.flatnonzero(followed).tolist():
+            if not len(occupied) or np.abs(occupied - m.pixels[i]).max(axis=1).min() > APART:
+                chosen.append(i)
+                occupied = np.concatenate((occupied, m.pixels[None, i]))
+        return chosen
+
+    def in_view(self, state: SlamState, eye: Eye, since: float) -> int:
+        """How many points of the state should be in the image, of those that were seen ``since`` then."""
+        lately = [i for i, p in enumerate(state.points) if p.t >= since]
+        return len(_visible(eye, eye.mapped(state, lately))[1])
+
+    def _named(self, m: PixelSightings, state: SlamState, eye: Eye) -> Match:
+        index = {p.name: i for i, p in enumerate(state.points)}
+        ours = [(i, index[name]) for i, name in enumerate(m.points) if name in index]
+        known = [(i, self._map.index[name]) for i, name in enumerate(m.points) if name in self._map.index]
+        if not self._grows and (unknown := len(m.points) - len(known)):
+            self._diagnostics.ignore("point not in the map", unknown)
+        taken = frozenset(i for i, _ in (*ours, *known))
+        right = self._agreeing(m.pixels, ours, state, eye)
+        match = self._match(
+            m.pixels, right, self._agreeing_known(m.pixels, known, state, eye), [i for _, i in ours], len(known)
+        )
+        return replace(match, taken=taken)
+
+    def _searched(self, m: CameraFrame, state: SlamState, eye: Eye) -> Match:
+        binary = m.feature == "orb"
+        which = [i for i, p in enumerate(state.points) if p.descriptor is not None]
+        sights, inside = _visible(eye, eye.mapped(state, which))
+        which = [which[i] for i in inside.tolist()]
+        ours = []
+        if which:
+            descriptors = np.array([state.points[i].descriptor for i in which])
+            spreads = Innovation.of(sights, state.covariance).each(sights.noise)
+            rows, features = find(descriptors, sights.pixels, spreads, m.pixels, m.descriptors, binary=binary)
+            ours = [(f, which[r]) for r, f in zip(rows.tolist(), features.tolist(), strict=True)]
+        known, wanted = self._known(m, state, eye)
+        ours = self._agreeing(m.pixels, ours, state, eye)
+        in_map = {f for f, _ in known}
+        match = self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
+        return replace(match, tempering=eye.model.tempering)
+
+    def relocated(self, m: PixelSightings | CameraFrame, eye: Eye) -> CameraPose | None:
+        """Where the camera is by this image and the map alone; None where that does not tell."""
+        if isinstance(m, CameraFrame):
+            found = None if self._associator is None else self._associator.relocalized(m)
+            return None if found is None else CameraPose(*found[:3])
+        known = [(i, self._map.index[name]) for i, name in enumerate(m.points) if name in self._map.index]
+        if len(known) < FEWEST_FOUND:
+            return None
+        rows, points = (list(part) for part in zip(*known, strict=True))
+        place = located(eye.model, self._map.positions[points], m.pixels[rows], self._map.covariances[points])
+        if place is None or np.count_nonzero(place.inliers) < max(FEWEST_FOUND, SHARE_FOUND * len(known)):
+            return None
+        return place.camera
+
+    def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
+        """Features of an image that are points of the map, and how many were expected."""
+        if self._associator is None:
+            if not self._grows:
+                self._diagnostics.ignore("camera", len(m.pixels))
+            return [], 0
+        if m.feature != self._associator.feature:
+            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
+            return [], 0
+        seen = self._associator.guided(m, *eye.pose(state.robot), eye.spread(state.covariance))
+        if seen.rejected:
+            self._diagnostics.reject(DISAGREES, seen.rejected)
+        # one that is left out must not become a new point
+        chosen = spread_out(m.pixels[seen.features], len(seen) if self._grows else MOST)
+        return list(zip(seen.features[chosen].tolist(), seen.points[chosen].tolist(), strict=True)), seen.expected
+
+    def _agreeing(
+        self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
+    ) -> list[tuple[int, int]]:
+        """Those of the pairs (row of the image, point of the state) that agree with the others."""
+        if not ours:
+            return ours
+        sights = eye.mapped(state, [p for _, p in ours])
+        residual = pixels[[i for i, _ in ours]] - sights.pixels
+        return self._kept(ours, agreeing(residual, Innovation.of(sights, state.covariance), sights.noise))
+
+    def _agreeing_known(
+        self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
+    ) -> list[tuple[int, int]]:
+        """Those of the pairs (row of the image, point of the map) that agree with the others."""
+        if len(known) < FEWEST:
+            return known
+        points = self._map.positions[[p for _, p in known]]
+        noise = eye.known(state.robot, points, self._spreads([p for _, p in known])).noise
+        camera = CameraPose(*eye.pose(state.robot), eye.spread(state.covariance))
+        try:
+            right = consensus.agreeing(eye.model, camera, points, pixels[[i for i, _ in known]], noise)
+        except np.linalg.LinAlgError:  # of a prediction that says nothing any more
+            right = np.zeros(len(known), dtype=bool)
+        return self._kept(known, right)
+
+    def _kept(self, pairs: list[tuple[int, int]], right: Truths) -> list[tuple[int, int]]:
+        if not right.all():
+            self._diagnostics.reject(DISAGREES, int(np.count_nonzero(~right)))
+        return list(compress(pairs, right.tolist()))
+
+    def _spreads(self, points: Sequence[int]) -> Array | None:
+        return self._map.covariances[list(points)].reshape(-1, 3, 3) if self._spreads_matter else None
+
+    def _match(
+        self,
+        pixels: Array,
+        ours: list[tuple[int, int]],
+        known: list[tuple[int, int]],
+        expected: Sequence[int],
+        wanted: int,
+    ) -> Match:
+        both, points = (*ours, *known), [p for _, p in known]
+        return Match(
+            pixels[[i for i, _ in both]].reshape(-1, 2),
+            tuple(p for _, p in ours),
+            self._map.positions[points].reshape(-1, 3),
+            self._spreads(points),
+            frozenset(i for i, _ in both),
+            tuple(expected),
+            wanted,
+        )
+
+
+def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
+    """Those that are in front of the camera and in its image."""
+    inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
+    return sights[inside], inside

@@ -1,0 +1,241 @@
+"""The state of the monoSLAM filter: the robot and points, what a camera would see of them, and how pixels correct them.
+
+Kalman update in covariance form: of a state of 12 + D error values only the columns of the robot's pose and of the points that are
+seen enter the innovation. A sighting far off has its noise widened, as in :mod:`~factors.update`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from factorgraph_loc.slam.space_motion import ROBOT, RobotState, Step, cross
+from factors import positive
+from factors.camera import inverse_depth
+from factors.camera.model import CameraModel, linearize_in_space, mounted
+from factors.se2 import Array
+from factors.update import GATE
+
+Integers = NDArray[np.int64]
+Truths = NDArray[np.bool_]
+POSE = 6  # values of the pose's error, the first of the state's
+
+
+@dataclass(frozen=True)
+class MapPoint:
+    """A point in the state, by six values (``ray``) or three. ``descriptor`` (D,): of what was found in an image, else None.
+    ``expected``, ``matched``: how often it should have been found, and was; ``t`` [s]: when it last was."""
+
+    name: str
+    ray: bool
+    descriptor: NDArray[Any] | None
+    t: float
+    expected: int = 0
+    matched: int = 0
+
+    @property
+    def size(self) -> int:
+        return inverse_depth.SIZE if self.ray else 3
+
+
+@dataclass(frozen=True)
+class SlamState:
+    """``robot``, and ``values`` (D,) of ``points`` one after the other; ``covariance`` (12 + D, 12 + D) of the error state.
+
+    ``tracks``: in the newest image; ``met``: points so far; ``lost``: images in a row in which nothing was where it was expected.
+    """
+
+    robot: RobotState
+    covariance: Array
+    points: tuple[MapPoint, ...] = ()
+    values: Array = field(default_factory=lambda: np.zeros(0))
+    tracks: frozenset[int] = frozenset()
+    met: int = 0
+    lost: int = 0
+
+    def starts(self) -> Integers:
+        """Where each point begins in ``values``."""
+        sizes = [inverse_depth.SIZE if p.ray else 3 for p in self.points]
+        return np.cumsum([0, *sizes], dtype=np.int64)[:-1]
+
+    def plus(self, error: Array, covariance: Array) -> SlamState:
+        return replace(
+            self,
+            robot=self.robot.plus(error[:ROBOT]),
+            values=self.values + error[ROBOT : ROBOT + len(self.values)],
+            covariance=covariance,
+        )
+
+    def moved(self, step: Step) -> SlamState:
+        """After a prediction, which changes the robot alone."""
+        carried = step.transition @ self.covariance[:ROBOT]
+        covariance = self.covariance.copy()
+        covariance[:ROBOT] = carried
+        covariance[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
+        corner = carried[:, :ROBOT] @ step.transition.T + step.noise
+        covariance[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
+        return replace(self, robot=step.robot, covariance=covariance)
+
+
+@dataclass(frozen=True)
+class Sights:
+    """K pixels as they are predicted: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians by the robot's pose (K, 2, 6) and by the
+    point's own values (K, 2, 6), of which the first ``sizes`` (K,) count; 0 for a point of the map, which is not in the state.
+    ``starts`` (K,): where the point's values begin in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map."""
+
+    pixels: Array
+    depths: Array
+    by_pose: Array
+    by_point: Array
+    starts: Integers
+    sizes: Integers
+    noise: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, rows: Any) -> Sights:
+        return Sights(
+            self.pixels[rows],
+            self.depths[rows],
+            self.by_pose[rows],
+            self.by_point[rows],
+            self.starts[rows],
+            self.sizes[rows],
+            self.noise[rows],
+        )
+
+    def columns(self) -> tuple[Integers, Array]:
+        """The Jacobian (2K, C) by those C values of the error state that matter, and which these are."""
+        own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
+        where, first, which = own
+        sizes = self.sizes[self.sizes > 0][first]
+        offsets = POSE + np.concatenate(([0], np.cumsum(sizes)))
+        chosen = np.concatenate([np.arange(POSE), *(np.arange(s, s + n) for s, n in zip(where, sizes, strict=True))])
+        jacobian = np.zeros((len(self), 2, len(chosen)))
+        jacobian[:, :, :POSE] = self.by_pose
+        for k, w in zip(np.flatnonzero(self.sizes).tolist(), which.tolist(), strict=True):
+            jacobian[k, :, offsets[w] : offsets[w + 1]] = self.by_point[k, :, : sizes[w]]
+        return chosen.astype(np.int64), jacobian.reshape(-1, len(chosen))
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A camera: its ``model``, and how its perturbation depends on that of the robot (6, 6)."""
+
+    model: CameraModel
+    lift: Array
+
+    @staticmethod
+    def of(model: CameraModel) -> Eye:
+        lift = np.zeros((POSE, POSE))
+        lift[:3, :3] = lift[3:, 3:] = model.rotation.T
+        lift[3:, :3] = -model.rotation.T @ cross(model.position)
+        return Eye(model, lift)
+
+    def pose(self, robot: RobotState) -> tuple[Array, Array]:
+        """Position and rotation of the camera in the world."""
+        return mounted(self.model, robot.position, robot.rotation)
+
+    def spread(self, covariance: Array) -> Array:
+        """The covariance (6, 6) of the camera's perturbation, from that of the error state."""
+        return self.lift @ covariance[:POSE, :POSE] @ self.lift.T
+
+    def known(self, robot: RobotState, points: Array, spreads: Array | None) -> Sights:
+        """What is seen of ``points`` (K, 3) of a map with covariances ``spreads`` (K, 3, 3); None: exact."""
+        position, rotation = self.pose(robot)
+        pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
+        depths = (points - position) @ rotation[:, 2]
+        noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (len(points), 2, 2))
+        if spreads is not None:
+            noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        nothing = np.zeros(len(points), dtype=np.int64)
+        by_pose = by_camera @ self.lift
+        return Sights(pixels, depths, by_pose, np.zeros((len(points), 2, 6)), nothing, nothing, noise)
+
+    def mapped(self, state: SlamState, which: Sequence[int]) -> Sights:
+        """What is seen of the points ``which`` of the state."""
+        position, rotation = self.pose(state.robot)
+        count, starts = len(which), state.starts()[list(which)]
+        rays = np.array([state.points[i].ray for i in which], dtype=bool)
+        pixels, depths = np.empty((count, 2)), np.empty(count)
+        by_camera, by_point = np.empty((count, 2, 6)), np.zeros((count, 2, 6))
+        for kind, size in ((True, inverse_depth.SIZE), (False, 3)):
+            rows = np.flatnonzero(rays == kind)
+            values = state.values[starts[rows, None] + np.arange(size)]
+            if kind:
+                found = inverse_depth.linearize(self.model, position, rotation, values)
+                ahead = values[:, 5, None] * (values[:, :3] - position) + inverse_depth.directions(values)[0]
+            else:
+                found = linearize_in_space(self.model, position, rotation, values)
+                ahead = values - position
+            pixels[rows], by_camera[rows], by_point[rows, :, :size] = found
+            depths[rows] = ahead @ rotation[:, 2]
+        noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (count, 2, 2))
+        sizes = np.where(rays, inverse_depth.SIZE, 3)
+        return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + ROBOT, sizes, noise)
+
+    def all(self, state: SlamState, which: Sequence[int], points: Array, spreads: Array | None) -> Sights:
+        """Points of the state, then those of the map."""
+        return joined(self.mapped(state, which), self.known(state.robot, points, spreads))
+
+
+def joined(first: Sights, second: Sights) -> Sights:
+    """The rows of both, ``first`` before ``second``."""
+    if not len(first) or not len(second):
+        return first if len(first) else second
+    names = Sights.__dataclass_fields__
+    return Sights(*(np.concatenate((getattr(first, name), getattr(second, name))) for name in names))
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """``carried`` (12 + D, 2K): covariance of state and predicted pixels; ``jacobian`` (2K, C) by the ``columns`` (C,) of the error
+    state; ``covariance`` (2K, 2K) of the innovation, without noise."""
+
+    carried: Array
+    jacobian: Array
+    columns: Integers
+    covariance: Array
+
+    @staticmethod
+    def of(sights: Sights, covariance: Array) -> Innovation:
+        columns, jacobian = sights.columns()
+        carried = covariance[:, columns] @ jacobian.T
+        return Innovation(carried, jacobian, columns, jacobian @ carried[columns])
+
+    def each(self, noise: Array) -> Array:
+        """The covariance (K, 2, 2) of each pixel's innovation, with ``noise`` (K, 2, 2)."""
+        k = np.arange(len(noise))
+        blocks = self.covariance.reshape(len(noise), 2, len(noise), 2)
+        return np.asarray(blocks[k, :, k, :] + noise)
+
+    def root(self, noise: Array) -> Array:
+        """The Cholesky factor (2K, 2K) of the innovation's covariance, with ``noise`` (K, 2, 2)."""
+        total = self.covariance.copy()
+        blocks = total.reshape(len(noise), 2, len(noise), 2)
+        k = np.arange(len(noise))
+        blocks[k, :, k, :] += noise
+        return positive.root(total)
+
+    def gain(self, noise: Array) -> tuple[Array, Array]:
+        """:meth:`root`, and its inverse times ``carried`` transposed."""
+        root = self.root(noise)
+        return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
+
+
+def squared(residual: Array, covariance: Array) -> Array:
+    """Squares (K,) of ``residual`` (K, 2) in units of ``covariance`` (K, 2, 2)."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    x, y = residual[:, 0], residual[:, 1]
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
+
+
+def widening(residual: Array, innovation: Innovation, noise: Array) -> Array:
+    """By how much (K,) the noise of each pixel is widened: the square of the excess beyond the gate."""
+    return np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE) ** 2

@@ -1,0 +1,195 @@
+"""Points that no map has: their sightings wait until they tell where the point is.
+
+That needs sightings from :data:`FEWEST` keyframes whose rays enclose an angle wide enough (a parallax test) for the errors of
+pixels and poses, that meet in front of the camera, and that are seen where the place that they give says. A sighting that
+contradicts the others is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+FEWEST, MAX_WAITING = 3, 10  # sightings of one point
+MIN_PARALLAX = 0.03  # rad, between the outermost rays
+MAX_SPREAD = 0.15  # standard deviation of a place that is good enough to begin with, as a share of the least depth
+NEAREST = 0.3  # m of depth
+ITERATIONS, SETTLED = 4, 1e-3  # m: a step that needs no further one
+GATE = 0.999  # probability of the residuals to be that small, if all sightings are right
+PATIENCE = 20  # keyframes that a point waits without being seen again
+ORIGIN, UNTURNED = np.zeros(3), np.eye(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A point seen from a keyframe, by its number, at ``pixel`` (2,): in the direction ``ray`` (3,) of the camera's frame."""
+
+    keyframe: int
+    pixel: Array
+    ray: Array
+
+
+def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sighting]:
+    """Of ``pixels`` (K, 2) seen from a keyframe."""
+    rays = reprojection.rays(model, pixels)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return [Sighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the camera of a keyframe is: ``centre`` (3,) and ``rotation`` (3, 3) in the world; and how far off in the image its
+    error may put points, ``slack`` [px]."""
+
+    centre: Array
+    rotation: Array
+    slack: float
+
+    @classmethod
+    def of(cls, model: CameraModel, pose: Array, slack: float) -> Place:
+        """Of the robot at ``pose`` (3,)."""
+        return cls(*reprojection.camera_pose(model, pose), slack)
+
+
+@dataclass(frozen=True, slots=True)
+class Triangulated:
+    """A point's ``position`` (3,), its ``covariance`` (3, 3) with exact poses, and the squared whitened residuals (M,) of its
+    sightings."""
+
+    position: Array
+    covariance: Array
+    squared: Array
+
+
+class NewPoints:
+    """The sightings that wait, by the name or number of their point."""
+
+    def __init__(self, model: CameraModel) -> None:
+        self._model = model
+        self._waiting: dict[Hashable, list[Sighting]] = {}
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def count(self, name: Hashable) -> int:
+        """How many sightings of a point wait."""
+        return len(self._waiting.get(name, ()))
+
+    def waiting(self) -> Mapping[Hashable, Sequence[Sighting]]:
+        """All that wait."""
+        return self._waiting
+
+    def add(self, name: Hashable, sighting: Sighting) -> None:
+        """One more sighting; the oldest ones do not wait for ever."""
+        waiting = self._waiting.setdefault(name, [])
+        waiting.append(sighting)
+        del waiting[:-MAX_WAITING]
+
+    def forget(self, keyframe: int) -> None:
+        """Give up the points that were last seen long before a keyframe."""
+        self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
+
+    def ready(
+        self, names: Iterable[Hashable], places: Callable[[int], Place | None], most: int = 1000
+    ) -> list[tuple[Hashable, Triangulated, list[Sighting]]]:
+        """Those of ``names``, at ``most`` so many, whose place is told by now, with the sightings that tell it; they wait no
+        longer. ``places``: of keyframes, None for one that nothing can be added to."""
+        found: list[tuple[Hashable, Triangulated, list[Sighting]]] = []
+        known: dict[int, Place | None] = {}
+        for name in names:
+            waiting = self._waiting.get(name, [])
+            if len(waiting) < FEWEST or len(found) >= most:
+                continue
+            for sighting in waiting:
+                if sighting.keyframe not in known:
+                    known[sighting.keyframe] = places(sighting.keyframe)
+            seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
+            if len(seen) < FEWEST or not apart(self._model, *seen[0], *seen[-1]):
+                continue
+            result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen], MAX_SPREAD)
+            if result is not None:
+                del self._waiting[name]
+                found.append((name, *result))
+        return found
+
+
+def apart(
+    model: CameraModel, first: Sighting, here: Place, last: Sighting, there: Place, spread: float = MAX_SPREAD
+) -> bool:
+    """Whether it is worth a try: two rays alone would nearly tell the point's place to the share ``spread`` of its depth."""
+    sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
+    angle = max(MIN_PARALLAX, min(sigma / spread, 0.5))
+    return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
+
+
+def agreed(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
+) -> tuple[Triangulated, list[Sighting]] | None:
+    """The point of ``seen`` from ``places``, and those sightings that agree on it; None where they do not tell it to the share
+    ``spread`` of its depth. Where they contradict each other, the one goes without which the others do so least."""
+    seen, places = list(seen), list(places)
+    found = _triangulate(model, seen, places, spread)
+    while found is not None and not found.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
+        if len(seen) <= FEWEST:
+            return None
+        best: tuple[float, int, Triangulated] | None = None
+        for i in range(len(seen)):
+            others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], spread)
+            if others is not None and (best is None or others.squared.sum() < best[0]):
+                best = float(others.squared.sum()), i, others
+        if best is None:
+            return None
+        _, out, found = best
+        del seen[out], places[out]
+    return None if found is None else (found, seen)
+
+
+def triangulate(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float = MAX_SPREAD
+) -> Triangulated | None:
+    """The point ``seen`` M times from ``places``; None where the rays are too nearly parallel, do not meet in front of the camera,
+    or tell the place worse than to the share ``spread`` of its least depth.
+
+    It begins where the rays come nearest to each other, and minimises the squared residuals in the images.
+    """
+    found = _triangulate(model, seen, places, spread)
+    return None if found is None or not math.isfinite(found.squared.sum()) else found
+
+
+def _triangulate(
+    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
+) -> Triangulated | None:
+    """The same, with residuals that are infinite where the rays do not meet in front of the camera."""
+    centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
+    rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
+    if (rays @ rays.T).min() > math.cos(MIN_PARALLAX):
+        return None
+    pixels, sigmas = np.array([s.pixel for s in seen]), np.array([math.hypot(model.sigma, p.slack) for p in places])
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    point = np.linalg.solve(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])
+    for i in range(ITERATIONS + 1):
+        local = ((point - centres)[:, None, :] @ turns)[:, 0]
+        if not local[:, 2].min() > NEAREST:
+            return Triangulated(point, UNTURNED, np.full(len(seen), np.inf))
+        # a point in the frame of a camera is as one of the world seen by a camera that is not moved
+        at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
+        residual = (at - pixels) / sigmas[:, None]
+        jacobian = (by_local @ turns.transpose(0, 2, 1) / sigmas[:, None, None]).reshape(-1, 3)
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        # at first it need not be that good
+        if np.linalg.eigvalsh(covariance)[-1] > ((2.0 if i == 0 else 1.0) * spread * local[:, 2].min()) ** 2:
+            return None
+        if i < ITERATIONS:
+            step = covariance @ (jacobian.T @ residual.ravel())
+            point = point - step
+            if np.abs(step).max() < SETTLED:
+                break
+    return Triangulated(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))

@@ -1,0 +1,237 @@
+"""How a robot moves in space between two times: one step of a filter whose error state has 12 values.
+
+The error state is (turn, shift, velocity, turn rate): turn and shift (3,) of the pose in the robot's own frame, as ``gtsam.Pose3``
+has them, the velocity (3,) in the world's frame and the turn rate (3,) in the robot's.
+
+Constant velocity: Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis
+and Machine Intelligence 29(6), 2007, section III.D: unknown accelerations a and alpha act as impulses a dt and alpha dt,
+so the noise depends on how long the steps are.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factors.motion import Increment
+from factors.se2 import Array
+
+ROBOT = 12  # values of the error state
+TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+PLANAR = [3, 4, 2]  # of the pose's error state: x, y and heading of a robot that stands level
+UPRIGHT = [0, 1, 5]  # and what the floor holds: roll, pitch, height
+NO_VELOCITY = [8, 9, 10]  # velocities of these
+SETTLING = 1.0  # s, in which a robot that was lifted or tilted comes back to the floor
+HOLD = 1.0  # s, for which a measured motion holds on
+SHORTEST = 1e-3  # s, for which a velocity means something
+UNKNOWN = 0.5  # m and rad per sqrt(s) without any
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """The 13 values: ``position`` (3,) [m] in the world, ``rotation`` (3, 3) of the robot in the world, which stands for the
+    quaternion, ``velocity`` (3,) [m/s] in the world's frame and ``rate`` (3,) [rad/s] in the robot's."""
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    rate: Array
+
+    def plus(self, error: Array) -> RobotState:
+        """The state moved by an error (12,)."""
+        return RobotState(
+            self.position + self.rotation @ error[SHIFT],
+            orthonormal(self.rotation @ exp(error[TURN])),
+            self.velocity + error[VELOCITY],
+            self.rate + error[RATE],
+        )
+
+    def minus(self, other: RobotState) -> Array:
+        """The error (12,) that leads from ``other`` to this state."""
+        turn = log(other.rotation.T @ self.rotation)
+        shift = other.rotation.T @ (self.position - other.position)
+        return np.concatenate((turn, shift, self.velocity - other.velocity, self.rate - other.rate))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A prediction: the ``robot`` that it led to, the ``transition`` (12, 12) of its error and the ``noise`` (12, 12) added."""
+
+    robot: RobotState
+    transition: Array
+    noise: Array
+
+    def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
+        """This step with another after it."""
+        return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Motion in space: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start, with the ``covariance`` (6, 6)
+    of its perturbation at the end, turn first, then shift."""
+
+    rotation: Array
+    shift: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, which all that follows shares."""
+
+    robot: RobotState
+    covariance: Array
+
+    def of_pose(self, robot: RobotState) -> Array:
+        """What it makes of the covariance (6, 6) of a later pose."""
+        turn = robot.rotation.T @ self.robot.rotation
+        back = robot.rotation.T @ (self.robot.position - robot.position)
+        adjoint = np.zeros((6, 6))
+        adjoint[TURN, TURN] = adjoint[SHIFT, SHIFT] = turn
+        adjoint[SHIFT, TURN] = cross(back) @ turn
+        return adjoint @ self.covariance @ adjoint.T
+
+    def of_point(self, point: Array) -> Array:
+        """What it makes of the covariance (3, 3) of a ``point`` (3,)."""
+        rotation = self.robot.rotation
+        jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
+        return np.asarray(jacobian @ self.covariance @ jacobian.T)
+
+
+def standstill(robot: RobotState) -> Step:
+    """No motion: the step to a second measurement of the same time."""
+    return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
+
+
+def constant_velocity(robot: RobotState, dt: float, impulse: Array, angular_impulse: Array) -> Step:
+    """Motion at constant velocity over ``dt``; ``impulse``, ``angular_impulse`` (3,): standard deviations of what is added to
+    velocity and turn rate at its beginning."""
+    turned = exp(robot.rate * dt)
+    rotation = orthonormal(robot.rotation @ turned)
+    by_rate = dt * np.asarray(gtsam.Rot3.ExpmapDerivative(robot.rate * dt))
+    transition = np.eye(ROBOT)
+    transition[TURN, TURN] = transition[SHIFT, SHIFT] = turned.T
+    transition[TURN, RATE] = by_rate
+    transition[SHIFT, VELOCITY] = dt * rotation.T
+    spread = np.concatenate((impulse, angular_impulse)) ** 2
+    noise = (transition[:, 6:] * spread) @ transition[:, 6:].T
+    moved = RobotState(robot.position + robot.velocity * dt, rotation, robot.velocity, robot.rate)
+    return Step(moved, transition, noise)
+
+
+def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
+    """Motion that was measured over ``dt``: it replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
+    dt = max(dt, SHORTEST)
+    rotation = orthonormal(robot.rotation @ motion.rotation)
+    transition, by_noise = np.zeros((ROBOT, ROBOT)), np.zeros((ROBOT, 6))
+    transition[TURN, TURN] = transition[SHIFT, SHIFT] = motion.rotation.T
+    transition[SHIFT, TURN] = -motion.rotation.T @ cross(motion.shift)
+    transition[VELOCITY, TURN] = -robot.rotation @ cross(motion.shift) / dt
+    by_noise[:6] = np.eye(6)
+    by_noise[VELOCITY, SHIFT] = rotation / dt
+    by_noise[RATE, TURN] = np.eye(3) / dt
+    way = robot.rotation @ motion.shift
+    moved = RobotState(robot.position + way, rotation, way / dt, log(motion.rotation) / dt)
+    return Step(moved, transition, by_noise @ motion.covariance @ by_noise.T)
+
+
+def planar(increment: Increment) -> Displacement:
+    """Odometry of a robot on the floor, as motion in space."""
+    x, y, heading = increment.delta.tolist()
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(PLANAR, PLANAR)] = increment.covariance
+    return Displacement(about_z(heading), np.array((x, y, 0.0)), covariance)
+
+
+def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) -> Step:
+    """A step of a robot that the floor holds: height, roll and pitch are those of a stationary process around zero with these
+    standard deviations, whatever the step says of them, and have no velocity. Small tilts."""
+    keep = math.exp(-dt / SETTLING)
+    robot = step.robot
+    heading = about_z(math.atan2(robot.rotation[1, 0], robot.rotation[0, 0]))
+    rotation = heading @ exp(keep * log(heading.T @ robot.rotation))
+    position = np.array((robot.position[0], robot.position[1], keep * robot.position[2]))
+    velocity = np.array((robot.velocity[0], robot.velocity[1], 0.0))
+    rate = np.array((0.0, 0.0, robot.rate[2]))
+    transition, noise = np.eye(ROBOT), np.zeros((ROBOT, ROBOT))
+    sigmas = np.array((tilt_sigma, tilt_sigma, height_sigma))
+    transition[UPRIGHT, UPRIGHT] = keep
+    transition[NO_VELOCITY, NO_VELOCITY] = 0.0
+    noise[UPRIGHT, UPRIGHT] = (1.0 - keep**2) * sigmas**2
+    noise[NO_VELOCITY, NO_VELOCITY] = np.square((height_sigma, tilt_sigma, tilt_sigma)) / SETTLING**2
+    return step.then(transition, noise, RobotState(position, rotation, velocity, rate))
+
+
+class TwistChain:
+    """Measured velocities in, motion between any two times out. ``horizon``: seconds of rows that are kept."""
+
+    def __init__(self, settings: TwistSettings, horizon: float = math.inf) -> None:
+        self._spread = np.square((*settings.turn, *settings.shift))
+        self._horizon = horizon
+        self._t: list[float] = []
+        self._rows: list[tuple[Array, Array]] = []
+
+    def add(self, t: float, v: Array, w: Array) -> bool:
+        """Take a row; False if it is older than the newest, whose motion is used already."""
+        if self._t and t < self._t[-1]:
+            return False
+        self._t.append(t)
+        self._rows.append((v, w))
+        old = bisect.bisect_left(self._t, t - self._horizon) - 1
+        if old > 0:
+            del self._t[:old], self._rows[:old]
+        return True
+
+    def between(self, start: float, end: float) -> Displacement:
+        """The motion from ``start`` to ``end``, later; a velocity holds until the next row, for at most :data:`HOLD`."""
+        rotation, shift, covariance = np.eye(3), np.zeros(3), np.zeros((6, 6))
+        first, last = bisect.bisect_right(self._t, start), bisect.bisect_left(self._t, end)
+        cuts = [start, *(t for t in self._t[first:last]), end]
+        for k, (a, b) in enumerate(pairwise(cuts)):
+            row = first - 1 + k
+            held = b - a if row >= 0 and b - self._t[row] <= HOLD else 0.0
+            v, w = self._rows[row] if held else (np.zeros(3), np.zeros(3))
+            turned = exp(w * (b - a))
+            moved = exp(w * (0.5 * (b - a))) @ v * (b - a)
+            transition = np.zeros((6, 6))
+            transition[TURN, TURN] = transition[SHIFT, SHIFT] = turned.T
+            transition[SHIFT, TURN] = -turned.T @ cross(moved)
+            covariance = transition @ covariance @ transition.T
+            spread = self._spread if held else np.full(6, UNKNOWN**2)
+            covariance[np.diag_indices(6)] += spread * (b - a)
+            shift, rotation = shift + rotation @ moved, rotation @ turned
+        return Displacement(orthonormal(rotation), shift, covariance)
+
+
+def exp(turn: Array) -> Array:
+    """The rotation (3, 3) of a turn (3,)."""
+    return np.asarray(gtsam.Rot3.Expmap(turn).matrix())
+
+
+def log(rotation: Array) -> Array:
+    """The turn (3,) of a rotation (3, 3)."""
+    return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(rotation)))
+
+
+def about_z(angle: float) -> Array:
+    """The rotation (3, 3) by ``angle`` [rad] about z, counter-clockwise as seen from above."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+
+
+def cross(v: Array) -> Array:
+    """The matrix (3, 3) of the cross product with ``v`` (3,)."""
+    x, y, z = v.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def orthonormal(rotation: Array) -> Array:
+    """A rotation (3, 3) without the rounding errors that its products gather."""
+    return np.asarray(rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation))

@@ -1,0 +1,27 @@
+"""The features of one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.se2 import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """The features of one image, none where it could not be read.
+
+    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left one; ``sizes`` (K,) [px] and ``descriptors``
+    (K, D), of the kind ``feature``. ``tracks`` (K,): numbers that stay with what is followed from image to image.
+    """
+
+    t: float
+    feature: str
+    pixels: Array
+    sizes: Array
+    descriptors: NDArray[Any]
+    tracks: NDArray[np.int64]

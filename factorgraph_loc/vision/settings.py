@@ -1,0 +1,16 @@
+"""Settings of the features that are found in images."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from factorgraph_loc.files.models import FileModel
+
+
+class FrontendSettings(FileModel):
+    """What is looked for in images: the ``feature`` by its name, and at most how many (``count``) in an image."""
+
+    feature: Literal["colour", "sift", "orb"] = "colour"
+    count: Annotated[int, Field(ge=10, le=20_000)] = 500

@@ -1,0 +1,171 @@
+"""Points seen by a camera as a factor on a pose, and where they are not known, or constants of the camera are not, on those too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import se2
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.kernels import NEAREST
+from factors.camera.model import (
+    PARAMETERS,
+    TIME_OFFSET,
+    CameraModel,
+    huber_loss,
+    huber_weight,
+    in_camera,
+    lens_of,
+    linearize,
+    project,
+    recalibrated,
+)
+from factors.displaced import carried, common_error, delayed, displaced
+from factors.se2 import Array
+
+NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
+BEHIND = 100.0  # standard deviations that a sighting of a point behind the camera is off by
+
+
+@dataclass(frozen=True, slots=True)
+class ReprojectionFactor:
+    """K points seen in one image, as a factor on the robot's pose then or a little earlier.
+
+    ``points`` (K, 3): of the world; ``pixels`` (K, 2): where they are seen; ``point_covariances`` (K, 3, 3) of a
+    map that is not exact widen the noise. ``offset`` (3,): the pose at the image's time in the frame of the variable's pose,
+    known from odometry; ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``twist`` (3,): the
+    robot's velocity then.
+
+    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
+    constants (P,); then, where ``free``, the position (3,) of the one point, in place of ``points``.
+    """
+
+    model: CameraModel
+    points: Array
+    pixels: Array
+    offset: Array | None = None
+    offset_covariance: Array | None = None
+    point_covariances: Array | None = None
+    estimated: tuple[int, ...] = ()
+    free: bool = False
+    twist: Array | None = None
+
+    @property
+    def of_pose_alone(self) -> bool:
+        """Whether its only value is the pose."""
+        return not self.estimated and not self.free
+
+    def packed(self) -> pixel_kernels.Seen:
+        """As compiled code takes it, where it is a factor :attr:`of_pose_alone`."""
+        model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
+        return pixel_kernels.Seen(
+            lens_of(model),
+            model.position,
+            model.rotation,
+            np.ascontiguousarray(self.points, dtype=float),
+            np.ascontiguousarray(self.pixels, dtype=float),
+            EXACT if spreads is None else np.ascontiguousarray(spreads),
+            NOT_MOVED if offset is None else offset,
+            NO_SPREAD if noise is None else noise,
+            float(model.sigma),
+            float(model.robust),
+            float(model.tempering),
+        )
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        if self.of_pose_alone:
+            residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
+            return residual, [jacobian]
+        error, blocks = self.whitened(values)
+        weight = np.sqrt(self.weight(np.einsum("ki,ki->k", error, error)))
+        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
+        return (weight[:, None] * error).ravel(), weighted
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss."""
+        error, _ = self.whitened(values)
+        return self.model.tempering * float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return self.model.tempering * huber_weight(squared, self.model.robust)
+
+    def widened(self, width: float) -> ReprojectionFactor:
+        """The same with a robust loss that is ``width`` times as wide."""
+        return replace(self, model=replace(self.model, robust=width * self.model.robust))
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        if self.of_pose_alone:
+            residual, jacobian = pixel_kernels.whitened(self.packed(), np.ascontiguousarray(values[0], dtype=float))
+            return residual, [jacobian]
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+        offset = here.offset
+        at = values[0] if offset is None else se2.compose(values[0], offset)
+        pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
+        error = (pixels - self.pixels) / self.model.sigma
+        if self.free and in_camera(here.model, at, here.points)[0, 2] < NEAREST:
+            # nothing behind a camera is seen by it: no way leads from there to where it is
+            error, by_pose, by_point, by_parameters = (
+                BEHIND + 0.0 * error,
+                0.0 * by_pose,
+                0.0 * by_point,
+                0.0 * by_parameters,
+            )
+        scale = 1.0 / self.model.sigma
+        by_pose = scale * by_pose
+        blocks = [by_pose]
+        if self.estimated:
+            by_parameters = scale * by_parameters
+            by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
+            if self.twist is not None:
+                by_parameters[..., TIME_OFFSET] = by_pose @ self.twist
+            blocks.append(by_parameters[..., list(self.estimated)])
+        if self.free:
+            blocks.append(scale * by_point)
+        spread = None
+        if self.point_covariances is not None:
+            spread = carried(scale * by_point, self.point_covariances)
+        if self.offset_covariance is not None:
+            common = common_error(by_pose, self.offset_covariance)
+            spread = common if spread is None else spread + common
+        return displaced(error, blocks, offset, spread)
+
+    def is_astray(self, pose: Array, point: Array) -> bool:
+        """Whether a free ``point`` (3,) cannot be what was seen by a robot at the variable's ``pose`` (3,): it lies behind the
+        camera, or is seen :data:`BEHIND` standard deviations away."""
+        at = pose if self.offset is None else se2.compose(pose, self.offset)
+        local = in_camera(self.model, at, point[None])
+        error = (project(self.model, local) - self.pixels) / self.model.sigma
+        return bool(local[0, 2] < NEAREST or np.sum(error**2) > BEHIND**2)
+
+    def fixed(self, parameters: Sequence[Array], point: Array | None) -> ReprojectionFactor:
+        """The factor on the pose alone, at given constants (one array (P,), or none) and position (3,) of a free point."""
+        if not parameters and point is None:
+            return self
+        model, offset = self.model, self.offset
+        if parameters:
+            changes = np.zeros(len(PARAMETERS))
+            changes[list(self.estimated)] = parameters[0]
+            model = recalibrated(model, changes)
+            offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
+        points = self.points if point is None else point[None]
+        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+
+    def dof(self) -> int:
+        """How many coordinates of pixels are measured."""
+        return 2 * len(self.pixels)
+
+
+def _turns(estimated: tuple[int, ...], changes: Array) -> Array:
+    """How small turns (3, 3) follow from changes of the camera's turn: the left Jacobian of SO(3), which is the right one of
+    the opposite turn."""
+    turn = np.zeros(3)
+    for place, value in zip(estimated, changes.tolist(), strict=True):
+        if place in (3, 4, 5):
+            turn[place - 3] = value
+    return np.asarray(gtsam.Rot3.ExpmapDerivative(-turn))

@@ -1,0 +1,220 @@
+"""The arithmetic of :mod:`factors.camera.model`, compiled: one camera, many points or many poses."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from factors.se2 import Array
+
+NEAREST = 0.05  # m in front of the camera
+MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method; the length of a residual that needs no further step
+BLOCK = 256  # poses whose likelihood is found together: what is known of them stays in the fastest cache
+
+# fx, fy, cx, cy, k1, k2, p1, p2, and the reciprocal of the x^2 + y^2 up to which the polynomial of the distortion is used
+Lens = tuple[float, ...]
+Place = tuple[tuple[float, ...], ...]
+
+
+@numba.njit(cache=True, inline="always")
+def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
+    """The polynomial at the direction (x, y), and its derivatives xx, xy = yx and yy."""
+    k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
+    rr = x * x + y * y
+    radial = 1.0 + k1 * rr + k2 * rr * rr
+    slope = 2.0 * (k1 + 2.0 * k2 * rr)
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x)
+    yd = y * radial + p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y
+    xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+    yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    return xd, yd, xx, xy, yy
+
+
+@numba.njit(cache=True, inline="always")
+def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
+    """The distorted direction, and its Jacobian by rows. Beyond the end of the polynomial B it goes on straight outwards, as
+    t B(x / t) with t = r / end, so that nothing far outside of the image is seen in it."""
+    t = math.sqrt(max(1.0, k[8] * (x * x + y * y)))
+    inverse = 1.0 / t
+    ex, ey = inverse * x, inverse * y
+    xd, yd, xx, xy, yy = _brown(k, ex, ey)
+    tx, ty = (k[8] * ex, k[8] * ey) if t > 1.0 else (0.0, 0.0)  # derivatives of t
+    ax, ay = xd - xx * ex - xy * ey, yd - xy * ex - yy * ey
+    return t * xd, t * yd, xx + ax * tx, xy + ax * ty, xy + ay * tx, yy + ay * ty
+
+
+@numba.njit(cache=True, inline="always")
+def pixel(
+    k: Lens, p0: float, p1: float, p2: float
+) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
+    """The pixel of a point, and how its two coordinates depend on the point."""
+    near = 1.0 / max(p2, NEAREST)
+    x, y = p0 * near, p1 * near
+    xd, yd, xx, xy, yx, yy = _distorted(k, x, y)
+    fx, fy, fz = k[0] * near, k[1] * near, 0.0 if p2 < NEAREST else -1.0
+    by_u = (fx * xx, fx * xy, fx * fz * (xx * x + xy * y))
+    by_v = (fy * yx, fy * yy, fy * fz * (yx * x + yy * y))
+    return k[0] * xd + k[2], k[1] * yd + k[3], by_u, by_v
+
+
+@numba.njit(cache=True, inline="always")
+def mounting(position: Array, rotation: Array) -> Place:
+    """The camera's place in the robot's frame, as numbers: its position, and its axes."""
+    p, r = position, rotation
+    right, down, ahead = (r[0, 0], r[1, 0], r[2, 0]), (r[0, 1], r[1, 1], r[2, 1]), (r[0, 2], r[1, 2], r[2, 2])
+    return (p[0], p[1], p[2]), right, down, ahead
+
+
+@numba.njit(cache=True, inline="always")
+def in_camera(
+    place: Place, c: float, s: float, dx: float, dy: float, z: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """A point that is (dx, dy, z) from a robot with the heading (c, s): as it lies from the camera along the robot's axes, and in
+    the camera's frame."""
+    position, right, down, ahead = place
+    ax, ay, az = c * dx + s * dy - position[0], c * dy - s * dx - position[1], z - position[2]
+    lx = right[0] * ax + right[1] * ay + right[2] * az
+    ly = down[0] * ax + down[1] * ay + down[2] * az
+    lz = ahead[0] * ax + ahead[1] * ay + ahead[2] * az
+    return (ax, ay, az), (lx, ly, lz)
+
+
+@numba.njit(cache=True, inline="always")
+def _huber(squared: float, scale: float) -> float:
+    """The loss of Huber (1964): half the square up to ``scale``, linear beyond."""
+    size = math.sqrt(squared)
+    return 0.5 * squared if size <= scale else scale * (size - 0.5 * scale)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def huber_losses(squared: Array, scale: float) -> Array:
+    """Of squared residuals (K,)."""
+    losses = np.empty_like(squared)
+    for i in range(len(squared)):
+        losses[i] = _huber(squared[i], scale)
+    return losses
+
+
+@numba.njit(cache=True, error_model="numpy")
+def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
+    """The directions (K, 2) that are distorted to ``seen`` (K, 2), where the determinant is positive, and how far off they are when
+    distorted (K,); NaN of NaN."""
+    n = len(seen)
+    directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
+    for i in range(n):
+        # from the axis, where every lens is invertible, first to the direction without distortion
+        x, y, step_x, step_y, share = 0.0, 0.0, seen[i, 0], seen[i, 1], 1.0
+        for _ in range(MOST_STEPS):
+            to_x, to_y = x + share * step_x, y + share * step_y
+            xd, yd, xx, xy, yx, yy = _distorted(k, to_x, to_y)
+            eu, ev, determinant = seen[i, 0] - xd, seen[i, 1] - yd, xx * yy - xy * yx
+            error = math.sqrt(eu * eu + ev * ev)
+            if not (determinant > 0.0 and error < errors[i]):  # too far, or over a fold
+                share *= 0.5
+                continue
+            x, y, errors[i] = to_x, to_y, error
+            directions[i, 0], directions[i, 1] = x, y
+            if error < ENOUGH:
+                break
+            step_x, step_y, share = (yy * eu - xy * ev) / determinant, (xx * ev - yx * eu) / determinant, 1.0
+    return directions, errors
+
+
+@numba.njit(cache=True, error_model="numpy")
+def project(k: Lens, points: Array) -> tuple[Array, Array]:
+    """Pixels (K, 2) of points (K, 3) in the camera's frame, and their Jacobians (K, 2, 3)."""
+    n = len(points)
+    pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
+    for i in range(n):
+        u, v, by_u, by_v = pixel(k, points[i, 0], points[i, 1], points[i, 2])
+        pixels[i, 0], pixels[i, 1] = u, v
+        for j in range(3):
+            jacobians[i, 0, j], jacobians[i, 1, j] = by_u[j], by_v[j]
+    return pixels, jacobians
+
+
+@numba.njit(cache=True, error_model="numpy")
+def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
+    """As of :func:`factors.camera.model.linearize_in_space`."""
+    n = len(points)
+    pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
+    for i in range(n):
+        dx, dy, dz = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+        x = dx * rotation[0, 0] + dy * rotation[1, 0] + dz * rotation[2, 0]
+        y = dx * rotation[0, 1] + dy * rotation[1, 1] + dz * rotation[2, 1]
+        z = dx * rotation[0, 2] + dy * rotation[1, 2] + dz * rotation[2, 2]
+        u, v, by_u, by_v = pixel(k, x, y, z)
+        pixels[i, 0], pixels[i, 1] = u, v
+        for r in range(2):
+            a, b, c = by_u if r == 0 else by_v
+            # a turn w moves the point in the camera's frame by -w x p
+            by_camera[i, r, 0], by_camera[i, r, 1], by_camera[i, r, 2] = b * z - c * y, c * x - a * z, a * y - b * x
+            by_camera[i, r, 3], by_camera[i, r, 4], by_camera[i, r, 5] = -a, -b, -c
+            for j in range(3):
+                by_point[i, r, j] = a * rotation[j, 0] + b * rotation[j, 1] + c * rotation[j, 2]
+    return pixels, by_camera, by_point
+
+
+@numba.njit(cache=True, error_model="numpy")
+def linearize(
+    k: Lens, position: Array, rotation: Array, pose: Array, points: Array
+) -> tuple[Array, Array, Array, Array]:
+    """As of :func:`factors.camera.model.linearize`."""
+    n, place = len(points), mounting(position, rotation)
+    pixels, by_pose, by_point = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
+    by_parameters = np.zeros((n, 2, 8))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(n):
+        (ax, ay, az), (lx, ly, lz) = in_camera(
+            place, c, s, points[i, 0] - pose[0], points[i, 1] - pose[1], points[i, 2]
+        )
+        rx, ry = ax + position[0], ay + position[1]  # from the robot
+        u, v, by_u, by_v = pixel(k, lx, ly, lz)
+        pixels[i, 0], pixels[i, 1] = u, v
+        for r in range(2):
+            d = by_u if r == 0 else by_v
+            b0 = d[0] * rotation[0, 0] + d[1] * rotation[0, 1] + d[2] * rotation[0, 2]
+            b1 = d[0] * rotation[1, 0] + d[1] * rotation[1, 1] + d[2] * rotation[1, 2]
+            b2 = d[0] * rotation[2, 0] + d[1] * rotation[2, 1] + d[2] * rotation[2, 2]
+            by_pose[i, r, 0], by_pose[i, r, 1], by_pose[i, r, 2] = -b0, -b1, b0 * ry - b1 * rx
+            by_point[i, r, 0], by_point[i, r, 1], by_point[i, r, 2] = c * b0 - s * b1, s * b0 + c * b1, b2
+            by_parameters[i, r, 0], by_parameters[i, r, 1], by_parameters[i, r, 2] = -b0, -b1, -b2
+            by_parameters[i, r, 3] = b1 * az - b2 * ay
+            by_parameters[i, r, 4] = b2 * ax - b0 * az
+            by_parameters[i, r, 5] = b0 * ay - b1 * ax
+        by_parameters[i, 0, 6] = u - k[2]
+        by_parameters[i, 1, 6] = v - k[3]
+    return pixels, by_pose, by_point, by_parameters
+
+
+@numba.njit(cache=True, error_model="numpy")
+def log_likelihood(
+    k: Lens,
+    position: Array,
+    rotation: Array,
+    poses: Array,
+    points: Array,
+    pixels: Array,
+    whiteners: Array,
+    scale: float,
+) -> Array:
+    """As of :func:`factors.camera.model.log_likelihood`, untempered, with ``whiteners`` (K, 2, 2) of the residuals."""
+    place = mounting(position, rotation)
+    px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    out = np.zeros(len(poses))
+    for start in range(0, len(poses), BLOCK):
+        rows = slice(start, start + BLOCK)
+        bx, by, bc, bs, total = px[rows], py[rows], c[rows], s[rows], out[rows]
+        for i in range(len(points)):
+            x, y, z, seen_u, seen_v = points[i, 0], points[i, 1], points[i, 2], pixels[i, 0], pixels[i, 1]
+            uu, uv, vu, vv = whiteners[i, 0, 0], whiteners[i, 0, 1], whiteners[i, 1, 0], whiteners[i, 1, 1]
+            # poses side by side, and no other array than theirs: several are computed by one instruction
+            for n in range(len(total)):
+                _, (lx, ly, lz) = in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
+                u, v, _, _ = pixel(k, lx, ly, lz)
+                a, b = uu * (u - seen_u) + uv * (v - seen_v), vu * (u - seen_u) + vv * (v - seen_v)
+                total[n] -= _huber(a * a + b * b, scale)
+    return out

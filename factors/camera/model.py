@@ -1,0 +1,236 @@
+"""A pinhole camera with distortion on a robot: where points are seen, and how that depends on everything.
+
+The camera sits on the robot at ``rTc``; its axes are z forward, x right, y down. A point p in the camera's frame is seen at the
+pixel (fx x + cx, fy y + cy) of its distorted direction (x, y), with radial and tangential distortion (k1, k2, p1, p2) after
+Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as OpenCV and ``gtsam.Cal3DS2`` have it. The noise
+of a pixel is Gaussian in its core; the loss of Huber (1964) limits the pull of a point that is wrong.
+
+That polynomial grows along the radius only up to where the lens would fold the image; directions farther out, outside of the image
+of a lens that can be inverted, are continued straight outwards, so that what lies there is not seen in the image.
+
+Points that are nearer than :data:`~factors.camera.kernels.NEAREST` or behind the camera are taken as that far away, and are
+seen far outside of the image: nothing throws, and every value is finite.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import positive, se2
+from factors.camera import kernels as reprojection_kernels
+from factors.camera.kernels import Lens
+from factors.se2 import Array
+
+# the constants of a camera that can be estimated: its place [m] and small turns [rad] about the robot's axes, the
+# logarithm of its focal length, and how much later it saw than its stamp says [s]
+PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
+FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
+WIDEST = 4.0  # of x^2 + y^2: farther out, 63 degrees off the axis, no polynomial of distortion is used
+GRID = 33  # rows and columns of pixels at which a lens is checked
+NONE = 1e-9  # of a distorted direction: no difference
+
+# columns: the camera's axes in the frame of a robot that looks along its x axis, z up
+FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """What we believe about a camera.
+
+    ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2); ``width``, ``height`` [px] of its images. ``position``
+    (3,) [m] and ``rotation`` (3, 3) of the camera in the robot's frame. ``sigma`` [px] in u and in v; ``robust``: scale of
+    Huber's loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 where errors stay from image to image.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    rotation: Array = field(default_factory=FORWARD.copy)
+    sigma: float = 1.0
+    robust: float = 2.0
+    tempering: float = 1.0
+
+    def intrinsics(self) -> Array:
+        """(fx, fy, cx, cy, k1, k2, p1, p2) as an array (8,)."""
+        return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion))
+
+    def matrix(self) -> Array:
+        """The camera matrix (3, 3)."""
+        return np.array(((self.fx, 0.0, self.cx), (0.0, self.fy, self.cy), (0.0, 0.0, 1.0)))
+
+    def calibration(self) -> gtsam.Cal3DS2:
+        """The same as GTSAM has it."""
+        return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
+
+    def contains(self, pixels: Array, margin: float = 0.0) -> Any:
+        """Whether ``pixels`` (..., 2) lie in the image, or at most ``margin`` pixels outside of it: truth values (...)."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
+        return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
+
+
+def mounting(roll: float, pitch: float, yaw: float) -> Array:
+    """The rotation (3, 3) of a camera in the robot's frame that looks along x and is then turned: ``roll`` about x,
+    ``pitch`` about y (down where positive), ``yaw`` about z (to the left)."""
+    (a, b), (c, d), (e, f) = ((math.cos(w), math.sin(w)) for w in (roll, pitch, yaw))
+    about_x = np.array(((1.0, 0.0, 0.0), (0.0, a, -b), (0.0, b, a)))
+    about_y = np.array(((c, 0.0, d), (0.0, 1.0, 0.0), (-d, 0.0, c)))
+    about_z = np.array(((e, -f, 0.0), (f, e, 0.0), (0.0, 0.0, 1.0)))
+    return np.asarray(about_z @ about_y @ about_x @ FORWARD)
+
+
+def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
+    """The model with ``changes`` (8,) of the constants :data:`PARAMETERS`; the time offset is the caller's business."""
+    turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())
+    scale = math.exp(float(changes[FOCAL]))
+    return replace(
+        model,
+        fx=scale * model.fx,
+        fy=scale * model.fy,
+        position=model.position + changes[:3],
+        rotation=turn @ model.rotation,
+    )
+
+
+def project(model: CameraModel, points: Array) -> Array:
+    """Pixels (K, 2) of ``points`` (K, 3) in the camera's frame."""
+    return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
+
+
+def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
+    """``points`` (K, 3) of the world in the frame of the camera of a robot at ``pose`` (3,)."""
+    local = np.empty_like(points, dtype=float)
+    local[:, :2] = se2.transform_to(pose, points[:, :2])
+    local[:, 2] = points[:, 2]
+    return np.asarray((local - model.position) @ model.rotation)
+
+
+def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
+    """Position (3,) and rotation (3, 3) in the world of the camera of a robot in space, at ``position`` with ``rotation``."""
+    return position + rotation @ model.position, rotation @ model.rotation
+
+
+def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
+    """The inverse of :func:`mounted`: position and rotation of the robot whose camera is at ``position`` (3,) with ``rotation``."""
+    turn = rotation @ model.rotation.T
+    return position - turn @ model.position, turn
+
+
+def camera_pose(model: CameraModel, pose: Array) -> tuple[Array, Array]:
+    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``pose`` (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    return mounted(model, np.array((pose[0], pose[1], 0.0)), turn)
+
+
+def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
+    """Pixels (K, 2) at which ``points`` (K, 3) of the world are seen from ``pose`` (3,), and their depths (K,) [m], below zero
+    behind the camera."""
+    local = in_camera(model, pose, points)
+    return project(model, local), local[:, 2]
+
+
+def undistorted(model: CameraModel, pixels: Array) -> Array:
+    """Directions (K, 2), as (x, y) at depth 1 in the camera's frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
+    Newton's method."""
+    seen = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
+    return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(seen))[0])
+
+
+def rays(model: CameraModel, pixels: Array) -> Array:
+    """The points (K, 3) at depth 1 in the camera's frame that are seen at ``pixels`` (K, 2)."""
+    return np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
+
+
+def folded(model: CameraModel) -> Array | None:
+    """A pixel (2,) at which the lens is not invertible, of a grid over the image with its corners; None where there is none.
+
+    It is invertible up to where its polynomial is used, as long as the determinant of its Jacobian stays positive.
+    """
+    if not any(model.distortion):
+        return None
+    u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in (model.width, model.height))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    lens = lens_of(model)
+    seen = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
+    directions, errors = reprojection_kernels.undistorted(lens, seen)
+    bad = ~(errors < NONE) | (lens[8] * np.sum(directions**2, axis=1) >= 1.0)
+    return np.asarray(pixels[np.argmax(bad)]) if bad.any() else None
+
+
+def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Pixels (K, 2) of ``points`` (K, 3) seen from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame
+    perturbation (K, 2, 3), by the points (K, 2, 3), and by small changes of :data:`PARAMETERS` (K, 2, 8), of which that by the
+    time offset is zero here, as it needs the robot's velocity."""
+    found: tuple[Array, Array, Array, Array] = reprojection_kernels.linearize(
+        lens_of(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
+    )
+    return found
+
+
+def linearize_in_space(
+    model: CameraModel, position: Array, rotation: Array, points: Array
+) -> tuple[Array, Array, Array]:
+    """Pixels (K, 2) of ``points`` (K, 3) seen from a camera anywhere in space, at ``position`` (3,) with ``rotation`` (3, 3) in the
+    world; their Jacobians by the camera's perturbation (K, 2, 6), turn first, then shift, both in the camera's frame as
+    ``gtsam.Pose3`` has them, and by the points (K, 2, 3)."""
+    found: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
+        lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
+    )
+    return found
+
+
+def log_likelihood(
+    model: CameraModel, poses: Array, points: Array, pixels: Array, covariances: Array | None = None
+) -> Array:
+    """The log-likelihood (N,), robust and tempered, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses`` (N, 3), up to a
+    constant.
+
+    ``covariances`` (K, 2, 2) [px^2]: of each pixel, from its noise and that of the map; by default that of the model.
+    """
+    if covariances is None:
+        whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
+    else:
+        whiteners = positive.whitener(covariances)
+    arguments = (lens_of(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
+    return model.tempering * np.asarray(
+        reprojection_kernels.log_likelihood(
+            *arguments,
+            np.ascontiguousarray(points, dtype=float),
+            np.ascontiguousarray(pixels, dtype=float),
+            whiteners,
+            model.robust,
+        )
+    )
+
+
+def huber_loss(squared: Array, scale: float) -> Array:
+    """The loss of squared whitened residuals: half of them up to ``scale`` standard deviations, linear beyond."""
+    return np.asarray(reprojection_kernels.huber_losses(np.ravel(squared), scale)).reshape(np.shape(squared))
+
+
+def huber_weight(squared: Array, scale: float) -> Array:
+    """The weight of squared whitened residuals in iteratively reweighted least squares."""
+    return np.asarray(scale / np.maximum(np.sqrt(squared), scale))
+
+
+def lens_of(model: CameraModel) -> Lens:
+    """What the kernels know of a camera: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which its
+    polynomial is used: where the radial part grows no more, at most :data:`WIDEST`; 0 without distortion, for everywhere."""
+    end = 0.0
+    if any(model.distortion):
+        k1, k2, *_ = model.distortion
+        # the radial part's slope at q = x^2 + y^2 is 1 + 3 k1 q + 5 k2 q^2: a quadratic of 1 / q
+        square = 9.0 * k1 * k1 - 20.0 * k2
+        end = max(1.0 / WIDEST, 0.5 * (math.sqrt(square) - 3.0 * k1) if square > 0.0 else 0.0)
+    return (*map(float, (model.fx, model.fy, model.cx, model.cy, *model.distortion)), end)

@@ -1,0 +1,219 @@
+"""What matches between two images tell of a planar robot's motion between them.
+
+A match is a pair of rays that should meet: with the camera's translation tau from the first image to the second, and the rotation R
+between them, the epipolar constraint is ``a . (tau x R b) = 0`` (Longuet-Higgins, Nature 293, 1981). Its first-order geometric
+error is Sampson's: the constraint over the standard deviation that the noise of both pixels gives it (Hartley and Zisserman,
+"Multiple View Geometry in Computer Vision", 2nd edition, 2004, eq. 11.9), here with the noise of each pixel carried through the
+lens. How long tau is cannot be seen: the error does not change along tau, so matches tell two of the three numbers of a
+planar motion.
+
+Two motions that follow each other share the image between them. Their errors are those of a moving average, whose power is at
+most twice, at any frequency, that of independent ones: with :data:`SHARED` of their information each, a chain of them claims
+no more than it knows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import se2
+from factors.camera.model import CameraModel, linearize_in_space, rays
+from factors.se2 import Array
+
+SHARED = 0.5  # share of the information that counts of a motion whose images are those of its neighbours too
+
+
+@dataclass(frozen=True, slots=True)
+class RayPairs:
+    """K matches: rays ``first`` and ``second`` (K, 3) in the robot's frame at the time of each image, of depth 1 along the
+    camera's ``axis`` (3,); how they move with the noise of their pixels, in standard deviations of it (K, 3, 2); and where the
+    camera is on the robot, ``position`` (3,) [m]."""
+
+    first: Array
+    second: Array
+    first_noise: Array
+    second_noise: Array
+    position: Array
+    axis: Array
+
+    @classmethod
+    def of(cls, model: CameraModel, first: Array, second: Array) -> RayPairs:
+        """Of pixels (K, 2) in both images."""
+        a, first_noise = _rays(model, np.asarray(first, dtype=float))
+        b, second_noise = _rays(model, np.asarray(second, dtype=float))
+        return cls(a, b, first_noise, second_noise, np.asarray(model.position, dtype=float), model.rotation[:, 2])
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def chosen(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> RayPairs:
+        """Those at ``which`` (M,), or where it (K,) is true."""
+        noises = self.first_noise[which], self.second_noise[which]
+        return RayPairs(self.first[which], self.second[which], *noises, self.position, self.axis)
+
+
+def sampson(pairs: RayPairs, motion: Array) -> tuple[Array, Array, Array]:
+    """Whitened errors (K,) of the matches under the robot's ``motion`` (3,) from the first image to the second, their Jacobian
+    (K, 3) by its body-frame perturbation, and how the constraint itself depends on that (K, 3), whitened, of the nearest rays that
+    meet. Zero where the motion leaves the camera where it is.
+
+    The Jacobian gives the slope of the cost. Its square is no information: near the epipole the standard deviation goes to
+    zero, and the Jacobian holds how noise over it changes. The square of the last is.
+    """
+    residual, jacobian, signal = np.empty(len(pairs)), np.empty((len(pairs), 3)), np.empty((len(pairs), 3))
+    arguments = (pairs.first, pairs.second, pairs.first_noise, pairs.second_noise, pairs.position)
+    _sampson(*arguments, float(motion[0]), float(motion[1]), float(motion[2]), residual, jacobian, signal)
+    return residual, jacobian, signal
+
+
+def translation(position: Array, motion: Array) -> Array:
+    """How far the camera at ``position`` (3,) on the robot moves (2,) [m] with the robot's ``motion`` (3,), in the robot's frame at
+    the first image; its height does not change."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    x, y = float(position[0]), float(position[1])
+    return np.array((motion[0] + c * x - s * y - x, motion[1] + s * x + c * y - y))
+
+
+def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
+    """The inverse of the depth (K,) [1/m] at which the rays of each match come nearest to each other under a robot's ``motion``
+    (3,), below zero where that is behind the camera, and its standard deviation (K,)."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    x, y = translation(pairs.position, motion)
+    a, b = pairs.first, pairs.second
+    turned = np.column_stack((c * b[:, 0] - s * b[:, 1], s * b[:, 0] + c * b[:, 1], b[:, 2]))
+    # a / rho = tau + mu R b, crossed with R b
+    far = np.column_stack((y * turned[:, 2], -x * turned[:, 2], x * turned[:, 1] - y * turned[:, 0]))
+    squared = np.maximum(np.einsum("ki,ki->k", far, far), 1e-18)
+    rho = np.einsum("ki,ki->k", np.cross(a, turned), far) / squared
+    noise = np.einsum("kij,kij->k", pairs.first_noise, pairs.first_noise) / 2.0
+    noise += np.einsum("kij,kij->k", pairs.second_noise, pairs.second_noise) / 2.0
+    return rho, np.sqrt(noise * np.einsum("ki,ki->k", turned, turned) / squared)
+
+
+def from_epipole(pairs: RayPairs, motion: Array) -> Array:
+    """How far from the epipole both rays of each match are (K,), the nearer one, in standard deviations of its pixel, under a
+    robot's ``motion`` (3,). Sampson's error is of first order: it holds where that is many."""
+    x, y = translation(pairs.position, motion)
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    found = []
+    for seen, noise, tx, ty in (
+        (pairs.first, pairs.first_noise, x, y),
+        (pairs.second, pairs.second_noise, c * x + s * y, c * y - s * x),
+    ):
+        across = np.hypot(np.hypot(seen[:, 2] * ty, seen[:, 2] * tx), seen[:, 0] * ty - seen[:, 1] * tx)
+        sigma = np.sqrt(np.einsum("kij,kij->k", noise, noise) / 2.0)
+        found.append(across / (sigma * max(math.hypot(tx, ty), 1e-12)))
+    return np.asarray(np.minimum(*found))
+
+
+class VisualOdometryFactor:
+    """A motion between two poses of which some numbers are told.
+
+    ``delta`` (3,): the second pose in the frame of the first; ``information`` (3, 3): of its body-frame perturbation, of any rank.
+    The values of the factor are the two poses (3,).
+    """
+
+    def __init__(self, delta: Array, information: Array) -> None:
+        self._delta = delta
+        values, vectors = np.linalg.eigh(information)
+        self._whitener = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * first^-1 * second)`` and its Jacobians."""
+        relative = se2.between(values[0], values[1])
+        error = se2.log(se2.between(self._delta, relative))
+        by_second = self._whitener @ np.linalg.inv(se2.right_jacobian(error))
+        return self._whitener @ error, [-by_second @ se2.adjoint(se2.inverse(relative)), by_second]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        error = self._whitener @ se2.log(se2.between(self._delta, se2.between(values[0], values[1])))
+        return 0.5 * float(error @ error)
+
+
+def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
+    local = rays(model, pixels)
+    _, by_camera, _ = linearize_in_space(model, np.zeros(3), np.eye(3), local)
+    # a shift of the camera moves the point the other way
+    by_ray = -by_camera[:, :, 3:5]
+    noise = model.sigma * np.linalg.inv(by_ray)
+    return np.ascontiguousarray(local @ model.rotation.T), np.ascontiguousarray(model.rotation[:, :2] @ noise)
+
+
+@numba.njit(cache=True)
+def _sampson(
+    first: Array,
+    second: Array,
+    first_noise: Array,
+    second_noise: Array,
+    position: Array,
+    dx: float,
+    dy: float,
+    turn: float,
+    residual: Array,
+    jacobian: Array,
+    signal: Array,
+) -> None:
+    c, s = math.cos(turn), math.sin(turn)
+    lever_x, lever_y = c * position[0] - s * position[1], s * position[0] + c * position[1]
+    tx, ty = dx + lever_x - position[0], dy + lever_y - position[1]
+    # how tau changes with a step along x or y of the robot's frame at the second image, and with a turn
+    change_x, change_y = (c, -s, -lever_y), (s, c, lever_x)
+    for k in range(len(first)):
+        a0, a1, a2 = first[k, 0], first[k, 1], first[k, 2]
+        b0, b1, b2 = second[k, 0], second[k, 1], second[k, 2]
+        q0, q1 = c * b0 - s * b1, s * b0 + c * b1
+        # by the first ray tau x R b, by the second one the cross product a x tau, turned back
+        g0, g1, g2 = ty * b2, -tx * b2, tx * q1 - ty * q0
+        h0, h1, h2 = -a2 * ty, a2 * tx, a0 * ty - a1 * tx
+        k0, k1 = c * h0 + s * h1, c * h1 - s * h0
+        p, n = first_noise[k], second_noise[k]
+        u0 = p[0, 0] * g0 + p[1, 0] * g1 + p[2, 0] * g2
+        u1 = p[0, 1] * g0 + p[1, 1] * g1 + p[2, 1] * g2
+        v0 = n[0, 0] * k0 + n[1, 0] * k1 + n[2, 0] * h2
+        v1 = n[0, 1] * k0 + n[1, 1] * k1 + n[2, 1] * h2
+        variance = u0 * u0 + u1 * u1 + v0 * v0 + v1 * v1
+        if variance <= 0.0:
+            residual[k] = 0.0
+            jacobian[k] = 0.0
+            signal[k] = 0.0
+            continue
+        sigma = math.sqrt(variance)
+        value = (a0 * g0 + a1 * g1 + a2 * g2) / sigma
+        residual[k] = value
+        # the rays that would meet
+        shift = value / sigma
+        m0, m1, m2 = (
+            a0 - shift * (p[0, 0] * u0 + p[0, 1] * u1),
+            a1 - shift * (p[1, 0] * u0 + p[1, 1] * u1),
+            a2 - shift * (p[2, 0] * u0 + p[2, 1] * u1),
+        )
+        w0, w1, w2 = (
+            b0 - shift * (n[0, 0] * v0 + n[0, 1] * v1),
+            b1 - shift * (n[1, 0] * v0 + n[1, 1] * v1),
+            b2 - shift * (n[2, 0] * v0 + n[2, 1] * v1),
+        )
+        r0, r1 = c * w0 - s * w1, s * w0 + c * w1
+        for j in range(3):
+            sx, sy = change_x[j], change_y[j]
+            dg0, dg1, dg2 = sy * b2, -sx * b2, sx * q1 - sy * q0
+            dh0, dh1, dh2 = -a2 * sy, a2 * sx, a0 * sy - a1 * sx
+            dk0, dk1 = c * dh0 + s * dh1, c * dh1 - s * dh0
+            if j == 2:
+                dg2 += tx * q0 + ty * q1  # R b turns too
+                dk0, dk1 = dk0 + k1, dk1 - k0
+            slope = u0 * (p[0, 0] * dg0 + p[1, 0] * dg1 + p[2, 0] * dg2)
+            slope += u1 * (p[0, 1] * dg0 + p[1, 1] * dg1 + p[2, 1] * dg2)
+            slope += v0 * (n[0, 0] * dk0 + n[1, 0] * dk1 + n[2, 0] * dh2)
+            slope += v1 * (n[0, 1] * dk0 + n[1, 1] * dk1 + n[2, 1] * dh2)
+            jacobian[k, j] = (a0 * dg0 + a1 * dg1 + a2 * dg2) / sigma - value * slope / variance
+            change = m0 * sy * w2 - m1 * sx * w2 + m2 * (sx * r1 - sy * r0)
+            if j == 2:
+                change += m2 * (tx * r0 + ty * r1)
+            signal[k, j] = change / sigma

@@ -1,0 +1,145 @@
+"""Identified landmarks as a factor on a pose, and where they are not known, or constants of the sensor are not, on those too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factors import se2
+from factors.displaced import carried, common_error, delayed, displaced
+from factors.landmarks.model import (
+    PARAMETERS,
+    TIME_OFFSET,
+    BearingRangeModel,
+    located,
+    log_likelihood,
+    recalibrated,
+    robust_loss,
+    robust_weight,
+    whitened,
+    whitened_all,
+)
+from factors.se2 import Array
+
+LEAST_TOLD = 1e-6  # of a landmark's place, in standard deviations per metre, and as a share of what is told best
+
+
+@dataclass(frozen=True, slots=True)
+class BearingRangeFactor:
+    """K landmarks seen at one time, as a factor on the robot's pose then or a little earlier.
+
+    ``points`` (K, 2): where the landmarks are; ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise.
+    ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, known from odometry;
+    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. All landmarks of the look have this error in
+    common; ``in_look``: how many they are, if those of other factors share it too, else K. ``twist`` (3,): the robot's velocity
+    then.
+
+    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
+    constants (P,); then, where ``free``, the position (2,) of the one landmark, in place of ``points``.
+    """
+
+    model: BearingRangeModel
+    points: Array
+    ranges: Array
+    bearings: Array
+    offset: Array | None = None
+    offset_covariance: Array | None = None
+    point_covariances: Array | None = None
+    estimated: tuple[int, ...] = ()
+    free: bool = False
+    twist: Array | None = None
+    in_look: int | None = None
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        error, blocks = self.whitened(values)
+        weight = np.sqrt(robust_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
+        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
+        return (weight[:, None] * error).ravel(), weighted
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss."""
+        error, _ = self.whitened(values)
+        return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
+
+    def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
+        """The log-likelihood (N,) of ``poses`` (N, 3) at the time of the look, up to a constant, each with its own ``parameters``
+        (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
+        seen = self.points, self.ranges, self.bearings
+        return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances)
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return robust_weight(squared, self.model.robust)
+
+    def widened(self, width: float) -> BearingRangeFactor:
+        """The same with a robust loss that is ``width`` times as wide."""
+        return replace(self, model=replace(self.model, robust=width * self.model.robust))
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+        offset = here.offset
+        at = values[0] if offset is None else se2.compose(values[0], offset)
+        arguments = (here.model, at, here.points, self.ranges, self.bearings)
+        if self.estimated or self.free or self.point_covariances is not None:
+            error, by_pose, by_point, by_sensor = whitened_all(*arguments)
+        else:
+            error, by_pose = whitened(*arguments)
+        blocks = [by_pose]
+        if self.estimated:
+            if self.twist is not None:
+                by_sensor[..., TIME_OFFSET] = by_pose @ self.twist
+            blocks.append(by_sensor[..., list(self.estimated)])
+        if self.free:
+            blocks.append(by_point)
+        spread = None
+        if self.point_covariances is not None:
+            spread = carried(by_point, self.point_covariances)
+        if self.offset_covariance is not None:
+            common = common_error(by_pose, self.offset_covariance, self.in_look)
+            spread = common if spread is None else spread + common
+        return displaced(error, blocks, offset, spread)
+
+    def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
+        """The factor on the pose alone, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
+        if not parameters and point is None:
+            return self
+        model, offset = self.model, self.offset
+        if parameters:
+            changes = np.zeros(len(PARAMETERS))
+            changes[list(self.estimated)] = parameters[0]
+            model = recalibrated(model, changes)
+            offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
+        points = self.points if point is None else point[None]
+        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+
+    def dof(self) -> int:
+        """How many ranges and bearings are measured."""
+        return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
+
+    def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
+        """Where the one landmark is, of which range and bearing are measured, as the pose and the constants have it.
+
+        Returns its position (2,), the Jacobian (2, d) of that by each of ``values`` (the landmark is none of them), and its
+        covariance (2, 2) from the noise of the measurement.
+        """
+        here = self.fixed(values[1:], None)
+        at = values[0] if here.offset is None else se2.compose(values[0], here.offset)
+        point = se2.transform_from(at, located(here.model, self.ranges, self.bearings))[0]
+        _, blocks = replace(self, free=True).whitened([*values, point])
+        # the whitened residual stays zero: by_value dv + by_point dp = noise
+        to_point = _inverse(blocks[-1][0])
+        return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
+
+
+def _inverse(by_point: Array) -> Array:
+    """The inverse of a whitened Jacobian (2, 2) by a landmark; in a direction of which it tells nothing, as of a landmark where the
+    sensor is, that of one that hardly does."""
+    rows, values, columns = np.linalg.svd(by_point)
+    if values[1] > LEAST_TOLD * values[0]:
+        return np.asarray(np.linalg.inv(by_point))
+    values = np.maximum(values, max(LEAST_TOLD * values[0], LEAST_TOLD))
+    return np.asarray(columns.T / values @ rows.T)

@@ -1,0 +1,170 @@
+"""The compiled part of the odometry: each measurement asks for relative motion, and graphs linearise the factor tens of thousands
+of times a run."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from factors.se2 import Array
+from factors.se2_kernels import SMALL, arc, exp, log, wrapped
+
+# Of a covariance of positions: what is less than this share of it is a matter of rounding. A robot that is not known to a hundred
+# metres is not known better than to a tenth of a millimetre in any direction: else its covariance could not be inverted.
+ROUNDING, FAR = 1e-12, 1e4  # m^2
+
+# direction of travel; variances per distance, rotation and time, of what is along, lateral and of the heading; those per time
+# without odometry, of position and of heading; the least ones, and the least ones per time
+Noise = tuple[float, ...]
+State = tuple[float, float, float, float, float, float, float, float]
+
+
+@numba.njit(cache=True)
+def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
+    """As of :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, of two states
+    of a chain (t, x, y, heading, path, turn, unknown, still)."""
+    c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
+    x, y, turned = c * dx + s * dy, c * dy - s * dx, wrapped(end[3] - start[3])
+    distance, rotation, duration = abs(end[4] - start[4]), abs(end[5] - start[5]), abs(end[0] - start[0])
+    unknown, still = max(0.0, end[6] - start[6]), min(duration, abs(end[7] - start[7]))
+    # what grows with time does so while the robot moves; no odometry is better than the least noise
+    moving, least_position, least_heading = duration - still, noise[14] * duration, noise[15] * duration
+    along = max(noise[1] * distance + noise[2] * rotation + noise[3] * moving, least_position) + noise[10] * unknown
+    lateral = max(noise[4] * distance + noise[5] * rotation + noise[6] * moving, least_position) + noise[10] * unknown
+    heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
+    # the start as seen from the end, turned by 90 degrees: how the end moves when the heading changes at the start
+    c, s = math.cos(turned), math.sin(turned)
+    nx, ny = s * x - c * y, c * x + s * y
+    # on the way the robot looked, on average, half the turn back from where it looks at the end
+    ahead, aside = math.cos(noise[0] - turned / 2.0), math.sin(noise[0] - turned / 2.0)
+    covariance = np.empty((3, 3))
+    covariance[0, 0] = ahead**2 * along + aside**2 * lateral + heading * nx * nx / 3.0 + noise[12]
+    covariance[1, 1] = aside**2 * along + ahead**2 * lateral + heading * ny * ny / 3.0 + noise[12]
+    covariance[2, 2] = heading + noise[13]
+    _widen(covariance)
+    covariance[0, 1] = covariance[1, 0] = ahead * aside * (along - lateral) + heading * nx * ny / 3.0
+    covariance[0, 2] = covariance[2, 0] = heading * nx / 2.0
+    covariance[1, 2] = covariance[2, 1] = heading * ny / 2.0
+    return np.array((x, y, turned)), covariance, duration, still
+
+
+@numba.njit(cache=True)
+def carried(covariance: Array, delta: Array, noise: Array) -> Array:
+    """The body-frame covariance (3, 3) of a pose that has moved by ``delta`` (3,), which has the covariance ``noise``."""
+    c, s = math.cos(delta[2]), math.sin(delta[2])
+    x, y = s * delta[0] - c * delta[1], c * delta[0] + s * delta[1]
+    # the adjoint of the inverse of the motion
+    adjoint = ((c, s, x), (-s, c, y), (0.0, 0.0, 1.0))
+    out = np.empty((3, 3))
+    for i in range(3):
+        p = adjoint[i]
+        a = p[0] * covariance[0, 0] + p[1] * covariance[1, 0] + p[2] * covariance[2, 0]
+        b = p[0] * covariance[0, 1] + p[1] * covariance[1, 1] + p[2] * covariance[2, 1]
+        d = p[0] * covariance[0, 2] + p[1] * covariance[1, 2] + p[2] * covariance[2, 2]
+        for j in range(3):
+            q = adjoint[j]
+            out[i, j] = a * q[0] + b * q[1] + d * q[2] + noise[i, j]
+    _widen(out)
+    return out
+
+
+@numba.njit(cache=True, inline="always")
+def _widen(covariance: Array) -> None:
+    """Keep a covariance (3, 3) that can be inverted: see :data:`FAR`."""
+    spread = covariance[0, 0] + covariance[1, 1]
+    if spread > FAR:
+        covariance[0, 0] += ROUNDING * spread
+        covariance[1, 1] += ROUNDING * spread
+
+
+@numba.njit(cache=True)
+def recalibrated(delta: Array, moving: float, changes: Array) -> Array:
+    """The increment ``delta`` (3,) alone of :func:`factors.odometry.model.recalibrated`."""
+    x, y, phi = log(delta[0], delta[1], delta[2])
+    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
+    return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
+
+
+@numba.njit(cache=True)
+def whitener(covariance: Array) -> Array:
+    """The inverse of the lower root of a covariance (3, 3)."""
+    a = math.sqrt(covariance[0, 0])
+    b, c = covariance[1, 0] / a, covariance[2, 0] / a
+    d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
+    e = (covariance[2, 1] - b * c) / d
+    f = math.sqrt(max(covariance[2, 2] - c * c - e * e, ROUNDING * covariance[2, 2]))
+    return np.array(
+        (
+            (1.0 / a, 0.0, 0.0),
+            (-b / (a * d), 1.0 / d, 0.0),
+            ((b * e / d - c) / (a * f), -e / (d * f), 1.0 / f),
+        )
+    )
+
+
+@numba.njit(cache=True)
+def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
+    """See :func:`factors.odometry.model.recalibrated`, of which ``twist`` (3,) is the logarithm of the increment, ``moving`` its
+    time."""
+    x, y, phi = twist[0], twist[1], twist[2]
+    way = math.hypot(x, y)
+    cx, cy = x + changes[0] * x, y + changes[0] * y
+    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * way
+    p, q = arc(turn)
+    jacobian = _right_jacobian(cx, cy, turn)
+    by_changes = np.zeros((3, 4))
+    for i in range(3):
+        by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y
+        by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * moving
+        by_changes[i, 3] = jacobian[i, 2] * way
+    return np.array((p * cx - q * cy, q * cx + p * cy, wrapped(turn))), by_changes
+
+
+@numba.njit(cache=True)
+def linearize(
+    start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and by what changes
+    ``delta`` as ``by_changes`` (3, P) says, (3, P)."""
+    rx, ry, turned = _between(start, end)
+    relative = np.array((rx, ry, turned))
+    ex, ey, angle = _between(delta, relative)
+    x, y, angle = log(ex, ey, angle)
+    by_end = whitener @ _inverse(_right_jacobian(x, y, angle))
+    c, s = math.cos(turned), math.sin(turned)
+    # the adjoint of the inverse of the relative pose
+    adjoint = np.array(((c, s, s * rx - c * ry), (-s, c, c * rx + s * ry), (0.0, 0.0, 1.0)))
+    by_delta = whitener @ _inverse(_right_jacobian(-x, -y, -angle))
+    return whitener @ np.array((x, y, angle)), -by_end @ adjoint, by_end, -by_delta @ by_changes
+
+
+@numba.njit(cache=True)
+def _between(a: Array, b: Array) -> tuple[float, float, float]:
+    c, s, dx, dy = math.cos(a[2]), math.sin(a[2]), b[0] - a[0], b[1] - a[1]
+    return c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])
+
+
+@numba.njit(cache=True)
+def _right_jacobian(x: float, y: float, angle: float) -> Array:
+    p, q = arc(angle)
+    if abs(angle) < SMALL:
+        r, s = angle / 6.0, 0.5 - angle * angle / 24.0
+    else:
+        r, s = (1.0 - p) / angle, q / angle
+    return np.array(((p, q, r * x - s * y), (-q, p, s * x + r * y), (0.0, 0.0, 1.0)))
+
+
+@numba.njit(cache=True)
+def _inverse(j: Array) -> Array:
+    """Of a right Jacobian."""
+    p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
+    scale = 1.0 / (p * p + q * q)
+    return np.array(
+        (
+            (scale * p, -scale * q, -scale * (p * u - q * v)),
+            (scale * q, scale * p, -scale * (q * u + p * v)),
+            (0.0, 0.0, 1.0),
+        )
+    )

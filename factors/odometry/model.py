@@ -1,0 +1,174 @@
+"""Wheel odometry (and a gyro): what we believe about it, and relative poses with covariance.
+
+The path of the wheels is kept as a chain (:mod:`factors.odometry.chain`) in an odometry frame; any relative pose is the difference
+of two poses of that chain.
+
+Noise: variances of along-track, lateral and heading error each grow linearly with distance, rotation and time, so that the
+result does not depend on how finely a path is cut into pieces.
+
+A robot at rest is a measurement of its own: while the wheels report no motion its velocity is zero, what grows with time does
+not grow, and the pose diffuses by the least noise alone. No odometry is better than that noise, whatever the model says: an
+increment without noise would make a graph that cannot be solved.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import se2
+from factors.motion import ChainState, Increment
+from factors.odometry.kernels import Noise, linearize, recalibrate, relative, whitener
+from factors.se2 import Array
+
+# of an increment that takes no time, whose covariance must still be one that can be inverted
+MINIMUM_POSITION_VARIANCE = 1e-8
+MINIMUM_HEADING_VARIANCE = 1e-8
+LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): the least noise
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Standard deviation of one error component per square root of distance, rotation and time.
+
+    The unit is that of the component (m or rad) per sqrt(m), per sqrt(rad) and per sqrt(s).
+    """
+
+    per_distance: float = 0.0
+    per_rotation: float = 0.0
+    per_time: float = 0.0
+
+    def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
+        """The same with independent errors of these standard deviations added."""
+        return Growth(
+            math.hypot(self.per_distance, per_distance),
+            math.hypot(self.per_rotation, per_rotation),
+            math.hypot(self.per_time, per_time),
+        )
+
+    def variance(self, distance: float, rotation: float, duration: float) -> float:
+        """The variance after ``distance`` metres, ``rotation`` radians (both unsigned) and ``duration`` seconds."""
+        return self.per_distance**2 * distance + self.per_rotation**2 * rotation + self.per_time**2 * duration
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryModel:
+    """What we believe about wheel odometry (and about the gyro that may replace its rotation).
+
+    ``scale_distance``, ``scale_rotation``: true over reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
+    ``gyro_bias`` [rad/s] are what is reported at rest; ``heading_drift`` [rad/m] is what the heading turns, unreported, on the
+    way. ``direction`` [rad]: that of travel, in the robot's frame.
+    ``delay`` and ``lag`` [s] belong to commanded velocities, and so does ``turn_slowdown`` [m/rad]: by how much a robot
+    that turns falls short of the forward speed, per turn rate. A velocity is held for at most ``max_hold`` seconds; after
+    that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
+    """
+
+    scale_distance: float = 1.0
+    scale_rotation: float = 1.0
+    speed_bias: float = 0.0
+    heading_rate_bias: float = 0.0
+    heading_drift: float = 0.0
+    direction: float = 0.0
+    delay: float = 0.0
+    lag: float = 0.0
+    turn_slowdown: float = 0.0
+    gyro_bias: float = 0.0
+    max_hold: float = 1.5
+    unknown_distance: float = 0.2
+    unknown_rotation: float = 0.2
+    along: Growth = field(default_factory=Growth)
+    lateral: Growth = field(default_factory=Growth)
+    heading: Growth = field(default_factory=Growth)
+
+    def noise(self) -> Noise:
+        """What compiled code knows of it: see :data:`factors.odometry.kernels.Noise`."""
+        growths = (self.along, self.lateral, self.heading)
+        sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
+        sigmas += [self.unknown_distance, self.unknown_rotation]
+        least = MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE, LEAST_POSITION**2, LEAST_HEADING**2
+        return (float(self.direction), *(float(s) ** 2 for s in sigmas), *least)
+
+
+def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
+    """The motion between two states of a chain, with its covariance.
+
+    The heading error is a random walk along the way, so it also displaces the end: with the chord seen from the end and
+    the walk spread evenly over it, by a third of its variance (and half of it as covariance).
+    """
+    return Increment(*relative(np.array(model.noise()), start, end))
+
+
+# the constants that recalibrated() changes
+PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift")
+
+
+def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]:
+    """The increment under changed parameters, and its Jacobian.
+
+    ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional
+    heading-rate bias [rad/s] while the robot moves, additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the
+    Jacobian (..., 3, 4) of its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant
+    curvature.
+    """
+    arc = se2.log(increment.delta)
+    parameters = np.asarray(parameters, dtype=float)
+    if parameters.ndim == 1:
+        delta, jacobian = recalibrate(arc, increment.moving, parameters)
+        return delta, jacobian
+    x, y, phi = arc.tolist()
+    by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.moving, math.hypot(x, y)]])
+    changed = arc + parameters @ by_parameter.T
+    return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
+
+
+def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:
+    """Which rows (M,) are the last of their stamps ``t`` (N,), which never go back, and the motions (M, 3) since the one before of
+    these: ``moves`` (N, 3) of equal stamps follow one another."""
+    last = np.flatnonzero(np.append(np.diff(t) > 0, True)[: len(t)])
+    first = np.append(0, last[:-1] + 1)[: len(last)]
+    out = np.array(moves[first], dtype=float)
+    for row in np.setdiff1d(np.arange(len(t)), first).tolist():
+        place = int(np.searchsorted(last, row))
+        out[place] = se2.compose(out[place], moves[row])
+    return last, out
+
+
+def between_factor(from_key: int, to_key: int, increment: Increment) -> gtsam.NonlinearFactor:
+    """The increment as GTSAM's factor between two ``Pose2`` variables."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(increment.covariance)
+    return gtsam.BetweenFactorPose2(from_key, to_key, gtsam.Pose2(*increment.delta), noise)
+
+
+class OdometryFactor:
+    """The increment between two poses, with constants of the odometry as a third variable.
+
+    ``estimated``: positions in :data:`PARAMETERS` of the P constants that the variable holds. The values of the factor are the two
+    poses (3,) and the constants (P,), or the poses alone where P is zero.
+    """
+
+    def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
+        self._increment = increment
+        self._arc = se2.log(increment.delta)
+        self._estimated = list(estimated)
+        self._whitener = whitener(increment.covariance)
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
+        residual, *blocks = linearize(values[0], values[1], *self._delta(values), self._whitener)
+        return residual, blocks if self._estimated else blocks[:2]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        error = self._whitener @ se2.log(se2.between(self._delta(values)[0], se2.between(values[0], values[1])))
+        return 0.5 * float(error @ error)
+
+    def _delta(self, values: Sequence[Array]) -> tuple[Array, Array]:
+        if not self._estimated:
+            return self._increment.delta, np.zeros((3, 0))
+        parameters = np.zeros(len(PARAMETERS))
+        parameters[self._estimated] = values[2]
+        delta, jacobian = recalibrate(self._arc, self._increment.moving, parameters)
+        return delta, np.ascontiguousarray(jacobian[:, self._estimated])

@@ -1,0 +1,336 @@
+"""Compiled loops behind :mod:`factors.rfid.detection`: each is one pass over poses, antennas and tags."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
+from factors.se2 import Array
+from factors.se2_kernels import wrapped
+
+FAST = {"contract", "reassoc", "arcp", "nsz"}  # what an optimiser may do, without taking infinities for impossible
+
+
+@numba.njit(cache=True)
+def moved(offset: Array, offsets: Array) -> Array:
+    """The poses (K, 3) that lie ``offset`` (3,) behind ``offsets`` (K, 3)."""
+    c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
+    for k in range(len(offsets)):
+        out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
+        out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
+        out[k, 2] = wrapped(offset[2] + offsets[k, 2])
+    return out
+
+
+@numba.njit(cache=True, inline="always")
+def seen(
+    packed: Packed, antenna: int, p: float, q: float, height: float, c: float
+) -> tuple[float, float, float, float, float]:
+    """Logit of a tag at (p, q, height) from the antenna, in axes turned by its yaw alone, and derivatives by p, q, height, c."""
+    cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
+    m = packed.which[antenna]
+    x, z = cp * p + sp * height, cp * height - sp * p
+    value, by_x, by_y, by_z, by_c = logit(
+        packed.kinds[m], packed.parameters[m], packed.shapes[m], packed.knots, x, q, z, c
+    )
+    return value, cp * by_x - sp * by_z, by_y, sp * by_x + cp * by_z, by_c
+
+
+@numba.njit(cache=True, inline="always")
+def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
+    """Where an antenna is in the world (x, y, cosine and sine of its heading), for a robot at ``offset`` from ``pose``; and the
+    cosine and sine of the robot's heading."""
+    c0, s0 = math.cos(pose[2]), math.sin(pose[2])
+    x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
+    c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
+    a = packed.antennas[antenna]
+    x, y = x + c * a[0] - s * a[1], y + s * a[0] + c * a[1]
+    return x, y, c * a[3] - s * a[4], s * a[3] + c * a[4], c, s
+
+
+@numba.njit(cache=True, inline="always")
+def of_tag(
+    packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
+) -> tuple[float, float, float, float]:
+    """Logit of one tag for an antenna at (x, y) that looks along (c, s), and its derivatives: by the tag's place along and across
+    the boresight, and by the antenna's heading. Beyond the reach it is constant."""
+    ex, ey = point[0] - x, point[1] - y
+    m = packed.which[antenna]
+    squared = ex * ex + ey * ey
+    if squared >= packed.reach[m] ** 2:
+        return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0
+    p, q = c * ex + s * ey, c * ey - s * ex
+    nx, ny = c * normal[0] + s * normal[1], c * normal[1] - s * normal[0]
+    distance = math.sqrt(squared + 1e-9)
+    facing = -(nx * p + ny * q) / distance
+    value, by_p, by_q, _, by_c = seen(packed, antenna, p, q, point[2] - packed.antennas[antenna, 2], facing)
+    by_heading = by_p * q - by_q * p
+    by_p -= by_c * (nx + facing * p / distance) / distance
+    by_q -= by_c * (ny + facing * q / distance) / distance
+    return value, by_p, by_q, by_heading
+
+
+@numba.njit(cache=True, inline="always")
+def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
+    """Negative log-likelihood of k hits in n rounds, its derivative by the logit, Fisher's information on the logit, and mean and
+    variance of the negative log-likelihood."""
+    sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
+    q = packed.false_read + packed.span * sigmoid
+    # a model without a floor may be certain, and certainty has no logarithm
+    q = min(max(q, 1e-12), 1.0 - 1e-12)
+    by_z = packed.span * sigmoid * (1.0 - sigmoid)
+    log_q, log_p = math.log(q), math.log1p(-q)
+    nll = -(hits * log_q + (rounds - hits) * log_p)
+    gradient = -(hits / q - (rounds - hits) / (1.0 - q)) * by_z
+    information = rounds * by_z * by_z / (q * (1.0 - q))
+    expected = -rounds * (q * log_q + (1.0 - q) * log_p)
+    variance = rounds * q * (1.0 - q) * (log_q - log_p) ** 2
+    return nll, gradient, information, expected, variance
+
+
+@numba.njit(cache=True, inline="always")
+def _place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
+    """Rows (K, 8) of looks: place and boresight of the antenna in the world, then in the frame of the pose. Returns how far from
+    the pose [m] the farthest antenna reaches."""
+    farthest = 0.0
+    for k in range(len(antennas)):
+        a = packed.antennas[antennas[k]]
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3], _, _ = placed(packed, antennas[k], pose, offsets[k])
+        co, so = math.cos(offsets[k, 2]), math.sin(offsets[k, 2])
+        out[k, 4], out[k, 5] = co * a[3] - so * a[4], so * a[3] + co * a[4]
+        out[k, 6], out[k, 7] = offsets[k, 0] + co * a[0] - so * a[1], offsets[k, 1] + so * a[0] + co * a[1]
+        reach = packed.reach[packed.which[antennas[k]]]
+        farthest = max(farthest, math.sqrt(out[k, 6] ** 2 + out[k, 7] ** 2) + reach)
+    return farthest
+
+
+@numba.njit(cache=True, inline="always")
+def _alive(
+    packed: Packed,
+    at: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    point: Array,
+    normal: Array,
+    far: Array,
+) -> tuple[float, float, float, float, tuple[float, float, float], tuple[float, float, float, float, float, float]]:
+    """Of one tag that is alive, over all looks: negative log-likelihood, that of a silence, their mean and variance over all that
+    could be read; gradient, and information (its upper triangle)."""
+    e_sum = silent = mean_sum = spread_sum = 0.0
+    g_x = g_y = g_a = 0.0
+    xx = xy = xa = yy = ya = aa = 0.0
+    for k in range(len(antennas)):
+        x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
+        z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, point, normal)
+        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
+            e_sum, silent = e_sum + far[k, 0], silent + far[k, 0]
+            mean_sum, spread_sum = mean_sum + far[k, 1], spread_sum + far[k, 2]
+            continue
+        e, g, f, mean, spread = terms(packed, z, hits[k], rounds[k])
+        e_sum += e
+        silent += e if hits[k] == 0 else terms(packed, z, 0, rounds[k])[0]
+        mean_sum += mean
+        spread_sum += spread
+        # the antenna moves, the tag does not
+        by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
+        by_a = by_heading - by_x * at[k, 7] + by_y * at[k, 6]
+        g_x += g * by_x
+        g_y += g * by_y
+        g_a += g * by_a
+        xx += f * by_x * by_x
+        xy += f * by_x * by_y
+        xa += f * by_x * by_a
+        yy += f * by_y * by_y
+        ya += f * by_y * by_a
+        aa += f * by_a * by_a
+    return e_sum, silent, mean_sum, spread_sum, (g_x, g_y, g_a), (xx, xy, xa, yy, ya, aa)
+
+
+@numba.njit(cache=True, inline="always")
+def _mixed(
+    odds: float, silent: float, mean: float, spread: float, none: float, tempering: float
+) -> tuple[float, float, float, float]:
+    """Of a tag that is dead with prior log-odds ``odds``, and is not read (:mod:`factors.rfid.tag_states`): the tempered negative
+    log-likelihood, by how much the tag counts, and mean and variance of the likelihood over all that could be read.
+
+    A read costs what it does of a tag that is known to live: that this one does, too, tells nothing of the pose.
+
+    ``silent``: negative log-likelihood of the silence if the tag is alive, ``mean`` and ``spread``: mean and variance of that of
+    all that could be read, ``none``: that of a silence out of reach.
+    """
+    alive, dead = 1.0 / (1.0 + math.exp(odds)), 1.0 / (1.0 + math.exp(-odds))
+    left = alive * math.exp(-tempering * (silent - none))
+    total = left + dead
+    nll = tempering * none - math.log(total)
+    # a silence costs nll, whether the tag is dead or alive; the rest is of an alive one that is read
+    quiet = math.exp(-silent)
+    expected = (alive * quiet + dead) * nll + alive * tempering * (mean - quiet * silent)
+    squared = tempering**2 * (spread + mean * mean - quiet * silent * silent)
+    second = (alive * quiet + dead) * nll * nll + alive * squared
+    return nll, left / total, expected, max(second - expected * expected, 0.0) / tempering
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def score(
+    packed: Packed,
+    poses: Array,
+    points: Array,
+    normals: Array,
+    offsets: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    odds: Array,
+    tempering: float,
+    nll: Array,
+    gradient: Array,
+    information: Array,
+    expected: Array,
+    variance: Array,
+) -> None:
+    looks, tags = hits.shape
+    heard = np.zeros(tags, np.int64)
+    for k in range(looks):
+        for t in range(tags):
+            heard[t] += hits[k, t]
+    # what a tag that is out of reach of all looks adds
+    far = np.empty((looks, 3))
+    far_e = far_mean = far_spread = 0.0
+    for k in range(looks):
+        far[k, 0], _, _, far[k, 1], far[k, 2] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])
+        far_e, far_mean, far_spread = far_e + far[k, 0], far_mean + far[k, 1], far_spread + far[k, 2]
+    at = np.empty((looks, 8))
+    for n in range(len(poses)):
+        # sums in registers, not in arrays: a scan is one pose, and this loop is most of a smoother's step
+        e_sum = mean_sum = spread_sum = 0.0
+        g_x = g_y = g_a = 0.0
+        xx = xy = xa = yy = ya = aa = 0.0
+        farthest = _place_looks(packed, poses[n], offsets, antennas, at)
+        beyond = 0
+        for t in range(tags):
+            dx, dy = points[t, 0] - poses[n, 0], points[t, 1] - poses[n, 1]
+            if heard[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
+                beyond += 1
+                continue
+            tag_e, tag_silent, tag_mean, tag_spread, slope, curve = _alive(
+                packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far
+            )
+            share = tempering
+            if odds[t] == -np.inf:
+                e_sum += tempering * tag_e
+                mean_sum += tempering * tag_mean
+                spread_sum += tempering * tag_spread
+            else:
+                mixed, counts, mean, spread = _mixed(odds[t], tag_silent, tag_mean, tag_spread, far_e, tempering)
+                mean_sum += mean
+                spread_sum += spread
+                if heard[t] > 0:
+                    e_sum += tempering * tag_e
+                else:
+                    e_sum += mixed
+                    share = tempering * counts
+            g_x, g_y, g_a = g_x + share * slope[0], g_y + share * slope[1], g_a + share * slope[2]
+            xx, xy, xa = xx + share * curve[0], xy + share * curve[1], xa + share * curve[2]
+            yy, ya, aa = yy + share * curve[3], ya + share * curve[4], aa + share * curve[5]
+        nll[n] = e_sum + tempering * beyond * far_e
+        expected[n] = mean_sum + tempering * beyond * far_mean
+        variance[n] = spread_sum + tempering * beyond * far_spread
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = g_x, g_y, g_a
+        information[n, 0, 0], information[n, 1, 1], information[n, 2, 2] = xx, yy, aa
+        information[n, 0, 1] = information[n, 1, 0] = xy
+        information[n, 0, 2] = information[n, 2, 0] = xa
+        information[n, 1, 2] = information[n, 2, 1] = ya
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def silence(
+    packed: Packed,
+    pose: Array,
+    covariance: Array,
+    points: Array,
+    normals: Array,
+    offsets: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    odds: Array,
+    tempering: float,
+    out: Array,
+) -> None:
+    looks, tags = hits.shape
+    at = np.empty((looks, 8))
+    farthest = _place_looks(packed, pose, offsets, antennas, at)
+    far = np.empty(looks)
+    for k in range(looks):
+        far[k] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])[0]
+    g = np.empty(3)
+    for t in range(tags):
+        out[t] = 0.0
+        dx, dy = points[t, 0] - pose[0], points[t, 1] - pose[1]
+        if odds[t] == -np.inf or dx * dx + dy * dy >= farthest * farthest:
+            continue
+        total, g[0], g[1], g[2] = 0.0, 0.0, 0.0, 0.0
+        for k in range(looks):
+            if hits[k, t] > 0:
+                total = -np.inf
+                break
+            x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
+            z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
+            if z == NEGLIGIBLE_LOGIT:
+                continue
+            e, by_z, _, _, _ = terms(packed, z, 0, rounds[k])
+            total += e - far[k]
+            by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
+            g[0] += by_z * by_x
+            g[1] += by_z * by_y
+            g[2] += by_z * (by_heading - by_x * at[k, 7] + by_y * at[k, 6])
+        # the mean of exp(-E) over a Gaussian, E linear: it is larger than at the middle, a silence then tells less
+        across = 0.0
+        for i in range(3):
+            for j in range(3):
+                across += g[i] * covariance[i, j] * g[j]
+        out[t] = max(tempering * total - 0.5 * tempering * tempering * across, 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def by_tag(
+    packed: Packed,
+    pose: Array,
+    points: Array,
+    normals: Array,
+    offsets: Array,
+    antennas: NDArray[np.int64],
+    rounds: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    nll: Array,
+    gradient: Array,
+    information: Array,
+) -> None:
+    for k in range(len(antennas)):
+        x, y, c, s, _, _ = placed(packed, antennas[k], pose, offsets[k])
+        for t in range(len(points)):
+            z, by_p, by_q, _ = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
+            e, g, f, _, _ = terms(packed, z, hits[k, t], rounds[k])
+            nll[t] += e
+            gx, gy = c * by_p - s * by_q, s * by_p + c * by_q
+            gradient[t, 0] += g * gx
+            gradient[t, 1] += g * gy
+            information[t, 0, 0] += f * gx * gx
+            information[t, 0, 1] += f * gx * gy
+            information[t, 1, 0] += f * gx * gy
+            information[t, 1, 1] += f * gy * gy
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def probabilities(packed: Packed, antenna: int, poses: Array, points: Array, normals: Array, out: Array) -> None:
+    none = np.zeros(3)
+    for n in range(len(poses)):
+        x, y, c, s, _, _ = placed(packed, antenna, poses[n], none)
+        for t in range(len(points)):
+            z, _, _, _ = of_tag(packed, antenna, x, y, c, s, points[t], normals[t])
+            out[n, t] = packed.false_read + packed.span / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))

@@ -1,0 +1,346 @@
+"""RFID antennas: the probability that an inventory round of an antenna reads a tag.
+
+A detection model gives the logit of that probability, as a function of where the tag is in the antenna's frame (x along the
+boresight, y to the left, z up) and of how it faces the antenna. The probability that counts is
+``q = false_read + (1 - false_read - miss) * sigmoid(logit)``: the floor makes a read from anywhere possible, as misplaced
+tags and reflections do, which is what makes the likelihood robust. The likelihood itself: :mod:`factors.rfid.detection`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.se2 import Array
+
+BEAM, LOGISTIC, GRID = 0, 1, 2
+FEATURES = ("1", "r", "r^2", "w", "w^2", "r w", "|z|", "c", "c^2", "r c", "w c")
+NEGLIGIBLE_LOGIT = -14.0  # beyond a model's reach nothing but the floor is left
+NEAR = 1e-2  # m: nearer than that to an antenna no direction is defined
+PARAMETERS = 12  # the longest parameter vector of a compiled model
+ALMOST_ONE = 1.0 - 1e-9
+
+
+class DetectionModel(Protocol):
+    """What an antenna reads. ``reach`` [m]: beyond it, in the plane, only false reads are left."""
+
+    @property
+    def reach(self) -> float: ...
+
+    @property
+    def uses_facing(self) -> bool:
+        """Whether the logit depends on how the tag faces the antenna."""
+
+    def compiled(self) -> tuple[int, Sequence[float], Array]:
+        """Kind, parameters, and knots (H, F, NX, NY) of a grid (empty for others)."""
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2)``, with the distance r [m] and the bearing phi [rad]
+    in the plane of the boresight: the default where there is no log to learn from."""
+
+    p0: float = 0.9
+    r_max: float = 4.5
+    s_r: float = 0.3
+    sigma_phi: float = 0.698
+
+    @property
+    def reach(self) -> float:
+        return self.r_max + 12.0 * self.s_r
+
+    @property
+    def uses_facing(self) -> bool:
+        return False
+
+    def compiled(self) -> tuple[int, Sequence[float], Array]:
+        # a probability of one has no logit
+        return BEAM, (math.log(min(self.p0, ALMOST_ONE)), self.r_max, self.s_r, self.sigma_phi), np.empty((0, 0, 0, 0))
+
+
+@dataclass(frozen=True)
+class LogisticModel:
+    """A logit that is linear in :data:`FEATURES`: distance r [m] in the plane, w = 1 - cosine of the bearing, height difference z
+    [m], and c, the cosine between the direction that the tag faces and that to the antenna (0 where the facing is not known)."""
+
+    coefficients: Sequence[float]
+    reach: float = 8.0
+
+    @property
+    def uses_facing(self) -> bool:
+        return any(value != 0.0 for value in self.coefficients[7:])
+
+    def compiled(self) -> tuple[int, Sequence[float], Array]:
+        return LOGISTIC, tuple(self.coefficients), np.empty((0, 0, 0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class GridModel:
+    """The paper's Cartesian field: ``logits`` (H, F, NX, NY) at knots ``cell`` [m] apart, the first at (``x0``, ``y0``) in the
+    antenna's frame.
+
+    H ``heights`` (H,) [m], in ascending order, of the tag above the antenna, and F facings, evenly from -1 to 1, the cosine between
+    the direction that the tag faces and that to the antenna; one knot where it does not matter. Between knots: cubic
+    convolution in the plane and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), linear in height; beyond them the value
+    of the edge, and beyond ``reach`` nothing.
+    """
+
+    logits: Array
+    x0: float
+    y0: float
+    cell: float
+    heights: Array
+
+    @property
+    def reach(self) -> float:
+        nx, ny = self.logits.shape[2:]
+        x = max(abs(self.x0), abs(self.x0 + (nx - 1) * self.cell))
+        y = max(abs(self.y0), abs(self.y0 + (ny - 1) * self.cell))
+        return math.hypot(x, y)
+
+    @property
+    def uses_facing(self) -> bool:
+        return int(self.logits.shape[1]) > 1
+
+    def compiled(self) -> tuple[int, Sequence[float], Array]:
+        step = self.heights[1] - self.heights[0] if len(self.heights) > 1 else 1.0
+        return GRID, (self.x0, self.y0, self.cell, float(self.heights[0]), float(step)), self.logits
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """Place and boresight in the robot's frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (upwards) [rad]; ``model``: which of
+    the models it has."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    yaw: float = 0.0
+    pitch: float = 0.0
+    model: int = 0
+
+
+class Packed(NamedTuple):
+    """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
+    ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
+    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model."""
+
+    antennas: Array
+    which: NDArray[np.int64]
+    kinds: NDArray[np.int64]
+    parameters: Array
+    shapes: NDArray[np.int64]
+    knots: Array
+    reach: Array
+    false_read: float
+    span: float
+
+
+@dataclass(frozen=True)
+class RfidModel:
+    """All antennas of a robot. ``false_read`` and ``miss``: see the module; ``tempering``: the exponent of the likelihood."""
+
+    antennas: tuple[Antenna, ...]
+    models: tuple[DetectionModel, ...]
+    false_read: float = 1e-3
+    miss: float = 0.0
+    tempering: float = 1.0
+
+    def packed(self) -> Packed:
+        """As compiled code takes it."""
+        compiled = [model.compiled() for model in self.models]
+        parameters = np.zeros((len(compiled), PARAMETERS))
+        shapes = np.zeros((len(compiled), 5), dtype=np.int64)
+        knots: list[Array] = []
+        for i, (_, values, grid) in enumerate(compiled):
+            parameters[i, : len(values)] = values
+            shapes[i] = (*grid.shape, sum(len(k) for k in knots))
+            knots.append(np.ascontiguousarray(grid, dtype=float).ravel())
+        rows = [
+            (a.x, a.y, a.z, math.cos(a.yaw), math.sin(a.yaw), math.cos(a.pitch), math.sin(a.pitch))
+            for a in self.antennas
+        ]
+        return Packed(
+            np.array(rows).reshape(-1, 7),
+            np.array([a.model for a in self.antennas], dtype=np.int64),
+            np.array([kind for kind, _, _ in compiled], dtype=np.int64),
+            parameters,
+            shapes,
+            np.concatenate(knots) if knots else np.empty(0),
+            np.array([model.reach for model in self.models]),
+            self.false_read,
+            1.0 - self.false_read - self.miss,
+        )
+
+
+def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
+    """Logit (N,) and its gradient (N, 4) by x, y, z and facing, for tags at ``points`` (N, 3) [m] in the antenna's frame.
+
+    ``facing`` (N,): cosine between the direction that the tag faces and that to the antenna.
+    """
+    packed = RfidModel((Antenna(),), (model,)).packed()
+    points = np.atleast_2d(np.asarray(points, dtype=float))
+    facing = np.ascontiguousarray(np.broadcast_to(np.asarray(facing, dtype=float), len(points)))
+    out = np.empty((len(points), 5))
+    _logits(packed.kinds[0], packed.parameters[0], packed.shapes[0], packed.knots, points, facing, out)
+    return out[:, 0], out[:, 1:]
+
+
+def probability(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> Array:
+    """Detection probability (N,), without the floor, for tags at ``points`` (N, 3) in the antenna's frame."""
+    return np.asarray(1.0 / (1.0 + np.exp(-logits(model, points, facing)[0])))
+
+
+def bake(
+    model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
+) -> GridModel:
+    """Any model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
+    count = 2 * math.ceil(extent / cell) + 1
+    axis = cell * (np.arange(count) - (count - 1) / 2.0)
+    cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
+    h, c, x, y = np.meshgrid(np.asarray(heights, dtype=float), cosines, axis, axis, indexing="ij")
+    found, _ = logits(model, np.stack((x, y, h), axis=-1).reshape(-1, 3), c.ravel())
+    return GridModel(found.reshape(h.shape), float(axis[0]), float(axis[0]), cell, np.asarray(heights, dtype=float))
+
+
+@numba.njit(cache=True)
+def _logits(
+    kind: int,
+    parameters: Array,
+    shape: NDArray[np.int64],
+    knots: Array,
+    points: Array,
+    facing: Array,
+    out: Array,
+) -> None:
+    for i in range(len(points)):
+        out[i] = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
+
+
+@numba.njit(cache=True)
+def logit(
+    kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
+) -> tuple[float, float, float, float, float]:
+    """Logit at (x, y, z) in the antenna's frame with facing c, and its derivatives by them."""
+    if kind == BEAM:
+        return _beam(parameters, x, y, z)
+    if kind == LOGISTIC:
+        return _logistic(parameters, x, y, z, c)
+    return _grid(parameters, shape, knots, x, y, z, c)
+
+
+@numba.njit(cache=True)
+def _beam(parameters: Array, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+    log_p0, r_max, s_r, sigma_phi = parameters[0], parameters[1], parameters[2], parameters[3]
+    r = math.sqrt(x * x + y * y + z * z + NEAR * NEAR)
+    phi = math.atan2(y, x)
+    excess = (r_max - r) / s_r
+    # log of a sigmoid, without overflow
+    log_range = -math.log1p(math.exp(-excess)) if excess > 0.0 else excess - math.log1p(math.exp(excess))
+    log_p = log_p0 + log_range - 0.5 * (phi / sigma_phi) ** 2
+    by_log_p = 1.0 / -math.expm1(log_p)
+    by_r = -(1.0 - math.exp(log_range)) / s_r / r
+    by_phi = -phi / sigma_phi**2 / max(x * x + y * y, NEAR * NEAR)
+    value = log_p - math.log(-math.expm1(log_p))
+    return value, by_log_p * (by_r * x - by_phi * y), by_log_p * (by_r * y + by_phi * x), by_log_p * by_r * z, 0.0
+
+
+@numba.njit(cache=True, inline="always")
+def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> float:
+    """Logit of a logistic model with coefficients ``b`` of :data:`FEATURES`, at range r, one minus the cosine of the bearing w,
+    height, and facing c."""
+    value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(height)
+    return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
+
+
+@numba.njit(cache=True)
+def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, float, float, float, float]:
+    r = math.sqrt(x * x + y * y + NEAR * NEAR)
+    cosine = x / r
+    w = 1.0 - cosine
+    value = logistic_value(b, r, w, z, c)
+    by_r = b[1] + 2.0 * b[2] * r + b[5] * w + b[9] * c
+    by_w = b[3] + 2.0 * b[4] * w + b[5] * r + b[10] * c
+    by_c = b[7] + 2.0 * b[8] * c + b[9] * r + b[10] * w
+    by_x = by_r * cosine - by_w * (1.0 - cosine * cosine) / r
+    by_y = by_r * y / r + by_w * cosine * y / (r * r)
+    return value, by_x, by_y, b[6] if z > 0.0 else -b[6], by_c
+
+
+@numba.njit(cache=True)
+def _cubic(f: float) -> tuple[float, float, float, float]:
+    """Weights of the four knots around a place ``f`` in [0, 1] between the middle ones."""
+    return (
+        ((-0.5 * f + 1.0) * f - 0.5) * f,
+        (1.5 * f - 2.5) * f * f + 1.0,
+        ((-1.5 * f + 2.0) * f + 0.5) * f,
+        (0.5 * f - 0.5) * f * f,
+    )
+
+
+@numba.njit(cache=True)
+def _slope(f: float) -> tuple[float, float, float, float]:
+    """Derivatives of these weights."""
+    return (
+        (-1.5 * f + 2.0) * f - 0.5,
+        (4.5 * f - 5.0) * f,
+        (-4.5 * f + 4.0) * f + 0.5,
+        (1.5 * f - 1.0) * f,
+    )
+
+
+@numba.njit(cache=True)
+def _place(s: float, count: int) -> tuple[int, float, float]:
+    """The knot below ``s`` (in knots), the place above it, and whether ``s`` lies inside (the derivative is zero outside)."""
+    if count == 1 or s <= 0.0:
+        return 0, 0.0, 0.0
+    if s >= count - 1:
+        return count - 2, 1.0, 0.0
+    i = min(int(s), count - 2)
+    return i, s - i, 1.0
+
+
+@numba.njit(cache=True)
+def _grid(
+    parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
+) -> tuple[float, float, float, float, float]:
+    x0, y0, cell, z0, dz = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    nh, nf, nx, ny, first = shape[0], shape[1], shape[2], shape[3], shape[4]
+    i, fx, in_x = _place((x - x0) / cell, nx)
+    j, fy, in_y = _place((y - y0) / cell, ny)
+    k, fc, in_c = _place((c + 1.0) / 2.0 * (nf - 1), nf)
+    m, fz, in_z = _place((z - z0) / dz, nh)
+    wx, dx, wy, dy, wc, dc = _cubic(fx), _slope(fx), _cubic(fy), _slope(fy), _cubic(fc), _slope(fc)
+    value = by_x = by_y = by_z = by_c = 0.0
+    for a in range(2 if nh > 1 else 1):
+        w_z = 1.0
+        d_z = 0.0
+        if nh > 1:
+            w_z, d_z = (1.0 - fz, -1.0) if a == 0 else (fz, 1.0)
+        for b in range(4 if nf > 1 else 1):
+            w_c, d_c = (wc[b], dc[b]) if nf > 1 else (1.0, 0.0)
+            layer = min(max(k + b - 1, 0), nf - 1) if nf > 1 else 0
+            plane = first + ((m + a) * nf + layer) * nx * ny
+            flat = by_px = by_py = 0.0
+            for p in range(4):
+                row = plane + min(max(i + p - 1, 0), nx - 1) * ny
+                across = by_across = 0.0
+                for q in range(4):
+                    knot = knots[row + min(max(j + q - 1, 0), ny - 1)]
+                    across += wy[q] * knot
+                    by_across += dy[q] * knot
+                flat += wx[p] * across
+                by_px += dx[p] * across
+                by_py += wx[p] * by_across
+            value += w_z * w_c * flat
+            by_x += w_z * w_c * by_px
+            by_y += w_z * w_c * by_py
+            by_c += w_z * d_c * flat
+            by_z += d_z * w_c * flat
+    return value, in_x * by_x / cell, in_y * by_y / cell, in_z * by_z / dz, in_c * by_c * (nf - 1) / 2.0

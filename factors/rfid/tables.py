@@ -1,0 +1,324 @@
+"""The likelihood of reads for many poses without derivatives, as particles need it: from tables of each model's field.
+
+A table holds the field of one antenna model at one height of tags, in cells of :data:`CELL`, and with facing where the model
+has it. Tags are taken one by one, as all poses look at places of a tag's table that are close together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.rfid.kernels import FAST, seen
+from factors.rfid.model import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidModel, logistic_value
+from factors.se2 import Array
+
+Array32 = NDArray[np.float32]
+
+CELL = 0.05  # m
+FACINGS = 9  # knots of the facing's cosine
+STEP = 0.01  # of the logit, in the tables of logarithms
+LEVEL = 0.04  # m: tags at the same height, to so much, share a table
+
+
+class Tables(NamedTuple):
+    """``logits``: places in ``logs`` of all tables, one after another, each (F, NX, NX), and ``missed``: log(1 - q) there;
+    ``start`` (L,): first place of each;
+    ``half`` (L,): knots from its middle to its edge; ``facings`` (L,); ``level`` (A, T): which table an antenna has for a tag;
+    ``logs`` (Z, 2): log q and log(1 - q) of logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative."""
+
+    logits: NDArray[np.uint16]
+    missed: NDArray[np.float32]
+    start: NDArray[np.int64]
+    half: NDArray[np.int64]
+    facings: NDArray[np.int64]
+    level: NDArray[np.int64]
+    logs: Array
+
+
+def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
+    """One table for each model, pitch and height difference that there is, for tags at ``heights`` (T,) [m]."""
+    z = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
+    q = packed.false_read + packed.span / (1.0 + np.exp(-z))
+    with np.errstate(divide="ignore"):
+        logs = np.log(np.column_stack((q, 1.0 - q)))
+    numbers: dict[tuple[int, float, int], int] = {}
+    level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)
+    tables: list[NDArray[np.uint16]] = []
+    halves: list[int] = []
+    for i, antenna in enumerate(model.antennas):
+        detection = model.models[antenna.model]
+        if packed.kinds[antenna.model] == LOGISTIC:
+            continue
+        for j, height in enumerate(heights - antenna.z):
+            key = (antenna.model, antenna.pitch, round(float(height) / LEVEL))
+            if key not in numbers:
+                numbers[key] = len(tables)
+                half = math.ceil(detection.reach / CELL)
+                table = np.empty((FACINGS if detection.uses_facing else 1, 2 * half + 1, 2 * half + 1), np.uint16)
+                _fill(packed, i, key[2] * LEVEL, half, table)
+                tables.append(table)
+                halves.append(half)
+            level[i, j] = numbers[key]
+    sizes = np.array([t.size for t in tables], dtype=np.int64)
+    logits = np.concatenate([t.ravel() for t in tables]) if tables else np.empty(0, np.uint16)
+    return Tables(
+        logits,
+        logs[logits, 1].astype(np.float32),
+        np.concatenate((np.zeros(1, np.int64), np.cumsum(sizes)))[: len(tables)],
+        np.array(halves, dtype=np.int64),
+        np.array([len(t) for t in tables], dtype=np.int64),
+        level,
+        logs,
+    )
+
+
+def add_log_likelihood(
+    packed: Packed,
+    tables: Tables,
+    antenna: int,
+    poses: Array,
+    points: Array,
+    normals: Array,
+    hits: NDArray[np.int64],
+    rounds: int,
+    apart: NDArray[np.int64],
+    out: Array,
+    each: Array32,
+) -> None:
+    """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
+    (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
+    added by itself, above what it is out of reach, -1 of tags that go to ``out``."""
+    arrays = (points, normals, hits, rounds, apart)
+    if packed.kinds[packed.which[antenna]] == LOGISTIC:
+        _add_direct(packed, antenna, poses, *arrays, tables.logs, out, each)
+    else:
+        _add_tabled(packed, antenna, poses, *arrays, tables, tables.level[antenna], out, each)
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def add_mixed(each: Array32, odds: Array, tempering: float, out: Array) -> None:
+    """Add to ``out`` (N,) the tempered log-likelihood of U silent tags that may be dead, with log-odds ``odds`` (U,) before, of
+    which ``each`` (U, N) is that if they are alive (:mod:`factors.rfid.tag_states`)."""
+    for u in range(len(odds)):
+        dead = 1.0 / (1.0 + math.exp(-odds[u]))
+        for n in range(len(out)):
+            if each[u, n] < 0.0:
+                out[n] += math.log((1.0 - dead) * math.exp(tempering * each[u, n]) + dead)
+
+
+@numba.njit(cache=True)
+def _index(z: float) -> int:
+    """Place of a logit in the tables of logarithms."""
+    return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
+
+
+@numba.njit(cache=True)
+def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
+    facings = len(table)
+    for f in range(facings):
+        c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0
+        for i in range(2 * half + 1):
+            for j in range(2 * half + 1):
+                z = seen(packed, antenna, (i - half) * CELL, (j - half) * CELL, height, c)[0]
+                table[f, i, j] = _index(z)
+
+
+@numba.njit(cache=True)
+def _out_of_reach(poses: Array, points: Array, reach: float) -> NDArray[np.bool_]:
+    """Which tags (T,) no robot at any of the poses, with an antenna that reaches so far from its middle, can read."""
+    low_x = high_x = poses[0, 0]
+    low_y = high_y = poses[0, 1]
+    for n in range(1, len(poses)):
+        low_x, high_x = min(low_x, poses[n, 0]), max(high_x, poses[n, 0])
+        low_y, high_y = min(low_y, poses[n, 1]), max(high_y, poses[n, 1])
+    out = np.empty(len(points), np.bool_)
+    for t in range(len(points)):
+        x, y = points[t, 0], points[t, 1]
+        dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
+        out[t] = dx * dx + dy * dy >= reach * reach
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_tabled(
+    packed: Packed,
+    antenna: int,
+    poses: Array,
+    points: Array,
+    normals: Array,
+    hits: NDArray[np.int64],
+    rounds: int,
+    apart: NDArray[np.int64],
+    tables: Tables,
+    level: NDArray[np.int64],
+    out: Array,
+    each: Array32,
+) -> None:
+    a = packed.antennas[antenna]
+    ax, ay, ca, sa = a[0], a[1], a[3], a[4]
+    logs = tables.logs
+    far = _out_of_reach(poses, points, packed.reach[packed.which[antenna]] + math.sqrt(ax * ax + ay * ay))
+    # place and direction of the antenna at each pose, in cells
+    x, y = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
+    c, s = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
+    inverse = 1.0 / CELL
+    middle_x, middle_y = poses[0, 0], poses[0, 1]
+    for n in range(len(poses)):
+        ct, st = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        x[n] = (poses[n, 0] - middle_x + ct * ax - st * ay) * inverse
+        y[n] = (poses[n, 1] - middle_y + st * ax + ct * ay) * inverse
+        c[n], s[n] = ct * ca - st * sa, st * ca + ct * sa
+    constant = 0.0
+    # tag by tag, as all poses look at places of its table that are close together
+    certain = np.zeros(len(poses), np.float32)
+    for t in range(len(points)):
+        if far[t]:
+            constant += hits[t] * logs[0, 0] + (rounds - hits[t]) * logs[0, 1]
+            continue
+        total = certain
+        if apart[t] >= 0:
+            total = each[apart[t]]
+            constant += rounds * logs[0, 1]
+            for n in range(len(poses)):
+                total[n] -= np.float32(rounds * logs[0, 1])
+        k = level[t]
+        tx, ty = np.float32((points[t, 0] - middle_x) * inverse), np.float32((points[t, 1] - middle_y) * inverse)
+        size = 2 * tables.half[k] + 1
+        layers = tables.facings[k]
+        begin = tables.start[k]
+        table = tables.logits[begin : begin + layers * size * size]
+        if layers > 1:
+            _add_facing(x, y, c, s, tx, ty, table, size, layers, normals[t], hits[t], rounds, logs, total)
+            continue
+        if hits[t] == 0:
+            _add_missed(x, y, c, s, tx, ty, tables.missed[begin : begin + size * size], size, np.float32(rounds), total)
+            continue
+        ends = np.int32(size - 1)
+        to_middle = np.float32(tables.half[k] + 0.5)
+        for n in range(len(poses)):
+            ex, ey = tx - x[n], ty - y[n]
+            i = min(max(np.int32(c[n] * ex + s[n] * ey + to_middle), np.int32(0)), ends)
+            j = min(max(np.int32(c[n] * ey - s[n] * ex + to_middle), np.int32(0)), ends)
+            row = table[i * size + j]
+            total[n] += np.float32(hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1])
+    for n in range(len(poses)):
+        out[n] += constant + certain[n]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_missed(
+    x: Array32,
+    y: Array32,
+    c: Array32,
+    s: Array32,
+    tx: np.float32,
+    ty: np.float32,
+    missed: Array32,
+    size: int,
+    rounds: np.float32,
+    total: Array32,
+) -> None:
+    """The commonest case: a tag that was not read."""
+    width, ends = np.int32(size), np.int32(size - 1)
+    to_middle = np.float32((size - 1) // 2 + 0.5)
+    for n in range(len(x)):
+        ex, ey = tx - x[n], ty - y[n]
+        # beyond the table nothing is left, as at its edge
+        i = min(max(np.int32(c[n] * ex + s[n] * ey + to_middle), np.int32(0)), ends)
+        j = min(max(np.int32(c[n] * ey - s[n] * ex + to_middle), np.int32(0)), ends)
+        total[n] += rounds * missed[np.int32(i * width + j)]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_facing(
+    x: Array32,
+    y: Array32,
+    c: Array32,
+    s: Array32,
+    tx: np.float32,
+    ty: np.float32,
+    table: NDArray[np.uint16],
+    size: int,
+    layers: int,
+    normal: Array,
+    hits: int,
+    rounds: int,
+    logs: Array,
+    total: Array32,
+) -> None:
+    """A tag whose facing matters: between two layers of its table."""
+    ends = size - 1
+    to_middle = np.float32((size - 1) // 2 + 0.5)
+    for n in range(len(x)):
+        ex, ey = tx - x[n], ty - y[n]
+        i = min(max(int(c[n] * ex + s[n] * ey + to_middle), 0), ends)
+        j = min(max(int(c[n] * ey - s[n] * ex + to_middle), 0), ends)
+        cosine = -(normal[0] * ex + normal[1] * ey) / math.sqrt(ex * ex + ey * ey + 1e-6)
+        f = (cosine + 1.0) * 0.5 * (layers - 1)
+        below = min(int(f), layers - 2)
+        place = (below * size + i) * size + j
+        low, high = table[place], table[place + size * size]
+        row = int(low + (f - below) * (np.float64(high) - low) + 0.5)
+        total[n] += np.float32(hits * logs[row, 0] + (rounds - hits) * logs[row, 1])
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_direct(
+    packed: Packed,
+    antenna: int,
+    poses: Array,
+    points: Array,
+    normals: Array,
+    hits: NDArray[np.int64],
+    rounds: int,
+    apart: NDArray[np.int64],
+    logs: Array,
+    out: Array,
+    each: Array32,
+) -> None:
+    """The same for a logistic model, which is computed faster than it is looked up for all facings."""
+    m = packed.which[antenna]
+    b = packed.parameters[m]
+    reach2 = packed.reach[m] ** 2
+    ax, ay, az = packed.antennas[antenna, 0], packed.antennas[antenna, 1], packed.antennas[antenna, 2]
+    ca, sa, cp, sp = (
+        packed.antennas[antenna, 3],
+        packed.antennas[antenna, 4],
+        packed.antennas[antenna, 5],
+        packed.antennas[antenna, 6],
+    )
+    none_hit, none_missed = logs[0, 0], logs[0, 1]
+    far = _out_of_reach(poses, points, packed.reach[m] + math.sqrt(ax * ax + ay * ay))
+    near = np.flatnonzero(~far)
+    constant = 0.0
+    for t in np.flatnonzero(far):
+        constant += hits[t] * none_hit + (rounds - hits[t]) * none_missed
+    for n in range(len(poses)):
+        ct, st = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        x, y = poses[n, 0] + ct * ax - st * ay, poses[n, 1] + st * ax + ct * ay
+        cosine, sine = ct * ca - st * sa, st * ca + ct * sa
+        total = constant
+        for t in near:
+            ex, ey = points[t, 0] - x, points[t, 1] - y
+            distance2 = ex * ex + ey * ey
+            if distance2 >= reach2:
+                total += hits[t] * none_hit + (rounds - hits[t]) * none_missed
+                continue
+            height = points[t, 2] - az
+            along, across = cosine * ex + sine * ey, cosine * ey - sine * ex
+            u, z = cp * along + sp * height, cp * height - sp * along
+            r = math.sqrt(u * u + across * across + NEAR * NEAR)
+            c = -(normals[t, 0] * ex + normals[t, 1] * ey) / math.sqrt(distance2 + 1e-9)
+            w = 1.0 - u / r
+            row = _index(logistic_value(b, r, w, z, c))
+            if apart[t] >= 0:
+                each[apart[t], n] += np.float32(rounds * (logs[row, 1] - none_missed))
+                total += rounds * none_missed
+            else:
+                total += hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1]
+        out[n] += total

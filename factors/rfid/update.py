@@ -1,0 +1,206 @@
+"""Gaussian update of a pose by what antennas read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import positive, se2, se2_kernels
+from factors.odometry.kernels import FAR, ROUNDING
+from factors.rfid import kernels as rfid_kernels
+from factors.rfid.detection import Looks, RfidLikelihood, Score
+from factors.rfid.factor import RfidFactor, TagScore
+from factors.rfid.model import Packed
+from factors.se2 import Array
+
+_Tags = tuple[Array, Array]  # points and normals
+_Integers = NDArray[np.int64]
+_Seen = tuple[Array, _Integers, _Integers, _Integers, Array]  # offsets, antennas, rounds, hits and odds
+CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
+ITERATIONS = 4
+NOTHING_TOLD = 1e-9  # added to an information that may be singular
+TELLING = 1e-6  # eigenvalue of an information that counts
+
+
+@dataclass(frozen=True)
+class TagUpdate:
+    """A pose (3,) with body-frame covariance (3, 3) after looks at tags.
+
+    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``surprise`` and ``variance``: how much larger
+    the negative log-likelihood was there than expected, and the variance of that; ``evidence``: log-probability of the looks,
+    by Laplace's method.
+    """
+
+    pose: Array
+    covariance: Array
+    nis: float
+    dof: int
+    surprise: float
+    variance: float
+    evidence: float
+
+
+def update(
+    likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = ITERATIONS
+) -> TagUpdate:
+    """The most likely pose after looks at tags; see :func:`updated`."""
+    return updated([RfidFactor(likelihood, looks)], pose, covariance, iterations)
+
+
+def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int = ITERATIONS) -> TagUpdate:
+    """The most likely pose under a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
+
+    A step that does not lower the cost is halved. What is told of the innovation is that of the first factor.
+    """
+    pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+    likelihood, looks = factors[0].likelihood, factors[0].seen
+    if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, Looks):
+        return scored_update(factors, pose, covariance, iterations)
+    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
+    arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
+    try:
+        return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
+    except np.linalg.LinAlgError:  # rounding made it singular
+        return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations))
+
+
+def scored_update(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int) -> TagUpdate:
+    """:func:`updated` by factors of any kind and number."""
+    prior_information: Array = positive.inverse(covariance)
+    sigmas = np.sqrt(np.diag(covariance))
+    scores = [factor.score(pose) for factor in factors]
+    first = scores[0]
+    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
+    tempering = factors[0].likelihood.model.tempering
+    nis, dof = _innovation(first.gradient[0], first.information[0], covariance, tempering)
+    surprise = variance = 0.0
+    if isinstance(first, Score):
+        surprise, variance = float(first.nll[0] - first.expected[0]), float(first.variance[0])
+    cost, gradient, information = _total(scores)
+    best, moved = pose, np.zeros(3)
+    for _ in range(iterations):
+        step = _scoring_step(prior_information, information, gradient, moved)
+        if np.all(np.abs(step) < CONVERGED * sigmas):
+            best = se2.compose(best, se2.exp(step))
+            break
+        for _ in range(4):
+            tried = se2.compose(best, se2.exp(step))
+            nll, tried_gradient, tried_information = _total([factor.score(tried) for factor in factors])
+            error = se2.log(se2.between(pose, tried))
+            tried_cost = nll + 0.5 * float(error @ prior_information @ error)
+            if tried_cost <= cost:
+                break
+            step = step / 2.0
+        else:
+            break
+        best, cost, moved = tried, tried_cost, error
+        gradient, information = tried_gradient, tried_information
+    posterior, log_ratio = _posterior(prior_information, information)
+    return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost)
+
+
+def _total(scores: Sequence[TagScore]) -> tuple[float, Array, Array]:
+    first, *others = scores
+    nll, gradient, information = float(first.nll[0]), first.gradient[0], first.information[0]
+    for score in others:
+        nll += float(score.nll[0])
+        gradient, information = gradient + score.gradient[0], information + score.information[0]
+    return nll, gradient, information
+
+
+@numba.njit(cache=True)
+def _updated(
+    packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array, covariance: Array, iterations: int
+) -> tuple[Array, Array, float, int, float, float, float]:
+    """What :func:`scored_update` does, by one factor of looks."""
+    here = _score(packed, tags, seen, tempering, pose)
+    prior_information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    nis, dof = _innovation(here.gradient[0], here.information[0], covariance, tempering)
+    surprise, variance, cost = here.nll[0] - here.expected[0], here.variance[0], here.nll[0]
+    best, moved = pose.copy(), np.zeros(3)
+    for _ in range(iterations):
+        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved)
+        small = True
+        for i in range(3):
+            small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
+        if small:
+            best = _stepped(best, step)
+            break
+        lower = False
+        for _ in range(4):
+            tried = _stepped(best, step)
+            there, error = _score(packed, tags, seen, tempering, tried), _apart(pose, tried)
+            tried_cost = there.nll[0] + 0.5 * np.dot(error, np.dot(prior_information, error))
+            lower = tried_cost <= cost
+            if lower:
+                best, cost, moved, here = tried, tried_cost, error, there
+                break
+            step = step / 2.0
+        if not lower:
+            break
+    posterior, log_ratio = _posterior(prior_information, here.information[0])
+    return best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost
+
+
+@numba.njit(cache=True)
+def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
+    """Of one pose (3,), as of :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
+    points, normals = tags
+    offsets, antennas, rounds, hits, odds = seen
+    nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
+    told = np.empty(1), np.empty(1)
+    at = pose.copy().reshape(1, 3)
+    rfid_kernels.score(
+        packed, at, points, normals, offsets, antennas, rounds, hits, odds, tempering, nll, gradient, information, *told
+    )
+    return Score(nll, gradient, information, *told)
+
+
+@numba.njit(cache=True)
+def _stepped(pose: Array, step: Array) -> Array:
+    x, y, turned = se2_kernels.exp(step[0], step[1], step[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)))
+
+
+@numba.njit(cache=True)
+def _apart(pose: Array, other: Array) -> Array:
+    """The twist that leads from one pose to another."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    dx, dy = other[0] - pose[0], other[1] - pose[1]
+    return np.array(se2_kernels.log(c * dx + s * dy, c * dy - s * dx, other[2] - pose[2]))
+
+
+@numba.njit(cache=True)
+def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
+    """The step (3,) of Fisher scoring from where the pose has ``moved`` (3,) to, shortened to the largest allowed."""
+    step = -np.linalg.solve(prior_information + information, gradient + prior_information @ moved)
+    step *= min(1.0, np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12)))
+    return np.asarray(step)
+
+
+@numba.njit(cache=True)
+def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
+    """Covariance (3, 3) after an update, and the log of its determinant's ratio to that before."""
+    posterior = np.asarray(np.linalg.inv(prior_information + information))
+    return posterior, float(np.linalg.slogdet(posterior)[1] + np.linalg.slogdet(prior_information)[1])
+
+
+@numba.njit(cache=True)
+def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
+    """Normalised square of a score, and its degrees of freedom."""
+    spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(3)
+    if (
+        covariance[0, 0] + covariance[1, 1] > FAR
+    ):  # of one direction so much more than of the others that these would be lost
+        units = np.sqrt(np.diag(spread))
+        gradient = gradient / units
+        spread = spread / units.reshape(3, 1) / units + ROUNDING * np.eye(3)
+    nis = float(gradient @ np.linalg.solve(spread, gradient))
+    return nis, int(np.sum(np.linalg.eigvalsh(information) > TELLING)) if nis > 0.0 else 0

@@ -1,0 +1,188 @@
+"""The Kalman update of all estimators by what is seen of landmarks and points: robust and iterated, in information form.
+
+A factor of sightings tells of K of them two coordinates each; one that is wrong must neither pull far nor be dropped by a
+prediction that is wrong itself. Of pixels of known points, which come often and in numbers, the same is done by compiled code
+(:mod:`factors.camera.update_kernels`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from factors import positive, se2
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor
+from factors.se2 import Array
+
+CONVERGED = 1e-6  # of an iterated update, m and rad
+GATE = 9.21  # 99 % of chi-square with two degrees of freedom
+
+
+class Sightings(Protocol):
+    """A factor of sightings: :class:`~factors.landmarks.factor.BearingRangeFactor` and
+    :class:`~factors.camera.factor.ReprojectionFactor`."""
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, 2) and its Jacobian (K, 2, d) by each value."""
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+
+    def dof(self) -> int:
+        """How many coordinates are measured."""
+
+
+@dataclass(frozen=True)
+class Update:
+    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and at the prediction
+    the whitened ``residual`` (K, 2), predicted less measured, and its normalised square (``nis``) with degrees of freedom."""
+
+    delta: Array
+    covariance: Array
+    residual: Array
+    nis: float
+    dof: int
+
+
+def robust_update(
+    factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+) -> Update:
+    """Kalman update of ``pose`` (3,) and further states by a factor on the pose alone; see :func:`update_state`.
+
+    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
+    """
+    if isinstance(factor, ReprojectionFactor) and factor.of_pose_alone:
+        arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+        try:
+            found = Update(*pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof())
+            _require_sound(found.delta, found.covariance)
+        except np.linalg.LinAlgError:
+            return linearized_update(factor, pose, covariance, iterations, converged)
+        return found
+    return linearized_update(factor, pose, covariance, iterations, converged)
+
+
+def linearized_update(
+    factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+) -> Update:
+    """:func:`robust_update` by a factor of any kind."""
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])
+        return residual, block
+
+    return update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged)
+
+
+def update_state(
+    linearize: Callable[[Array], tuple[Array, Array]],
+    covariance: Array,
+    weight: Callable[[Array], Array],
+    iterations: int,
+    dof: int,
+    converged: float = CONVERGED,
+) -> Update:
+    """Kalman update, robust and iterated, in information form; by square roots where that has not the digits for it.
+
+    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the
+    first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the weight (K,) of squared
+    residuals (K,), robust and tempered: that of zero is the tempering, which the innovation is free of. At first a sighting
+    whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that it
+    pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
+    weight at the updated state (iteratively reweighted least squares), until a step is below ``converged``.
+    """
+    iterated = iterations, dof, converged
+    try:
+        found = _iterated(_informed(np.asarray(np.linalg.inv(covariance))), linearize, covariance, weight, *iterated)
+        _require_sound(found.delta, found.covariance)
+    except np.linalg.LinAlgError:
+        return _iterated(_rooted(positive.root(covariance)), linearize, covariance, weight, *iterated)
+    return found
+
+
+# Correction (S,) and covariance (S, S) from a Jacobian (K, 2, D) and residuals (K, 2), their weights (K,), and the correction (D,)
+# at which they are linearised.
+_Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+
+
+def _iterated(
+    solve: _Solver,
+    linearize: Callable[[Array], tuple[Array, Array]],
+    covariance: Array,
+    weight: Callable[[Array], Array],
+    iterations: int,
+    dof: int,
+    converged: float,
+) -> Update:
+    zero = np.zeros(len(covariance))
+    residual, blocks = linearize(zero)
+    size = blocks.shape[2]
+    widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATE)
+    delta, updated = solve(blocks, residual, np.ones(len(residual)), zero[:size])
+    # by the matrix inversion lemma
+    pull = np.einsum("kij,ki->j", blocks, residual)
+    nis = max(0.0, float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull))
+    tempering = weight(np.zeros(1))[0]
+    if widening.max() > 1.0 or tempering < 1.0:
+        delta, updated = solve(blocks, residual, tempering * widening**-2, zero[:size])
+    first, before = residual, zero
+    for _ in range(iterations - 1):
+        if np.abs(delta - before).max() < converged:
+            break
+        before = delta
+        residual, blocks = linearize(delta)
+        weights = weight(np.einsum("ki,ki->k", residual, residual))
+        delta, updated = solve(blocks, residual, weights, delta[:size])
+    return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
+
+
+def _informed(prior: Array) -> _Solver:
+    """By the information ``prior`` (S, S) before."""
+
+    def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
+        size = len(at)
+        jacobian = blocks.reshape(-1, size)
+        weighted = jacobian.T * np.repeat(weight, 2)
+        information = prior.copy()
+        information[:size, :size] += weighted @ jacobian
+        updated = np.asarray(np.linalg.inv(information), dtype=float)
+        return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
+
+    return solve
+
+
+def _rooted(root: Array) -> _Solver:
+    """By the lower ``root`` (S, S) of the covariance before: what comes out is positive however far the numbers are apart."""
+
+    def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
+        size, scale = len(at), np.sqrt(np.repeat(weight, 2))
+        jacobian = scale[:, None] * blocks.reshape(-1, size)
+        upper = np.asarray(
+            np.linalg.qr(np.concatenate((jacobian @ root[:size], np.eye(len(root)))), mode="r"), dtype=float
+        )
+        half = np.linalg.solve(upper.T, root.T).T
+        wanted = jacobian @ at - scale * residual.ravel()
+        return half @ ((jacobian @ half[:size]).T @ wanted), half @ half.T
+
+    return solve
+
+
+def _require_sound(delta: Array, covariance: Array) -> None:
+    """LinAlgError if that is no update: rounding has taken more than there was."""
+    np.linalg.cholesky(covariance)
+    if not np.all(np.isfinite(delta)):
+        raise np.linalg.LinAlgError("an update is not finite")
+
+
+def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
+    """Normalised innovation squared (K,) of each landmark by itself."""
+    s = blocks @ covariance @ blocks.transpose(0, 2, 1)
+    a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
+    x, y = residual[:, 0], residual[:, 1]
+    # rounding may take all of the difference, which is never less than that
+    determinant = np.maximum(a * c - b * b, 0.5 * (a + c))
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)
