@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from factorgraph_loc.api import (
         calibrate,
@@ -58,7 +60,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.twist.stream import TwistStream
     from factorgraph_loc.vision.frame import CameraFrame
 
-__version__ = "0.1.0"
 __all__ = [
     "BearingRange",
     "BearingRangeStream",

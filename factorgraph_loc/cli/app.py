@@ -10,7 +10,6 @@ import typer
 from typer.completion import install_callback, show_callback
 from typer.core import TyperGroup
 
-from factorgraph_loc import __version__
 from factorgraph_loc.cli import (
     active,
     calibrating,
@@ -31,6 +30,7 @@ from factorgraph_loc.cli.streams import OutputError, standard_streams
 from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.text import MESSAGE, plain
 from factorgraph_loc.threads import use_one_thread
+from factorgraph_loc.version import __version__
 
 DEBUG = "--debug"
 COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc import __version__
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.evaluation.active import DIFFERENCES, difference_cells, differences, summary_cells
@@ -34,6 +33,7 @@ from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.text import quoted, told
+from factorgraph_loc.version import __version__
 
 CHUNK = 10  # runs of one process: to start one takes longer than a run
 FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-import factorgraph_loc
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.files import bounded
@@ -53,7 +52,7 @@ def digest_of(content: Any) -> str:
 @lru_cache
 def code_version() -> str:
     """A digest of the source files that a run can go through."""
-    package = Path(factorgraph_loc.__file__).parent
+    package = Path(__file__).parents[1]
     total = hashlib.sha256()
     for root in (package, package.parent / "factors"):
         for file in sorted(root.rglob("*")):

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.experiments.experiment import Prepared
 from factorgraph_loc.experiments.index import collect
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.version import __version__
 
 PAGE = "report.html"
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc import __version__
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.doubts import (
     check_free_map,
@@ -44,6 +43,7 @@ from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.version import __version__
 from factors.se2 import Array
 
 OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid

@@ -5,8 +5,6 @@ from __future__ import annotations
 import sysconfig
 from pathlib import Path
 
-import factorgraph_loc
-
 SHIPPED = Path("share", "factorgraph-loc", "datasets")  # below the data path of an installation
 
 
@@ -25,7 +23,7 @@ def manifests() -> dict[str, Path]:
 
 def manifest_folders() -> list[Path]:
     """Where the shipped manifests may be: in a source checkout beside the package, else where an installer puts data."""
-    checkout = Path(factorgraph_loc.__file__).resolve().parent.parent
+    checkout = Path(__file__).resolve().parents[2]
     folders = [checkout / "datasets"] if (checkout / "pyproject.toml").is_file() else []
     user = sysconfig.get_path("data", sysconfig.get_preferred_scheme("user"))
     return [*folders, Path(sysconfig.get_path("data")) / SHIPPED, Path(user) / SHIPPED]

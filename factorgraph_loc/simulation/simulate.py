@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc import __version__
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream
@@ -26,6 +25,7 @@ from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.version import __version__
 from factors import se2
 from factors.se2 import Array
 

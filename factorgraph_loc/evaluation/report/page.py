@@ -17,7 +17,6 @@ from typing import Any
 import polars as pl
 import tomli_w
 
-from factorgraph_loc import __version__
 from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag, text
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import charts, tables
@@ -29,6 +28,7 @@ from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.version import __version__
 
 SHOWN = 8  # variants that are visible at first
 _SWEPT = 3  # metrics that are drawn over a swept setting
