@@ -137,7 +137,7 @@ def hall(tmp_path_factory):
     )
     (run / "odometry.csv").write_text("t,v,w\n" + "".join(f"{a},0.55,0.0\n" for a in t))
     (run / "images.csv").write_text("t,file\n" + "".join(f"{t[i]},{i}.png\n" for i in range(0, len(t), 4)))
-    camera = fgloc.rig.read_rig(folder / "cart.rig.toml").camera.model()
+    camera = fgloc.read_rig(folder / "cart.rig.toml").camera.model()
     rng = np.random.default_rng(0)
     for i in range(0, len(t), 4):
         x, y, heading = poses[i]

@@ -24,7 +24,7 @@ from factorgraph_loc.vision.settings import FrontendSettings
 
 ORB = FrontendSettings(feature="orb", count=100)
 SIZE = (160, 120)
-SOURCE = Path(frontend.__file__).parent
+SOURCE = Path(frontend.__file__).parents[2] / "vision"
 
 
 @pytest.fixture(autouse=True)
