@@ -8,8 +8,10 @@ drives. What a name needs is imported when it is first used.
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc.old_places import OldPlaces
 from factorgraph_loc.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -161,6 +163,7 @@ _MODULES = {
     "sensors.twist.stream": ("TwistStream",),
     "vision.frame": ("CameraFrame",),
 }
+sys.meta_path.insert(0, OldPlaces())  # before folders of old modules that an upgrade has left empty
 _ELSEWHERE = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 
 

@@ -21,7 +21,7 @@ LAYERS = (
     ("exports", "simulation", "mapping", "slam"),
     ("planning",),
     ("experiments", "live"),
-    ("api", "cli", ""),
+    ("api", "cli", "old_places", ""),
 )
 EXCEPTIONS = {
     ("factorgraph_loc.exports.particles", "factorgraph_loc.experiments.run"),

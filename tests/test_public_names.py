@@ -1,5 +1,6 @@
 """What scripts import from the package itself: every name is there, is documented, and does its work with nothing else imported."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
+from factorgraph_loc import old_places
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = [*sorted((ROOT / "scripts").glob("example_*")), ROOT / "scripts/ros2_node_example"]
@@ -93,3 +95,28 @@ def test_several_logs_are_not_one():
     assert [log.name for log in fgloc.load("plaza2", options=both)] == ["plaza2-run1", "plaza2-run2"]
     with pytest.raises(fgloc.InputError, match="plaza2 stands for 2 logs, expected one: plaza2-run1, plaza2-run2"):
         fgloc.read_log("plaza2", options=both)
+
+
+def test_places_of_0_1_0_still_work_with_a_warning():
+    for place, name in (
+        ("rig", "Rig"),
+        ("rig", "read_rig"),
+        ("world", "Tag"),
+        ("readers", "manifests"),
+        ("readers.simulated_odometry", "wheel_odometry"),
+        ("estimators.base", "PoseEstimate"),
+        ("log", "RfidStream"),
+        ("measurements", "CameraFrame"),
+    ):
+        with pytest.warns(DeprecationWarning, match=f"factorgraph_loc.{place}.{name} is deprecated"):
+            exec(f"from factorgraph_loc.{place} import {name}", {})
+    with pytest.raises(ImportError):
+        exec("from factorgraph_loc.rig import Nothing", {})
+    with pytest.raises(ImportError):
+        exec("import factorgraph_loc.readers.nothing", {})
+
+
+@pytest.mark.parametrize("places", old_places._MODULES.values(), ids=old_places._MODULES)
+def test_places_are_there(places):
+    for place in places:
+        importlib.import_module(place)

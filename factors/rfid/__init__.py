@@ -1,0 +1,5 @@
+"""RFID tags: detection, strength and phase."""
+
+from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel
+
+__all__ = ["BeamModel", "DetectionModel", "GridModel", "LogisticModel"]

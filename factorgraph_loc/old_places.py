@@ -1,0 +1,82 @@
+"""Modules of version 0.1.0 whose content is elsewhere now: what is imported from them comes with a DeprecationWarning."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+_SENSORS = tuple(f"factorgraph_loc.sensors.{name}" for name in ("odometry", "twist", "landmarks", "rfid", "camera"))
+_MODULES: dict[str, tuple[str, ...]] = {
+    "factorgraph_loc.calibration.mapping": ("factorgraph_loc.mapping.mapping",),
+    "factorgraph_loc.calibration.phase": ("factorgraph_loc.sensors.rfid.calibration.phase",),
+    "factorgraph_loc.calibration.rssi": ("factorgraph_loc.sensors.rfid.calibration.rssi",),
+    "factorgraph_loc.calibration.tag_mapping": ("factorgraph_loc.mapping.tag_mapping",),
+    "factorgraph_loc.camera_settings": ("factorgraph_loc.sensors.camera.settings", "factorgraph_loc.vision.settings"),
+    "factorgraph_loc.estimators.base": (
+        "factorgraph_loc.fusion.base",
+        "factorgraph_loc.model.belief",
+        "factorgraph_loc.model.diagnostics",
+        "factorgraph_loc.model.learnt",
+    ),
+    "factorgraph_loc.evaluation.result": ("factorgraph_loc.model.result",),
+    "factorgraph_loc.grids": ("factorgraph_loc.sensors.rfid.grids",),
+    "factorgraph_loc.localizer": ("factorgraph_loc.live.localizer",),
+    "factorgraph_loc.log": ("factorgraph_loc.model.log", *(f"{sensor}.stream" for sensor in _SENSORS)),
+    "factorgraph_loc.measurements": (
+        "factorgraph_loc.model.measurement",
+        *(f"{sensor}.measurement" for sensor in _SENSORS),
+        "factorgraph_loc.vision.frame",
+    ),
+    "factorgraph_loc.points": ("factorgraph_loc.maps.points",),
+    "factorgraph_loc.pushed": ("factorgraph_loc.live.pushed",),
+    "factorgraph_loc.readers": ("factorgraph_loc.io.readers", "factorgraph_loc.files.shipped"),
+    "factorgraph_loc.readers.simulated_odometry": ("factorgraph_loc.sensors.odometry.simulation",),
+    "factorgraph_loc.rfid_settings": ("factorgraph_loc.sensors.rfid.settings",),
+    "factorgraph_loc.rig": (
+        "factorgraph_loc.model.rig",
+        "factorgraph_loc.io.native.rig_file",
+        *(f"{sensor}.settings" for sensor in _SENSORS),
+    ),
+    "factorgraph_loc.tag_map": ("factorgraph_loc.sensors.rfid.tag_map",),
+    "factorgraph_loc.trajectory": ("factorgraph_loc.model.trajectory",),
+    "factorgraph_loc.trajectory3": ("factorgraph_loc.model.trajectory3",),
+    "factorgraph_loc.vision.feature_evaluation": ("factorgraph_loc.evaluation.features.feature_evaluation",),
+    "factorgraph_loc.vision.frontend": ("factorgraph_loc.sensors.camera.frontend",),
+    "factorgraph_loc.vision.repeatability": ("factorgraph_loc.evaluation.features.repeatability",),
+    "factorgraph_loc.vision.sequences": ("factorgraph_loc.evaluation.features.sequences",),
+    "factorgraph_loc.world": (
+        "factorgraph_loc.model.world",
+        "factorgraph_loc.io.native.world_file",
+        "factorgraph_loc.sensors.landmarks.map",
+        "factorgraph_loc.sensors.rfid.map",
+    ),
+}
+_PACKAGES = ("factorgraph_loc.estimators", "factorgraph_loc.readers")
+
+
+class OldPlaces(MetaPathFinder, Loader):
+    """Finds those modules for the import system."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """The module, if it is one of them."""
+        if name in _MODULES or name in _PACKAGES:
+            return ModuleSpec(name, self, is_package=name in _PACKAGES)
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Let the module look for its names where they are now."""
+
+        def found(name: str) -> Any:
+            for place in _MODULES.get(module.__name__, ()):
+                if not name.startswith("__") and hasattr(where := importlib.import_module(place), name):
+                    told = f"{module.__name__}.{name} is deprecated: import it from factorgraph_loc, or {place}"
+                    warnings.warn(told, DeprecationWarning, stacklevel=2)
+                    return getattr(where, name)
+            raise AttributeError(f"module {module.__name__!r} has no attribute {name!r}")
+
+        module.__dict__["__getattr__"] = found
