@@ -24,8 +24,6 @@ LAYERS = (
     ("api", "cli", "old_places", ""),
 )
 EXCEPTIONS = {
-    ("factorgraph_loc.exports.particles", "factorgraph_loc.experiments.run"),
-    ("factorgraph_loc.exports.runs", "factorgraph_loc.experiments.stored_run"),
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.frame_pairs"),
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.unknown_points"),
     ("factorgraph_loc.fusion.guarded", "factorgraph_loc.live.pushed"),
@@ -35,9 +33,6 @@ EXCEPTIONS = {
     ("factorgraph_loc.fusion.registry", "factorgraph_loc.slam.space_batch"),
     ("factorgraph_loc.fusion.relocating", "factorgraph_loc.slam.new_points"),
     ("factorgraph_loc.fusion.smoother", "factorgraph_loc.slam.unknown_points"),
-    ("factorgraph_loc.maps.free_space", "factorgraph_loc.model.world"),
-    ("factorgraph_loc.maps.points", "factorgraph_loc.vision.settings"),
-    ("factorgraph_loc.maps.walls", "factorgraph_loc.model.world"),
     ("factorgraph_loc.model.log", "factorgraph_loc.sensors.odometry.stream"),
     ("factorgraph_loc.model.measurement", "factorgraph_loc.sensors.camera.measurement"),
     ("factorgraph_loc.model.measurement", "factorgraph_loc.sensors.landmarks.measurement"),

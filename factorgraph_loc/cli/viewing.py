@@ -62,7 +62,7 @@ def view(
 
 def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
     """The particles of those runs that have some, by name."""
-    from factorgraph_loc.exports.particles import particles_of
+    from factorgraph_loc.experiments.particles import particles_of
 
     found = {}
     for run in runs:

@@ -38,6 +38,7 @@ OUTSIDE = (
     "evaluation/report",
     "experiments/cluster.py",
     "experiments/maps.py",
+    "experiments/particles.py",
     "experiments/reporting.py",
 )
 Kept = TypeVar("Kept", bound=BaseModel)

@@ -21,10 +21,10 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import write_files
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.temporary import of_system, temporary_folder
-from factorgraph_loc.io.results.layout import COVARIANCES, FILES
+from factorgraph_loc.io.results.estimates import trajectory_of
+from factorgraph_loc.io.results.layout import FILES
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.trajectory import Trajectory
 
 
 def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
@@ -59,12 +59,3 @@ def read_track(estimates: bytes) -> Track:
 def _from_localized(table: pl.DataFrame) -> pl.Expr:
     found = table.filter((pl.col("kind") == "causal") & (pl.col("status") == "localized"))["t_ns"]
     return pl.col("t_ns") >= (found.min() if len(found) else np.iinfo(np.int64).max)
-
-
-def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:
-    """The poses in rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
-    covariances = np.empty((len(table), 3, 3))
-    for name, (i, j) in COVARIANCES.items():
-        covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    t = (table["t_ns"].to_numpy() - t0_ns) / 1e9
-    return Trajectory(t, table.select("x", "y", "heading").fill_null(np.nan).to_numpy(), covariances)

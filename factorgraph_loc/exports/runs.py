@@ -13,10 +13,10 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
-from factorgraph_loc.experiments.stored_run import trajectory_of
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
+from factorgraph_loc.io.results.estimates import trajectory_of
 from factorgraph_loc.io.results.layout import FILES
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log

@@ -12,7 +12,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.world import World
+from factorgraph_loc.maps.walls import Walled
 from factors.se2 import Array
 
 CELL = 0.2  # m
@@ -44,7 +44,7 @@ class FreeSpace:
         return bool(_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
-def free_space(world: World, clearance: float) -> FreeSpace:
+def free_space(world: Walled, clearance: float) -> FreeSpace:
     """Where a robot may be that keeps ``clearance`` [m] to all walls of the world; the largest connected part."""
     walls = np.array(world.walls).reshape(-1, 2, 2)
     if not len(walls):
@@ -65,7 +65,7 @@ def free_space(world: World, clearance: float) -> FreeSpace:
     return FreeSpace(centres[inside], _graph(index), index, origin, distance, clearance)
 
 
-def distance_to_walls(world: World, points: Array) -> Array:
+def distance_to_walls(world: Walled, points: Array) -> Array:
     """Distance [m] (N,) from points (N, 2) to the nearest wall."""
     out = np.full(len(points), np.inf)
     for x1, y1, x2, y2 in world.walls:

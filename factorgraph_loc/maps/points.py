@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import polars as pl
@@ -17,14 +17,14 @@ from factorgraph_loc.files.columns import POINTS
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.parquet import read_parquet, text_column
 from factorgraph_loc.text import listed
-from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
-KINDS: tuple[str, ...] = get_args(FrontendSettings.model_fields["feature"].annotation)
+Feature = Literal["colour", "sift", "orb"]
+KINDS: tuple[str, ...] = get_args(Feature)
 LARGEST_VALUE = 1e6  # of a descriptor
 ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
 

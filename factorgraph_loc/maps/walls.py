@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.model.world import World
 from factors.se2 import Array
 
 
-def crosses(world: World, a: Array, b: Array) -> NDArray[np.bool_]:
+class Walled(Protocol):
+    """What has walls, such as a world: its ``name``, and segments (x1, y1, x2, y2) [m]."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def walls(self) -> Sequence[tuple[float, float, float, float]]: ...
+
+
+def crosses(world: Walled, a: Array, b: Array) -> NDArray[np.bool_]:
     """Whether the segments from ``a`` (N, 2) to ``b`` (N, 2) cross a wall of the world."""
     out = np.zeros(len(a), dtype=bool)
     d = b - a

@@ -7,8 +7,8 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
+from factorgraph_loc.experiments.particles import SHOWN, _drawn, particles_of
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.exports.particles import SHOWN, _drawn, particles_of
 from factorgraph_loc.exports.runs import find_runs, read_runs
 
 
