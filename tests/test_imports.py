@@ -26,7 +26,6 @@ LAYERS = (
 EXCEPTIONS = {
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.frame_pairs"),
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.unknown_points"),
-    ("factorgraph_loc.fusion.guarded", "factorgraph_loc.live.pushed"),
     ("factorgraph_loc.fusion.keyframes", "factorgraph_loc.slam.new_points"),
     ("factorgraph_loc.fusion.keyframes", "factorgraph_loc.slam.unknown_points"),
     ("factorgraph_loc.fusion.registry", "factorgraph_loc.slam.monoslam"),

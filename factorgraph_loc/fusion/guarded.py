@@ -19,9 +19,8 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.base import Estimator
-from factorgraph_loc.live.pushed import sensor_of
 from factorgraph_loc.model.belief import Belief, PoseEstimate
-from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import plain
@@ -210,8 +209,7 @@ def _clearly_positive_3(covariance: Array) -> bool:
 
 
 def _named(measurement: Measurement) -> str:
-    name = "tick" if isinstance(measurement, Tick) else sensor_of(measurement)
-    return f"{name} at {measurement.t:.3f} s"
+    return f"{measurement.sensor} at {measurement.t:.3f} s"
 
 
 def _reason(error: BaseException) -> str:

@@ -38,17 +38,19 @@ from factors.se2 import Array
 
 M = TypeVar("M", bound=Odometry | Exteroceptive)
 # sensors as a rig and a log name them
-SENSORS: dict[type, str] = {
-    VelocityOdometry: "odometry",
-    IncrementOdometry: "odometry",
-    YawRate: "imu",
-    Twist: "twist",
-    BearingRange: "bearing_range",
-    RfidScan: "rfid",
-    PixelSightings: "sightings",
-    CameraFrame: "camera",
-}
-ALL_SENSORS = (*dict.fromkeys(SENSORS.values()), "sightings_right", "rssi", "phase")
+KINDS = (VelocityOdometry, IncrementOdometry, YawRate, Twist, BearingRange, RfidScan, PixelSightings, CameraFrame)
+ALL_SENSORS = (
+    "odometry",
+    "imu",
+    "twist",
+    "bearing_range",
+    "rfid",
+    "sightings",
+    "camera",
+    "sightings_right",
+    "rssi",
+    "phase",
+)
 # fields that name something, of which each has a row in the fields that are not numbers of their own
 NAMES: dict[type, str] = {BearingRange: "landmarks", RfidScan: "tags", PixelSightings: "points"}
 # fields that hold numbers, and their bounds
@@ -84,11 +86,11 @@ class RfidRead:
 
 def sensor_of(m: Odometry | Exteroceptive) -> str:
     """The name of the sensor that a measurement is of; InputError if it is no measurement."""
-    if type(m) not in SENSORS:
+    if type(m) not in KINDS:
         raise InputError(
-            f"{type(m).__name__} is no measurement, expected one of {', '.join(k.__name__ for k in SENSORS)}"
+            f"{type(m).__name__} is no measurement, expected one of {', '.join(k.__name__ for k in KINDS)}"
         )
-    return "sightings_right" if isinstance(m, PixelSightings) and m.right else SENSORS[type(m)]
+    return m.sensor
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:

@@ -4,6 +4,7 @@ Stamps are those of the event, with the known offsets between clocks already app
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
@@ -17,6 +18,7 @@ from factorgraph_loc.vision.frame import CameraFrame
 class Tick:
     """No measurement: time has passed, and the trajectory is wanted at this stamp."""
 
+    sensor: ClassVar[str] = "tick"
     t: float
 
 

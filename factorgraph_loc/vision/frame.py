@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ class CameraFrame:
     (K, D), of the kind ``feature``. ``tracks`` (K,): numbers that stay with what is followed from image to image.
     """
 
+    sensor: ClassVar[str] = "camera"
     t: float
     feature: str
     pixels: Array

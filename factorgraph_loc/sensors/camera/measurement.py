@@ -16,3 +16,8 @@ class PixelSightings:
     points: tuple[str, ...]
     pixels: Array
     right: bool = False
+
+    @property
+    def sensor(self) -> str:
+        """The sensor that saw them."""
+        return "sightings_right" if self.right else "sightings"

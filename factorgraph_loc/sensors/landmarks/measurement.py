@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from factors.se2 import Array
 
@@ -14,6 +15,7 @@ class BearingRange:
     ``landmarks``: K names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor's frame]: NaN where not measured.
     """
 
+    sensor: ClassVar[str] = "bearing_range"
     t: float
     landmarks: tuple[str, ...]
     range: Array

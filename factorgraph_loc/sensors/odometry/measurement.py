@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityOdometry:
     """Forward velocity ``v`` [m/s] and turn rate ``w`` [rad/s], held until the next row."""
 
+    sensor: ClassVar[str] = "odometry"
     t: float
     v: float
     w: float
@@ -18,6 +20,7 @@ class VelocityOdometry:
 class IncrementOdometry:
     """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot's frame at the previous row."""
 
+    sensor: ClassVar[str] = "odometry"
     t: float
     dx: float
     dy: float
@@ -28,5 +31,6 @@ class IncrementOdometry:
 class YawRate:
     """Turn rate ``w`` [rad/s] of a gyro, held until the next row."""
 
+    sensor: ClassVar[str] = "imu"
     t: float
     w: float

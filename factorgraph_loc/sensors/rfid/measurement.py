@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ class RfidScan:
     reader reports it, and ``frequency`` (R,) [Hz] of the carrier: NaN where unknown.
     """
 
+    sensor: ClassVar[str] = "rfid"
     t: float
     antennas: tuple[str, ...]
     antenna: NDArray[np.int64]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from factors.se2 import Array
 
@@ -12,6 +13,7 @@ class Twist:
     """Motion in space of a robot that is carried: velocity ``v`` (3,) [m/s] and turn rate ``w`` (3,) [rad/s], both in its own
     frame, held until the next row."""
 
+    sensor: ClassVar[str] = "twist"
     t: float
     v: Array
     w: Array
