@@ -112,7 +112,7 @@ def without_points(
     """A camera that is used, a map without points that it could find, and an estimator (by its ``name``) that needs them."""
     used = [sensor for sensor in OF_CAMERA if sensor in sensors]
     points = log.world.points
-    if not used or not getattr(estimator, "takes_pixels", False):
+    if not used or CAMERA not in getattr(estimator, "modalities", ()):
         return ()
     if points is not None and len(points.owners if used == [CAMERA] else points):
         return ()

@@ -34,7 +34,7 @@ class Prepared:
 
 def takes_pixels(estimator: str) -> bool:
     """Whether an estimator, by its name, uses what a camera sees."""
-    return bool(getattr(registry.estimator_type(estimator), "takes_pixels", False))
+    return CAMERA in getattr(registry.estimator_type(estimator), "modalities", ())
 
 
 def frontend_of(log: Log) -> FrontendSettings:

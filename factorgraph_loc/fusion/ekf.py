@@ -106,7 +106,7 @@ class _Record:
 class Ekf(Filter):
     """The EKF; see the module."""
 
-    takes_pixels = True
+    modalities = frozenset({"bearing_range", "camera"})
     _state: _State
 
     def __init__(self, setup: Setup, settings: EkfSettings) -> None:

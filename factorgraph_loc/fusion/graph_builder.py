@@ -80,12 +80,8 @@ class MeasuringGraph(KeyframeGraph):
             self._see(m)
 
     def _drop_late(self, m: Exteroceptive | Tick) -> None:
-        if isinstance(m, BearingRange):
-            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
-        elif isinstance(m, RfidScan):
-            self.diagnostics.drop_late("rfid", len(m.antennas))
-        elif isinstance(m, Pixels):
-            self.diagnostics.drop_late("camera", len(m.pixels))
+        if not isinstance(m, Tick):
+            self.diagnostics.drop_late(m.modality, m.count)
 
     @abstractmethod
     def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:

@@ -73,8 +73,7 @@ class ParticleFilter(Filter):
 
     deterministic = False
     supports_unknown_start = True
-    takes_scans = True
-    takes_pixels = True
+    modalities = frozenset({"bearing_range", "rfid", "camera"})
     _state: Cloud
     _rng: np.random.Generator
 

@@ -52,7 +52,7 @@ SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 class RelocatingGraph(MeasuringGraph):
     """A graph estimator that finds its place; see the module."""
 
-    takes_pixels = True
+    modalities = frozenset({"bearing_range", "rfid", "camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:

@@ -54,7 +54,7 @@ class Switching:
     """The switch; see the module."""
 
     deterministic = False
-    takes_pixels = True
+    modalities = frozenset({"bearing_range", "rfid", "camera"})
 
     def __init__(self, setup: Setup, settings: SwitchingSettings) -> None:
         self.diagnostics = Diagnostics()

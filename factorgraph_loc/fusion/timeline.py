@@ -60,8 +60,7 @@ class Filter(ABC):
 
     deterministic = True
     supports_unknown_start = False
-    takes_scans = False  # whether scans of RFID tags update it; else they are counted as ignored
-    takes_pixels = False  # and whether what a camera sees does
+    modalities = frozenset({"bearing_range"})  # of measurements that may update it; others are counted as ignored
 
     def __init__(self, setup: Setup, settings: FilterSettings) -> None:
         self.diagnostics = Diagnostics()
@@ -98,10 +97,8 @@ class Filter(ABC):
             self._ahead = None
         if isinstance(measurement, Odometry):
             self._motion.add(measurement)
-        elif isinstance(measurement, RfidScan) and not self.takes_scans:
-            self.diagnostics.ignore("rfid", len(measurement.antennas))
-        elif isinstance(measurement, PixelSightings | CameraFrame) and not self.takes_pixels:
-            self.diagnostics.ignore("camera", len(measurement.pixels))
+        elif not isinstance(measurement, Tick) and measurement.modality not in self.modalities:
+            self.diagnostics.ignore(measurement.modality, measurement.count)
         elif self._state is None:
             self._begin(measurement)
         elif measurement.t >= self._t:
@@ -251,12 +248,8 @@ class Filter(ABC):
             self._take(m)
 
     def _drop_late(self, m: Exteroceptive | Tick) -> None:
-        if isinstance(m, BearingRange):
-            self.diagnostics.drop_late("bearing_range", len(m.landmarks))
-        elif isinstance(m, RfidScan):
-            self.diagnostics.drop_late("rfid", len(m.antennas))
-        elif isinstance(m, PixelSightings | CameraFrame):
-            self.diagnostics.drop_late("camera", len(m.pixels))
+        if not isinstance(m, Tick):
+            self.diagnostics.drop_late(m.modality, m.count)
 
     def _go_back(self, taken: _Taken) -> None:
         self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry

@@ -61,7 +61,7 @@ class ActiveMcl(Filter):
 
     deterministic = False
     supports_unknown_start = True
-    takes_scans = True
+    modalities = frozenset({"bearing_range", "rfid"})
     _state: Cloud
     _rng: np.random.Generator
 

@@ -103,7 +103,7 @@ class _Record:
 class Monoslam(Filter):
     """The filter; see the module."""
 
-    takes_pixels = True
+    modalities = frozenset({"bearing_range", "camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
     _state: SlamState
 

@@ -20,9 +20,15 @@ class CameraFrame:
     """
 
     sensor: ClassVar[str] = "camera"
+    modality: ClassVar[str] = "camera"
     t: float
     feature: str
     pixels: Array
     sizes: Array
     descriptors: NDArray[Any]
     tracks: NDArray[np.int64]
+
+    @property
+    def count(self) -> int:
+        """How many points were seen."""
+        return len(self.pixels)

@@ -43,7 +43,7 @@ def seeing(log, tmp_path):
 @pytest.fixture
 def sees(fake, monkeypatch):
     """The estimator of the tests as one that takes pixels."""
-    monkeypatch.setattr(fake, "takes_pixels", True, raising=False)
+    monkeypatch.setattr(fake, "modalities", frozenset({"camera"}), raising=False)
     return fake
 
 

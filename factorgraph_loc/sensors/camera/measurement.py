@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from factors.se2 import Array
 
@@ -12,6 +13,7 @@ class PixelSightings:
     """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: by the second
     camera of a stereo pair."""
 
+    modality: ClassVar[str] = "camera"
     t: float
     points: tuple[str, ...]
     pixels: Array
@@ -21,3 +23,8 @@ class PixelSightings:
     def sensor(self) -> str:
         """The sensor that saw them."""
         return "sightings_right" if self.right else "sightings"
+
+    @property
+    def count(self) -> int:
+        """How many points were seen."""
+        return len(self.pixels)

@@ -16,7 +16,13 @@ class BearingRange:
     """
 
     sensor: ClassVar[str] = "bearing_range"
+    modality: ClassVar[str] = "bearing_range"
     t: float
     landmarks: tuple[str, ...]
     range: Array
     bearing: Array
+
+    @property
+    def count(self) -> int:
+        """How many landmarks were seen."""
+        return len(self.landmarks)

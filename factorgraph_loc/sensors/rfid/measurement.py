@@ -22,6 +22,7 @@ class RfidScan:
     """
 
     sensor: ClassVar[str] = "rfid"
+    modality: ClassVar[str] = "rfid"
     t: float
     antennas: tuple[str, ...]
     antenna: NDArray[np.int64]
@@ -30,3 +31,8 @@ class RfidScan:
     rssi: Array
     phase: Array
     frequency: Array
+
+    @property
+    def count(self) -> int:
+        """How many rounds there were."""
+        return len(self.antennas)
