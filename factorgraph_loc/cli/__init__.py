@@ -1,0 +1,1 @@
+"""The command ``fgloc``: options, what is printed, exit codes."""

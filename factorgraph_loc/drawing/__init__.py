@@ -1,0 +1,1 @@
+"""The style of plots, and HTML."""

@@ -1,0 +1,1 @@
+"""Robust fits that calibrations are made of."""

@@ -1,0 +1,1 @@
+"""Logs and results in files: formats of others, the native one, ROS bags."""

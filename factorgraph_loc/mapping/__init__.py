@@ -1,0 +1,1 @@
+"""Maps made from logs: landmarks, tags, and points that a camera sees."""

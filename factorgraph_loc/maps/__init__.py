@@ -1,0 +1,1 @@
+"""Points, markers, walls and free space."""

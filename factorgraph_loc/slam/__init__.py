@@ -1,0 +1,1 @@
+"""What maps while it localizes: unknown landmarks and points, loop closure, robots in space."""

@@ -1,0 +1,1 @@
+"""Pixels of points in space: model, kernels, factors."""

@@ -1,0 +1,1 @@
+"""Increments of wheel odometry: model, chain of states, kernels."""

@@ -1,0 +1,1 @@
+"""How well points of images are found again."""

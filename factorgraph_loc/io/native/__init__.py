@@ -1,0 +1,1 @@
+"""The native format: run folders, rigs and worlds."""

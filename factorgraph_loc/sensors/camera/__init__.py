@@ -1,0 +1,1 @@
+"""Cameras: features of images, and points by name."""

@@ -1,0 +1,1 @@
+"""Wheel odometry and gyro."""

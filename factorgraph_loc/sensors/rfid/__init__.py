@@ -1,0 +1,1 @@
+"""Readers of RFID tags: detection, strength and phase."""

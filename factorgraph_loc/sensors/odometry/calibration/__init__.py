@@ -1,0 +1,1 @@
+"""What is learnt of wheel odometry from logs with a reference."""

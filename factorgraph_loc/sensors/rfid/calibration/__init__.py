@@ -1,0 +1,1 @@
+"""What is learnt of RFID readers and tags from logs with a reference."""

@@ -3,26 +3,11 @@
 ``EXCEPTIONS`` are imports that still do: whoever removes one takes it off the list, and nothing is put onto it.
 """
 
-import ast
 from collections import defaultdict
 from graphlib import TopologicalSorter
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-# from the ground up; packages of one layer may import one another, but not in a circle
-LAYERS = (
-    ("factors", "errors", "text", "version", "threads", "processes", "drawing"),
-    ("files",),
-    ("maps",),
-    ("model", "vision"),
-    ("fitting",),
-    ("sensors",),
-    ("io", "evaluation", "calibration", "fusion"),
-    ("exports", "simulation", "mapping", "slam"),
-    ("planning",),
-    ("experiments", "live"),
-    ("api", "cli", "old_places", ""),
-)
+from package_tables import HEIGHT, MODULES, ROOT, imported, package_of, tables
+
 EXCEPTIONS = {
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.frame_pairs"),
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.unknown_points"),
@@ -138,41 +123,11 @@ SENSORS_OF_FUSION = {
     ("timeline", "factorgraph_loc.sensors.rfid.measurement"),
     ("timeline", "factorgraph_loc.vision.frame"),
 }
-HEIGHT = {package: height for height, packages in enumerate(LAYERS) for package in packages}
-MODULES = {
-    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
-    for folder in ("factorgraph_loc", "factors")
-    for path in (ROOT / folder).rglob("*.py")
-}
-
-
-def package(module: str) -> str:
-    top, _, below = module.partition(".")
-    return top if top == "factors" else below.partition(".")[0]
-
-
-def imported(module: str, *, at_once: bool = False) -> set[str]:
-    """The modules of this project that a module imports, or names in a string; ``at_once``: when it is itself imported."""
-    tree = ast.parse(MODULES[module].read_text())
-    nodes = ast.walk(tree)
-    if at_once:
-        nodes = iter(tree.body)
-    found: set[str] = set()
-    for node in nodes:
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {m if (m := f"{node.module}.{alias.name}") in MODULES else node.module for alias in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not at_once:
-            found.add(node.value.partition(":")[0])
-    return {m for m in found if m in MODULES and m != module}
-
-
 IMPORTS = {module: imported(module) for module in MODULES}
 
 
 def test_every_package_has_a_layer():
-    assert {package(module) for module in MODULES} == HEIGHT.keys()
+    assert {package_of(module) for module in MODULES} == HEIGHT.keys()
 
 
 def test_no_import_goes_up():
@@ -181,7 +136,7 @@ def test_no_import_goes_up():
         (module, other)
         for module, others in IMPORTS.items()
         for other in others
-        if HEIGHT[package(other)] > HEIGHT[package(module)]
+        if HEIGHT[package_of(other)] > HEIGHT[package_of(module)]
     }
     assert up == EXCEPTIONS
 
@@ -193,7 +148,7 @@ def test_no_estimator_imports_a_sensor():
         (module.removeprefix("factorgraph_loc.fusion."), other)
         for module, others in IMPORTS.items()
         for other in others
-        if package(module) == "fusion" and other.startswith(of_sensors)
+        if package_of(module) == "fusion" and other.startswith(of_sensors)
     }
     assert found == SENSORS_OF_FUSION
 
@@ -207,6 +162,20 @@ def test_no_circle_of_packages():
     graph: dict[str, set[str]] = defaultdict(set)
     for module, others in IMPORTS.items():
         for other in others:
-            if (module, other) not in EXCEPTIONS and package(other) != package(module):
-                graph[package(module)].add(package(other))
+            if (module, other) not in EXCEPTIONS and package_of(other) != package_of(module):
+                graph[package_of(module)].add(package_of(other))
     assert list(TopologicalSorter(graph).static_order())
+
+
+def test_every_folder_is_a_package():
+    # setuptools leaves out folders that are none
+    for path in MODULES.values():
+        for folder in path.relative_to(ROOT).parents[:-1]:
+            assert (ROOT / folder / "__init__.py").is_file(), folder
+
+
+def test_the_page_of_the_architecture_is_up_to_date():
+    page = (ROOT / "docs/architecture.md").read_text()
+    assert page.partition("<!-- tables -->\n\n")[2].splitlines() == list(tables()), (
+        "scripts/architecture --docs docs/architecture.md"
+    )
