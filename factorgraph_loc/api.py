@@ -31,9 +31,10 @@ from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder
-from factorgraph_loc.io.native.native import require_new
+from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.native.rig_file import write_rig
-from factorgraph_loc.io.readers import Dataset, describe, load, read_log, write_log, write_native
+from factorgraph_loc.io.readers import Dataset, describe, load, read_log
+from factorgraph_loc.io.write import write_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP

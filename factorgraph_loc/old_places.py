@@ -34,7 +34,12 @@ _MODULES: dict[str, tuple[str, ...]] = {
     ),
     "factorgraph_loc.points": ("factorgraph_loc.maps.points",),
     "factorgraph_loc.pushed": ("factorgraph_loc.live.pushed",),
-    "factorgraph_loc.readers": ("factorgraph_loc.io.readers", "factorgraph_loc.files.shipped"),
+    "factorgraph_loc.readers": (
+        "factorgraph_loc.io.readers",
+        "factorgraph_loc.io.native.native",
+        "factorgraph_loc.io.write",
+        "factorgraph_loc.files.shipped",
+    ),
     "factorgraph_loc.readers.simulated_odometry": ("factorgraph_loc.sensors.odometry.simulation",),
     "factorgraph_loc.rfid_settings": ("factorgraph_loc.sensors.rfid.settings",),
     "factorgraph_loc.rig": (

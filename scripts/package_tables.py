@@ -46,6 +46,9 @@ def imported(module: str, *, at_once: bool = False) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not at_once:
             found.add(node.value.partition(":")[0])
+    if at_once:  # and the packages that they are in
+        found |= {".".join(parts[:i]) for m in found for parts in (m.split("."),) for i in range(2, len(parts))}
+        found = {m for m in found if not module.startswith(f"{m}.")}
     return {m for m in found if m in MODULES and m != module}
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, StartPose, cut, join
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -96,7 +96,7 @@ def convert(
     json: Json = False,
 ) -> None:
     """Write a log in the native format, a folder of tables that any program can read, or as a ROS bag."""
-    from factorgraph_loc.io.readers import write_log
+    from factorgraph_loc.io.write import write_log
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     for warning in loaded.warnings:

@@ -18,7 +18,7 @@ from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.export import write_bag
 from factorgraph_loc.io.bags.file import open_bag
 from factorgraph_loc.io.bags.manifest import propose
-from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.io.native.native import write_native
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

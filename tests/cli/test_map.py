@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import write_native
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -14,7 +14,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.tables import comparison_table
 from factorgraph_loc.files.models import read_toml, write_toml
-from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -12,7 +12,7 @@ from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.paper_figures import deviations, fusion
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
-from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -15,7 +15,8 @@ from factorgraph_loc.experiments.index import load_results
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
-from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.io.native.native import write_native
+from factorgraph_loc.io.readers import load
 
 # a name that would leave the store as a path, and be code in a page
 NASTY = "../../a 'b' \"c\" <script>alert(1)</script>/.."

@@ -14,7 +14,7 @@ from factorgraph_loc.experiments import facts, globs, keys
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
-from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.io.native.native import write_native
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model
-from factorgraph_loc.io.native.native import RunFile
+from factorgraph_loc.io.native.native import RunFile, write_native
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

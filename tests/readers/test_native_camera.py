@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.readers import write_native
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, SightingStream
 from factorgraph_loc.sensors.twist.stream import TwistStream
 

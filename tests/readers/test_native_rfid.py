@@ -7,7 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.io.readers import load, write_native
+from factorgraph_loc.io.native.native import write_native
+from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World

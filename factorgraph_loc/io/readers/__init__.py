@@ -1,20 +1,7 @@
 """Readers: one module per log format, and ``load``, which finds the right one."""
 
-from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.readers.load import load, read_log
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
 from factorgraph_loc.io.readers.registry import READERS
-from factorgraph_loc.io.write import write_log
 
-__all__ = [
-    "READERS",
-    "Dataset",
-    "Manifest",
-    "describe",
-    "load",
-    "read_log",
-    "read_manifest",
-    "verify",
-    "write_log",
-    "write_native",
-]
+__all__ = ["READERS", "Dataset", "Manifest", "describe", "load", "read_log", "read_manifest", "verify"]
