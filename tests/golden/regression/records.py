@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -165,7 +166,7 @@ def _of_result(result: RunResult) -> tuple[dict[str, Any], dict[str, Array]]:
         "ticks": len(result.t),
         "status": [[i, result.status[i]] for i in changes],
         "final": len(result.final),
-        "warnings": list(result.warnings),
+        "warnings": [re.sub(r"(?<!\S)/\S*/", "", warning) for warning in result.warnings],  # wherever the data lies
     }
     numbers = _of_trajectory("causal", Trajectory(result.t, result.poses, result.covariances), CAUSAL)
     numbers |= _of_trajectory("final", result.final, FINAL)
