@@ -201,7 +201,8 @@ def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -
             for run in prepared.runs
         ],
     )
-    show.line(f"\n{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes")
+    show.line()
+    show.line(f"{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes")
 
 
 def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:

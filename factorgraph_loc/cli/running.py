@@ -152,8 +152,9 @@ def compare(
         show.rich_table(comparison_table(comparison.rows))
         for line in verdict(comparison.rows):
             show.line(line)
+        show.line()
         show.line(
-            f"\nresults are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/"
+            f"results are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/"
         )
     if comparison.failures:
         raise typer.Exit(1)

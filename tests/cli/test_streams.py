@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -98,3 +99,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(named_log: Path, tmp_path: P
     assert done.stderr.decode().count("\n") == 1
     assert "File too large" in done.stderr.decode()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_line_of_a_command_has_a_break_that_would_be_escaped():
+    for path in (Path(__file__).parents[2] / "factorgraph_loc/cli").glob("*.py"):
+        assert not re.search(r"""show\.(line|note)\(\s*f?["'][^"']*\\n""", path.read_text()), path
