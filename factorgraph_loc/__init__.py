@@ -11,6 +11,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from factorgraph_loc import builtin as builtin
 from factorgraph_loc.old_places import OldPlaces
 from factorgraph_loc.version import __version__ as __version__
 

@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 # from the ground up; packages of one layer may import one another, but not in a circle
 LAYERS = (
-    ("factors", "errors", "text", "version", "threads", "processes", "drawing"),
+    ("factors", "errors", "text", "version", "threads", "processes", "drawing", "plugins"),
     ("files",),
     ("maps",),
     ("model", "vision"),
@@ -19,7 +19,7 @@ LAYERS = (
     ("exports", "simulation", "mapping", "slam"),
     ("planning",),
     ("experiments", "live"),
-    ("api", "cli", "old_places", ""),
+    ("api", "cli", "old_places", "builtin", ""),
 )
 HEIGHT = {package: height for height, packages in enumerate(LAYERS) for package in packages}
 MODULES = {

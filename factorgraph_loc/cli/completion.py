@@ -3,18 +3,9 @@
 from __future__ import annotations
 
 from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.plugins import ESTIMATORS
 
-# said again here, as the modules that know them load much; a test compares
-ESTIMATORS = (
-    "dead_reckoning",
-    "ekf",
-    "particle_filter",
-    "switching",
-    "monoslam",
-    "smoother",
-    "batch",
-    "space_batch",
-)
+# said again here, as the module that knows them loads much; a test compares
 PRESETS = ("office", "sparse", "bursty", "corridor", "warehouse", "symmetric")
 PRIORS = ("reference", "log", "unknown")
 

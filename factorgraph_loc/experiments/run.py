@@ -104,7 +104,7 @@ def run(
     if "odometry" not in log.streams and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
             f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
-            f"expected one of {', '.join(registry.IN_SPACE)}"
+            f"expected one of {', '.join(registry.in_space())}"
         )
     unstated: tuple[str, ...] = ()
     if prior is None and config.prior is None and not findable(log, tuple(log.streams)):

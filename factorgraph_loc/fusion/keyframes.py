@@ -110,9 +110,9 @@ class KeyframeGraph(ABC):
         elif self._prior is None:
             self.diagnostics.ignore("before the start")
         elif measurement.t < max(self._t - self._graph_settings.max_delay, self._prior.t):
-            self._drop_late(measurement)
+            self._drop_late(measurement)  # type: ignore[arg-type]
         else:
-            self._take(measurement)
+            self._take(measurement)  # type: ignore[arg-type]
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The newest keyframe, moved along the odometry since, to the newest time or to ``t`` if that is later."""

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, nearest, parse_model
-from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.fusion.base import Estimator, SpaceEstimator
 from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.plugins import ESTIMATORS, load
 from factorgraph_loc.text import quoted
-
-# by name: module, class of the estimator and class of its settings; imported when asked for
-ESTIMATORS = {
-    "dead_reckoning": ("factorgraph_loc.fusion.dead_reckoning", "DeadReckoning", "DeadReckoningSettings"),
-    "ekf": ("factorgraph_loc.fusion.ekf", "Ekf", "EkfSettings"),
-    "particle_filter": ("factorgraph_loc.fusion.particle_filter", "ParticleFilter", "ParticleFilterSettings"),
-    "switching": ("factorgraph_loc.fusion.switching", "Switching", "SwitchingSettings"),
-    "monoslam": ("factorgraph_loc.slam.monoslam", "Monoslam", "MonoslamSettings"),
-    "smoother": ("factorgraph_loc.fusion.smoother", "Smoother", "SmootherSettings"),
-    "batch": ("factorgraph_loc.fusion.batch", "Batch", "BatchSettings"),
-    "space_batch": ("factorgraph_loc.slam.space_batch", "SpaceBatch", "SpaceBatchSettings"),
-}
-
-IN_SPACE = ("monoslam", "space_batch")  # those of a robot that need not be on a floor
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
@@ -47,17 +33,18 @@ def check_names(names: Sequence[str]) -> None:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
 
 
+def in_space() -> list[str]:
+    """The names of those for a robot that need not be on a floor."""
+    return [name for name in ESTIMATORS if issubclass(estimator_type(name), SpaceEstimator)]
+
+
 def estimator_type(name: str) -> type[Any]:
     """The class of an estimator; InputError for an unknown one."""
-    return _load(name, 1)
+    check_names([name])
+    return cast(type[Any], ESTIMATORS[name])
 
 
 def settings_type(name: str) -> type[FileModel]:
-    """The class of its settings; InputError for an unknown estimator."""
-    return _load(name, 2)
-
-
-def _load(name: str, which: int) -> type[Any]:
+    """The class of its settings: beside it, ``EkfSettings`` of ``Ekf``. InputError for an unknown estimator."""
     check_names([name])
-    entry = ESTIMATORS[name]
-    return cast(type[Any], getattr(importlib.import_module(entry[0]), entry[which]))
+    return cast(type[FileModel], load(f"{ESTIMATORS.place(name)}Settings"))

@@ -96,7 +96,7 @@ class RelocatingGraph(MeasuringGraph):
             super().process(measurement)
         elif self._prior is None:
             self._conclusion = None
-            self._search(measurement)
+            self._search(measurement)  # type: ignore[arg-type]
         else:
             super().process(measurement)
             if isinstance(measurement, Pixels):

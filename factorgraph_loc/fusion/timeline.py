@@ -100,13 +100,13 @@ class Filter(ABC):
         elif not isinstance(measurement, Tick) and measurement.modality not in self.modalities:
             self.diagnostics.ignore(measurement.modality, measurement.count)
         elif self._state is None:
-            self._begin(measurement)
+            self._begin(measurement)  # type: ignore[arg-type]
         elif measurement.t >= self._t:
-            self._take(measurement)
+            self._take(measurement)  # type: ignore[arg-type]
         elif measurement.t < self._t - self._max_delay or not self._taken:
-            self._drop_late(measurement)
+            self._drop_late(measurement)  # type: ignore[arg-type]
         else:
-            self._take_late(measurement)
+            self._take_late(measurement)  # type: ignore[arg-type]
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; not a number before the start."""

@@ -21,6 +21,7 @@ class CameraFrame:
 
     sensor: ClassVar[str] = "camera"
     modality: ClassVar[str] = "camera"
+    is_motion: ClassVar[bool] = False
     t: float
     feature: str
     pixels: Array

@@ -9,7 +9,6 @@ import shellingham
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.fusion.registry import ESTIMATORS
 from factorgraph_loc.simulation import PRESETS
 
 FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
@@ -25,7 +24,6 @@ def completed(line: str) -> list[str]:
 
 
 def test_the_names_are_those_of_the_registries():
-    assert set(completion.ESTIMATORS) == set(ESTIMATORS)
     assert set(completion.PRESETS) == set(PRESETS)
     assert completion.logs("") == list(manifests())
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt
@@ -16,6 +15,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.plugins import ESTIMATORS
 from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
@@ -116,5 +116,5 @@ def fake(monkeypatch):
     monkeypatch.setitem(
         sys.modules, "factorgraph_loc.fusion.fake", SimpleNamespace(Fake=Fake, FakeSettings=FakeSettings)
     )
-    monkeypatch.setitem(registry.ESTIMATORS, "fake", ("factorgraph_loc.fusion.fake", "Fake", "FakeSettings"))
+    monkeypatch.setitem(ESTIMATORS.own, "fake", "factorgraph_loc.fusion.fake:Fake")
     return Fake

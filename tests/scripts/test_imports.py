@@ -13,8 +13,6 @@ EXCEPTIONS = {
     ("factorgraph_loc.fusion.graph_builder", "factorgraph_loc.slam.unknown_points"),
     ("factorgraph_loc.fusion.keyframes", "factorgraph_loc.slam.new_points"),
     ("factorgraph_loc.fusion.keyframes", "factorgraph_loc.slam.unknown_points"),
-    ("factorgraph_loc.fusion.registry", "factorgraph_loc.slam.monoslam"),
-    ("factorgraph_loc.fusion.registry", "factorgraph_loc.slam.space_batch"),
     ("factorgraph_loc.fusion.relocating", "factorgraph_loc.slam.new_points"),
     ("factorgraph_loc.fusion.smoother", "factorgraph_loc.slam.unknown_points"),
     ("factorgraph_loc.model.log", "factorgraph_loc.sensors.odometry.stream"),

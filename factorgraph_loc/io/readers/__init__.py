@@ -2,6 +2,6 @@
 
 from factorgraph_loc.io.readers.load import load, read_log
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
-from factorgraph_loc.io.readers.registry import READERS
+from factorgraph_loc.plugins import READERS
 
 __all__ = ["READERS", "Dataset", "Manifest", "describe", "load", "read_log", "read_manifest", "verify"]

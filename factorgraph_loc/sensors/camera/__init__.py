@@ -1,1 +1,35 @@
 """Cameras: features of images, and points by name."""
+
+from factorgraph_loc.model.sections import Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+SENSOR = SensorType(
+    "camera",
+    channels=(
+        Channel(
+            "camera",
+            streams=(
+                "factorgraph_loc.sensors.camera.stream:ImageStream",
+                "factorgraph_loc.sensors.camera.stream:FeatureStream",
+            ),
+            measurements=("factorgraph_loc.vision.frame:CameraFrame",),
+            section="camera",
+        ),
+        Channel(
+            "sightings",
+            streams=("factorgraph_loc.sensors.camera.stream:SightingStream",),
+            measurements=("factorgraph_loc.sensors.camera.measurement:PixelSightings",),
+            section="camera",
+        ),
+        Channel(
+            "sightings_right",
+            streams=("factorgraph_loc.sensors.camera.stream:RightSightingStream",),
+            measurements=("factorgraph_loc.sensors.camera.measurement:PixelSightings",),
+            section="camera_right",
+        ),
+    ),
+    settings={
+        "camera": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
+        "camera_right": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
+    },
+)

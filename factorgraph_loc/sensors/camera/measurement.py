@@ -14,6 +14,7 @@ class PixelSightings:
     camera of a stereo pair."""
 
     modality: ClassVar[str] = "camera"
+    is_motion: ClassVar[bool] = False
     t: float
     points: tuple[str, ...]
     pixels: Array

@@ -1,1 +1,18 @@
 """Ranges and bearings of identified landmarks."""
+
+from factorgraph_loc.model.sections import Layer, Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+SENSOR = SensorType(
+    "landmarks",
+    channels=(
+        Channel(
+            "bearing_range",
+            streams=("factorgraph_loc.sensors.landmarks.stream:BearingRangeStream",),
+            measurements=("factorgraph_loc.sensors.landmarks.measurement:BearingRange",),
+            section="bearing_range",
+        ),
+    ),
+    settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
+    layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.map:Landmark")},
+)

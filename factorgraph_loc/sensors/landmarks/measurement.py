@@ -17,6 +17,7 @@ class BearingRange:
 
     sensor: ClassVar[str] = "bearing_range"
     modality: ClassVar[str] = "bearing_range"
+    is_motion: ClassVar[bool] = False
     t: float
     landmarks: tuple[str, ...]
     range: Array

@@ -1,1 +1,32 @@
 """Wheel odometry and gyro."""
+
+from factorgraph_loc.model.sections import Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+SENSOR = SensorType(
+    "odometry",
+    channels=(
+        Channel(
+            "odometry",
+            streams=(
+                "factorgraph_loc.sensors.odometry.stream:VelocityStream",
+                "factorgraph_loc.sensors.odometry.stream:IncrementStream",
+            ),
+            measurements=(
+                "factorgraph_loc.sensors.odometry.measurement:VelocityOdometry",
+                "factorgraph_loc.sensors.odometry.measurement:IncrementOdometry",
+            ),
+            section="odometry",
+        ),
+        Channel(
+            "imu",
+            streams=("factorgraph_loc.sensors.odometry.stream:YawRateStream",),
+            measurements=("factorgraph_loc.sensors.odometry.measurement:YawRate",),
+            section="imu",
+        ),
+    ),
+    settings={
+        "odometry": Section("factorgraph_loc.sensors.odometry.settings:OdometrySettings", always=True),
+        "imu": Section("factorgraph_loc.sensors.odometry.settings:ImuSettings"),
+    },
+)

@@ -11,6 +11,9 @@ class VelocityOdometry:
     """Forward velocity ``v`` [m/s] and turn rate ``w`` [rad/s], held until the next row."""
 
     sensor: ClassVar[str] = "odometry"
+    modality: ClassVar[str] = "odometry"
+    is_motion: ClassVar[bool] = True
+    count: ClassVar[int] = 1
     t: float
     v: float
     w: float
@@ -21,6 +24,9 @@ class IncrementOdometry:
     """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot's frame at the previous row."""
 
     sensor: ClassVar[str] = "odometry"
+    modality: ClassVar[str] = "odometry"
+    is_motion: ClassVar[bool] = True
+    count: ClassVar[int] = 1
     t: float
     dx: float
     dy: float
@@ -32,5 +38,8 @@ class YawRate:
     """Turn rate ``w`` [rad/s] of a gyro, held until the next row."""
 
     sensor: ClassVar[str] = "imu"
+    modality: ClassVar[str] = "imu"
+    is_motion: ClassVar[bool] = True
+    count: ClassVar[int] = 1
     t: float
     w: float

@@ -23,6 +23,7 @@ class RfidScan:
 
     sensor: ClassVar[str] = "rfid"
     modality: ClassVar[str] = "rfid"
+    is_motion: ClassVar[bool] = False
     t: float
     antennas: tuple[str, ...]
     antenna: NDArray[np.int64]

@@ -1,1 +1,17 @@
 """Measured motion in space."""
+
+from factorgraph_loc.model.sections import Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+SENSOR = SensorType(
+    "twist",
+    channels=(
+        Channel(
+            "twist",
+            streams=("factorgraph_loc.sensors.twist.stream:TwistStream",),
+            measurements=("factorgraph_loc.sensors.twist.measurement:Twist",),
+            section="twist",
+        ),
+    ),
+    settings={"twist": Section("factorgraph_loc.sensors.twist.settings:TwistSettings")},
+)

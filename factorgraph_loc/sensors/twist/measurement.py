@@ -14,6 +14,9 @@ class Twist:
     frame, held until the next row."""
 
     sensor: ClassVar[str] = "twist"
+    modality: ClassVar[str] = "twist"
+    is_motion: ClassVar[bool] = True
+    count: ClassVar[int] = 1
     t: float
     v: Array
     w: Array

@@ -1,0 +1,41 @@
+"""The sensors, estimators and readers that this project brings itself, and where each stands."""
+
+from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+
+SENSORS.own.update(
+    {
+        "odometry": "factorgraph_loc.sensors.odometry:SENSOR",
+        "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
+        "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
+        "twist": "factorgraph_loc.sensors.twist:SENSOR",
+        "camera": "factorgraph_loc.sensors.camera:SENSOR",
+    }
+)
+ESTIMATORS.own.update(
+    {
+        "dead_reckoning": "factorgraph_loc.fusion.dead_reckoning:DeadReckoning",
+        "ekf": "factorgraph_loc.fusion.ekf:Ekf",
+        "particle_filter": "factorgraph_loc.fusion.particle_filter:ParticleFilter",
+        "switching": "factorgraph_loc.fusion.switching:Switching",
+        "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
+        "smoother": "factorgraph_loc.fusion.smoother:Smoother",
+        "batch": "factorgraph_loc.fusion.batch:Batch",
+        "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
+    }
+)
+READERS.own.update(
+    {
+        "native": "factorgraph_loc.io.native.native",
+        "euroc": "factorgraph_loc.io.readers.euroc",
+        "kitti_odometry": "factorgraph_loc.io.readers.kitti_odometry",
+        "mapped": "factorgraph_loc.io.readers.mapped",
+        "mrclam": "factorgraph_loc.io.readers.mrclam",
+        "plaza": "factorgraph_loc.io.readers.plaza",
+        "rf_robot": "factorgraph_loc.io.readers.rf_robot",
+        "rosbag": "factorgraph_loc.io.bags.rosbag",
+        "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
+        "starry_night": "factorgraph_loc.io.readers.starry_night",
+        "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
+        "utias_woods": "factorgraph_loc.io.readers.utias_woods",
+    }
+)

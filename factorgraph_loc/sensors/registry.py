@@ -1,0 +1,84 @@
+"""The sensors: what each brings, and which of them a name is of.
+
+A sensor is a package. Its ``__init__`` has a :class:`SensorType` that names the classes and functions of its modules by their
+places, ``package.module:name``, so that asking what there is imports nothing else; :func:`factorgraph_loc.plugins.load` does. Ours
+stand in :mod:`factorgraph_loc.builtin`. Another package registers one by an entry point of the group ``factorgraph_loc.sensors``
+whose value is the place of its :class:`SensorType`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.model.sections import Layer, Section
+from factorgraph_loc.plugins import SENSORS, Place
+from factorgraph_loc.text import plain, quoted
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A name in ``--sensors``, and of a log's streams.
+
+    ``streams``, ``measurements``: the classes that a stream of this name may have, and what it yields. Both are empty of a channel
+    that only says how the rows of another one are used, as ``rssi`` and ``phase`` do of those of ``rfid``. ``section``: the one of
+    the rig that has the ``time_offset`` of its stamps.
+    """
+
+    name: str
+    streams: tuple[Place, ...] = ()
+    measurements: tuple[Place, ...] = ()
+    section: str = ""
+
+
+@dataclass(frozen=True)
+class SensorType:
+    """What a sensor brings: its ``channels``, the sections of the rig that are its ``settings``, its ``layers`` of the world."""
+
+    name: str
+    channels: tuple[Channel, ...]
+    settings: Mapping[str, Section] = field(default_factory=dict)
+    layers: Mapping[str, Layer] = field(default_factory=dict)
+
+
+@cache
+def sensors() -> Mapping[str, SensorType]:
+    """All sensors by name, ours first. InputError if one of another package cannot be loaded, or if two bring the same name."""
+    found: dict[str, SensorType] = {}
+    owners: dict[tuple[str, str], str] = {}
+    for name, sensor in SENSORS.items():
+        if not isinstance(sensor, SensorType):
+            raise InputError(f"sensors: {plain(name)} is {type(sensor).__name__}, expected a SensorType")
+        names = {"channel": [c.name for c in sensor.channels], "setting": sensor.settings, "layer": sensor.layers}
+        for key in ((kind, each) for kind, several in names.items() for each in several):
+            if key in owners:
+                raise InputError(f"sensors: {plain(name)} and {owners[key]} both have the {key[0]} {plain(key[1])}")
+            owners[key] = name
+        found[name] = sensor
+    return found
+
+
+@cache
+def channels() -> Mapping[str, Channel]:
+    """All channels by name: what may stand in ``--sensors``."""
+    return {channel.name: channel for sensor in sensors().values() for channel in sensor.channels}
+
+
+@cache
+def sensor_of(channel: str) -> SensorType:
+    """The sensor that a channel is of, which is also the ``sensor`` of a measurement and the name of a log's stream. InputError if
+    there is none of that name."""
+    for sensor in sensors().values():
+        if any(own.name == channel for own in sensor.channels):
+            return sensor
+    raise InputError(f"no sensor is called {quoted(channel)}{nearest(channel, list(channels()))}")
+
+
+def forget() -> None:
+    """Look once more for what is installed."""
+    SENSORS.forget()
+    for function in (sensors, channels, sensor_of):
+        function.cache_clear()
