@@ -19,7 +19,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import LearntPoint
-from factorgraph_loc.model.log import MOTION, Log
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.stream import SEEN
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
@@ -64,7 +65,7 @@ def pose_graph(
     ``sensors``: which of the log's streams are used. Landmarks are those of the map, or, where it has none, those ``learnt``.
     InputError without two poses, or if the log does not say how the robot moved.
     """
-    moving = [s for s in MOTION if s in sensors and s in log.streams]
+    moving = [s for s, stream in log.streams.items() if s in sensors and stream.rank < SEEN]
     if "odometry" not in moving:
         raise InputError(
             f"{log.name}: has no odometry among {listed(sensors)}, expected it for the edges of a pose graph"

@@ -16,11 +16,8 @@ from factorgraph_loc.model.stream import Stream, joined, selected
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factorgraph_loc.text import well_formed
 from factors.se2 import Array
-
-MOTION = ("odometry", "imu", "twist")  # streams of how the robot moves
 
 
 @dataclass(frozen=True)
@@ -34,8 +31,7 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Log:
-    """A run. ``streams`` by sensor name (odometry, imu, twist, bearing_range, rfid, camera, sightings,
-    sightings_right); ``t0_ns``: absolute time of t = 0 in nanoseconds.
+    """A run. ``streams`` by the names of their sensors' channels; ``t0_ns``: absolute time of t = 0 in nanoseconds.
 
     ``reference3``: the true robot in space, of a log that was not recorded on a floor. ``warnings``: what the reader mended or
     left out, one line each. ``metadata``: licence, origin and the like.
@@ -65,7 +61,7 @@ class Log:
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
         """The measurements of ``sensors`` in the order in which they arrived, stamps corrected by the rig's offsets.
 
-        A late one keeps its stamp and follows those that arrived before it. At equal times odometry comes first.
+        A late one keeps its stamp and follows those that arrived before it. At equal times the rank of the streams decides.
         """
 
         def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
@@ -74,7 +70,7 @@ class Log:
                 latest = max(latest, m.t)
                 yield latest, rank, i, m
 
-        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (s not in MOTION, s != "odometry", s))
+        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
         for _, _, _, m in heapq.merge(*(arrivals(rank, name) for rank, name in enumerate(order))):
             yield m
 
@@ -129,10 +125,7 @@ def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
     shift = _extent(first)[1] + gap - _extent(second)[0]
     streams = dict(first.streams)
     for name, stream in second.streams.items():
-        later = replace(stream, t=stream.t + shift)
-        if isinstance(later, IncrementStream):
-            moves = np.arange(len(later.t)) > 0
-            later = replace(later, dx=later.dx * moves, dy=later.dy * moves, dtheta=later.dtheta * moves)
+        later = replace(stream, t=stream.t + shift).begun_anew()
         streams[name] = joined(streams[name], later) if name in streams else later
     return replace(
         first,

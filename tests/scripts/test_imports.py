@@ -15,7 +15,6 @@ EXCEPTIONS = {
     ("factorgraph_loc.fusion.keyframes", "factorgraph_loc.slam.unknown_points"),
     ("factorgraph_loc.fusion.relocating", "factorgraph_loc.slam.new_points"),
     ("factorgraph_loc.fusion.smoother", "factorgraph_loc.slam.unknown_points"),
-    ("factorgraph_loc.model.log", "factorgraph_loc.sensors.odometry.stream"),
     ("factorgraph_loc.model.measurement", "factorgraph_loc.sensors.camera.measurement"),
     ("factorgraph_loc.model.measurement", "factorgraph_loc.sensors.landmarks.measurement"),
     ("factorgraph_loc.model.measurement", "factorgraph_loc.sensors.odometry.measurement"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,24 +11,23 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array
 
 
 @dataclass(frozen=True)
-class SightingStream:
+class SightingStream(Stream):
     """One row an identified point in an image: its name and pixel (``u``, ``v``) [px]. Rows of one stamp belong together."""
 
-    t: Array
     point: Sequence[str]
     u: Array
     v: Array
     right: ClassVar[bool] = False
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
-        for i, j in pairwise(bounds):
+        for i, j in self.scans():
             pixels = np.column_stack((self.u[i:j], self.v[i:j]))
             yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels, self.right)
 
@@ -42,10 +40,9 @@ class RightSightingStream(SightingStream):
 
 
 @dataclass(frozen=True)
-class ImageStream:
+class ImageStream(Stream):
     """Images that were taken: files (N) by their paths. :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
-    t: Array
     file: Sequence[Path]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
@@ -53,10 +50,9 @@ class ImageStream:
 
 
 @dataclass(frozen=True)
-class FeatureStream:
+class FeatureStream(Stream):
     """What was found in images: ``frame`` (N), whose own stamps do not count."""
 
-    t: Array
     frame: Sequence[CameraFrame]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors.se2 import Array
 
 
 @dataclass(frozen=True)
-class RfidStream:
+class RfidStream(Stream):
     """One row a read of a tag, and one with an empty EPC for a round in which an antenna read nothing.
 
     ``t`` (N,): the end of the inventory round, when its content is known; rows of one stamp make one scan. ``round`` (N,): the
@@ -23,7 +23,6 @@ class RfidStream:
     before ``t`` the tag was read; ``rssi`` (N,) [dBm], ``phase`` (N,) [rad], ``frequency`` (N,) [Hz]: NaN where unknown.
     """
 
-    t: Array
     round: NDArray[np.int64]
     antenna: Sequence[str]
     epc: Sequence[str]
@@ -33,8 +32,7 @@ class RfidStream:
     frequency: Array
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        bounds = [*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)]
-        for i, j in pairwise(bounds):
+        for i, j in self.scans():
             rounds: dict[int, int] = {}
             names: list[str] = []
             for number, antenna in zip(self.round[i:j].tolist(), self.antenna[i:j], strict=True):

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factors.se2 import Array
 
 
 @dataclass(frozen=True)
-class TwistStream:
+class TwistStream(Stream):
     """``v`` (N, 3) [m/s] and ``w`` (N, 3) [rad/s] in the robot's frame, each held until the next row."""
 
-    t: Array
+    rank: ClassVar[int] = 1
     v: Array
     w: Array
 
