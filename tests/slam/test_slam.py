@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.metrics import score
@@ -21,7 +22,7 @@ SEEDS = range(1, 7)
 
 
 @pytest.fixture(scope="module")
-def logs(simulate):
+def logs():
     return {seed: simulate(seed=seed, seconds=30.0) for seed in SEEDS}
 
 

@@ -6,6 +6,7 @@ from functools import cache
 import camera_world
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors
@@ -36,7 +37,7 @@ UNLIKELY = 21.1  # of a squared error of three dimensions: exceeded once in 10,0
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     """The simulated log in a world that is turned about the start."""
     made = simulate(seconds=30.0)
     turn = np.array((0.0, 0.0, TURN))
@@ -101,7 +102,7 @@ def test_switching_without_tags_finds_it_by_landmarks(log):
     assert np.nanmax(found.position) < 0.4
 
 
-def test_who_has_found_a_heading_by_ranges_alone_knows_how_well(simulate):
+def test_who_has_found_a_heading_by_ranges_alone_knows_how_well():
     squared = []
     for seed in range(1, 9):
         made = without(simulate(seed=seed, seconds=5.0), "bearing")

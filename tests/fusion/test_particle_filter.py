@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.metrics import errors, score
@@ -24,12 +25,12 @@ KNOWN = replace(UNKNOWN, prior=None)
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     return simulate(seconds=20.0)
 
 
 @pytest.fixture(scope="module")
-def kidnapped(log, simulate):
+def kidnapped(log):
     """After 10 s the robot is carried to where another run is at 25 s."""
     return join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
 
@@ -151,7 +152,7 @@ def test_a_density_of_several_modes_stays_at_its_poses():
     assert drawn.constants.std() == pytest.approx(cloud.constants.std(), rel=0.4)  # 5 sigma: 6e-7 of false alarms
 
 
-def test_trajectories_of_a_robot_that_stands_do_not_coalesce(simulate):
+def test_trajectories_of_a_robot_that_stands_do_not_coalesce():
     """Against the smoothed EKF; standard deviations of 100 trajectories are themselves off by a fourteenth."""
     log = simulate(seconds=30.0, speeds=lambda t: (np.where(t < 5.0, 0.3, 0.0), np.zeros(len(t))))
     found = run(log, KNOWN).final
@@ -161,7 +162,7 @@ def test_trajectories_of_a_robot_that_stands_do_not_coalesce(simulate):
     assert ratio.max() < 2.5
 
 
-def test_constants_of_the_sensor_travel_with_the_particles(simulate):
+def test_constants_of_the_sensor_travel_with_the_particles():
     """A rig whose sensor sits 0.3 m behind where it says, and whose ranges are 6 % short."""
     log = simulate(seconds=45.0)
     uncertainty = BearingRangeUncertainty(x=0.3, range_scale=0.06, time_offset=0.05)

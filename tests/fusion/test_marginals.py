@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -102,7 +103,7 @@ def test_a_factor_of_gtsam_that_throws_is_replaced_by_ours_wherever_it_throws():
     assert problem.covariances(solution.values, [ODOMETRY_KEY]).by_key[ODOMETRY_KEY][0, 0] == pytest.approx(1.0)
 
 
-def test_the_window_survives_marginals_that_fail(simulate, monkeypatch):
+def test_the_window_survives_marginals_that_fail(monkeypatch):
     log = simulate(seconds=12.0)
     config = RunConfig("smoother", {"lag": 5.0})
     expected, covariance = run(log, config), Window.covariance
@@ -120,7 +121,7 @@ def test_the_window_survives_marginals_that_fail(simulate, monkeypatch):
 
 
 @pytest.mark.parametrize("lag", [None, 5.0])
-def test_a_smoother_that_cannot_be_solved_says_so_in_one_line(lag, simulate, monkeypatch):
+def test_a_smoother_that_cannot_be_solved_says_so_in_one_line(lag, monkeypatch):
     def failing(_, key):
         raise RuntimeError(GTSAM_SAYS.format(key))
 
@@ -133,7 +134,7 @@ def test_a_smoother_that_cannot_be_solved_says_so_in_one_line(lag, simulate, mon
     assert "\n" not in text
 
 
-def test_a_batch_without_covariances_says_so_in_one_line(simulate, monkeypatch):
+def test_a_batch_without_covariances_says_so_in_one_line(monkeypatch):
     def failing(*_):
         raise IndeterminateError(pose_key(4))
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.smoother import Smoother
@@ -22,7 +23,7 @@ EVERY = pytest.mark.parametrize("config", CONFIGS.values(), ids=list(CONFIGS))
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     return simulate(seconds=6.0, rate=3.0)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import camera_world
 import numpy as np
 import pytest
 
@@ -12,7 +13,6 @@ from factorgraph_loc.slam.frame_pairs import FramePairs
 from factors import se2
 from factors.camera import model as reprojection
 from factors.motion import ChainState, Increment
-from tests.estimators import camera_world
 
 MODEL = camera_world.CAMERA.model()
 SPREAD = np.diag((0.01, 0.005, 0.01)) ** 2

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors, score
@@ -27,7 +28,7 @@ CAUSAL = ("ekf", "particle_filter", "smoother", "smoother_lag")
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     return simulate(seconds=30.0)
 
 
@@ -106,7 +107,7 @@ def test_final_is_better_than_causal(log, clean):
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (0.025, 0.02)], ids=["stands", "creeps"])
 @pytest.mark.parametrize("name", CONFIGS)
-def test_gap_in_all_sensors(name, motion, simulate):
+def test_gap_in_all_sensors(name, motion):
     """In the gap the robot stands, or moves by 1.5 m and 1.2 rad: about the sigmas that the rig gives to unknown motion."""
 
     def speeds(t):
@@ -132,7 +133,7 @@ def test_gap_in_all_sensors(name, motion, simulate):
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_gap_in_odometry_alone(name, simulate):
+def test_gap_in_odometry_alone(name):
     """The robot drives on at 0.3 m/s for 60 s without odometry, and sees landmarks all the while."""
     log = silent(simulate(seconds=75.0), "odometry", 8.0, 68.0)
     result = run(log, CONFIGS[name])
@@ -218,7 +219,7 @@ def delayed(stream, delay):
 
 
 @pytest.fixture(scope="module")
-def frequent(simulate):
+def frequent():
     return simulate(rate=8.0, seconds=15.0)
 
 
@@ -334,7 +335,7 @@ def test_solver_fails_in_mid_run(name, solver, tolerance, log, clean, monkeypatc
     assert distance(result, clean(name)) < tolerance
 
 
-def test_long_way_without_landmarks(simulate):
+def test_long_way_without_landmarks():
     log = simulate(seconds=300.0, speeds=lambda t: (np.full(len(t), 0.3), np.zeros(len(t))))
     settings = {"keyframe_max_interval": 0.05}
     result = run(log, RunConfig("smoother", settings, sensors=("odometry",)))

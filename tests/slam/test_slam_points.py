@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import camera_world
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -15,7 +16,6 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
-from tests.estimators import camera_world
 
 UNKNOWN = {"landmarks": "unknown"}
 CONFIGS = {

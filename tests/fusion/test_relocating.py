@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors
@@ -22,12 +23,12 @@ LOST = "lost: landmarks were not where they were expected since {:.1f} s; goes o
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     return simulate(seconds=20.0)
 
 
 @pytest.fixture(scope="module")
-def kidnapped(log, simulate):
+def kidnapped(log):
     """After 10 s the robot is carried to where another run is at 25 s."""
     return join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
 
@@ -142,7 +143,7 @@ def test_kidnapped(name, prior, kidnapped, log):
         np.testing.assert_array_equal(result.poses[:90], undisturbed.poses[:90])
 
 
-def test_a_lost_track_is_ambiguous_until_its_place_is_found(log, simulate):
+def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
     """The new place is told by one landmark for a while: seen well enough to doubt the old one, not to find the new one."""
     elsewhere = cut(simulate(seed=3, seconds=45.0), 25.0, 45.0)
     s = elsewhere.streams["bearing_range"]

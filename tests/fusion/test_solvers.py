@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import camera_world
 import gtsam
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.solvers import FullHistory, Window, read_all
@@ -12,14 +14,13 @@ from factorgraph_loc.fusion.summary import Summary
 from factorgraph_loc.fusion.variables import pose_key
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
-from tests.estimators import camera_world
 
 START = "0,0,0"  # its standard deviations are 0.05 m, 0.05 m, 0.05 rad
 SIGMA = 0.05
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     """The wheels report 7 % too little, and turns of 0.04 rad/s that there are not."""
     made = simulate(seed=1, seconds=20.0)
     wheels = made.streams["odometry"]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import camera_world
 import numpy as np
 import pytest
 
@@ -12,8 +13,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.slam import loop_closure
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factors import se2
-from tests.estimators import camera_world
-from tests.estimators.test_slam_points import rmse, with_features
+from tests.slam.test_slam_points import rmse, with_features
 
 MODEL = camera_world.CAMERA.model()
 POSES = np.array([(0.0, 0.1 * i, 0.05 * i) for i in range(5)])

@@ -1,5 +1,6 @@
 """The last keyframes and what waits there, adjusted together."""
 
+import camera_world
 import numpy as np
 
 from factorgraph_loc.fusion.graph_parts import Keyframe
@@ -8,7 +9,6 @@ from factorgraph_loc.slam.new_points import sightings_of
 from factors import se2
 from factors.camera import model as reprojection
 from factors.motion import ChainState, Increment
-from tests.estimators import camera_world
 
 MODEL = camera_world.CAMERA.model()
 TURN = 0.015  # rad, that the odometry is off by from one keyframe to the next

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import DEPTH, TRUTH, miscalibrated
+from landmark_world import DEPTH, TRUTH, miscalibrated, simulate
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -34,7 +34,7 @@ CONFIGS = {
 
 
 @pytest.fixture(scope="module")
-def logs(simulate):
+def logs():
     """By whether ranges are depths: a log, and the truth."""
     log = simulate(seconds=40.0)
     return {depth: (miscalibrated(log, t, depth=depth), t) for depth, t in ((False, TRUTH), (True, DEPTH))}
@@ -60,7 +60,7 @@ def test_constants_are_found(name, depth, logs):
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_right_constants_stay(name, simulate):
+def test_right_constants_stay(name):
     """As above, with a rig that is right and does not know it: 3.5 sigma of seven constants, one of 300 simulations."""
     log = miscalibrated(simulate(seconds=40.0, seed=2), TRUTH, seed=2)
     right = miscalibrated(simulate(seconds=40.0, seed=2), dict.fromkeys(TRUTH, 0.0), seed=2)

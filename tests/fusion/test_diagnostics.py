@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -30,7 +31,7 @@ def told(result):
 
 
 @pytest.fixture(scope="module")
-def late(simulate):
+def late():
     """Each third look comes 0.3 s late, after the next one; the landmark x is in no map."""
     log = simulate(seconds=15.0)
     seen = log.streams["bearing_range"]
@@ -55,7 +56,7 @@ def test_a_late_look_counts_once(late, name):
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])
-def test_a_look_counts_once_when_a_graph_goes_back(simulate, name):
+def test_a_look_counts_once_when_a_graph_goes_back(name):
     log = simulate(seconds=20.0)
     kidnapped = join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
     result = run(kidnapped, RunConfig(name))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import simulate
 
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -19,7 +20,7 @@ from factors import se2
 
 
 @pytest.fixture(scope="module")
-def log(simulate):
+def log():
     return simulate(seconds=40.0)
 
 
