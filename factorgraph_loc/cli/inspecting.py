@@ -25,8 +25,6 @@ from factorgraph_loc.cli.options import (
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
     from factorgraph_loc.model.log import Log
-    from factorgraph_loc.sensors.camera.summary import ImageSummary, PixelSummary
-    from factorgraph_loc.sensors.rfid.summary import RfidSummary
 
 
 class Format(StrEnum):
@@ -115,7 +113,7 @@ def _print(log: Log, found: Inspection) -> None:
         "log": log.name,
         "span": f"{last - first:.1f} s",
         "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors)}",
-        "world": f"{log.world.name}, {len(log.world.landmarks)} landmarks, {len(log.world.tags)} tags",
+        "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in found.in_map.items())]),
         "start": "stated by the log" if log.start is not None else "not stated",
     }
     if log.reference is None and log.reference3 is not None:
@@ -132,46 +130,15 @@ def _print(log: Log, found: Inspection) -> None:
     header = ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps")
     show.table(header, [_row(name, stream) for name, stream in streams.items()])
     show.line()
-    if found.rfid is not None:
-        _print_rfid(found.rfid)
-    if found.images is not None:
-        _print_images(found.images)
-    if found.pixels is not None:
-        _print_pixels(found.pixels)
+    for paragraph in (p for summary in found.sensors.values() for p in summary.text):
+        show.line(paragraph.line)
+        if paragraph.header:
+            show.table(paragraph.header, paragraph.rows)
+        show.line()
     if not found.problems:
         show.line("nothing looks wrong")
     for problem in found.problems:
         show.line(f"! {problem}")
-
-
-def _print_rfid(found: RfidSummary) -> None:
-    known = f"{found.known} tags of the map"
-    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
-    show.line(f"RFID: {found.reads} reads of {known} and of {unknown}, in {found.rounds} rounds, {found.scans} scans")
-    header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
-    rows = [
-        (name, str(a.reads), str(a.rounds), show.number(a.rate, 2), str(a.silent), show.number(a.last, 1))
-        for name, a in found.antennas.items()
-    ]
-    show.table(header, rows)
-    show.line()
-
-
-def _print_images(found: ImageSummary) -> None:
-    sizes = ", ".join(found.sizes) or "unknown"
-    show.line(
-        f"images: {found.images}, of {sizes} px; {found.readable} of the {found.looked_at} looked at can be read, "
-        f"with {found.features:.0f} {found.feature} features (median)"
-    )
-    show.line()
-
-
-def _print_pixels(found: PixelSummary) -> None:
-    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
-    show.line(
-        f"identified pixels: {found.rows} in {found.frames} images, of {found.known} points of the map and {unknown}"
-    )
-    show.line()
 
 
 def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
@@ -186,15 +153,10 @@ def _document(log: Log, found: Inspection) -> dict[str, Any]:
         "metadata": dict(log.metadata),
         "span": last - first,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
-        "world": {"name": log.world.name, "landmarks": len(log.world.landmarks), "tags": len(log.world.tags)},
+        "world": {"name": log.world.name, **found.in_map},
         "start": None if log.start is None else {"t": log.start.t, "pose": log.start.pose.tolist()},
-        "streams": {name: asdict(stream) for name, stream in found.streams.items()},
-        "reference": None if found.reference is None else asdict(found.reference),
-        "unseen": found.unseen,
-        "unknown": dict(found.unknown),
-        "suspects": [asdict(suspect) | {"offset": suspect.offset.tolist()} for suspect in found.suspects],
-        "rfid": None if found.rfid is None else asdict(found.rfid),
-        "images": None if found.images is None else asdict(found.images),
-        "pixels": None if found.pixels is None else asdict(found.pixels),
+        "streams": found.streams,
+        "reference": found.reference,
+        **found.found,
         "problems": found.problems,
     }

@@ -1,42 +1,20 @@
-"""What a log holds and what looks wrong with it, before any estimator sees it.
-
-Where there is a reference, each landmark's position is also estimated from its own sightings, taken from the reference poses:
-by the robust median where range and bearing are measured, by robust trilateration from ranges alone. A landmark whose map position
-lies far from that is a suspect.
-"""
+"""What a log holds and what looks wrong with it, before any estimator sees it."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from factorgraph_loc.evaluation.inspect_motion import motion_problems
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.summary import (
-    ImageSummary,
-    PixelSummary,
-    camera_problems,
-    summarize_images,
-    summarize_pixels,
-)
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.rfid.summary import RfidSummary, rfid_problems, summarize_rfid
-from factors import se2
+from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.summary import Summary
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
 _ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
-MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
-MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
-MIN_PASSES = 3
-MAD_TO_SIGMA = 1.4826  # of a Gaussian
-_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
-PASS = 10.0  # s; errors of sightings in one pass are not independent, so passes are counted, not sightings
 
 
 @dataclass(frozen=True)
@@ -51,160 +29,45 @@ class StreamSummary:
 
 
 @dataclass(frozen=True)
-class Suspect:
-    """A landmark that its sightings put elsewhere: ``offset`` (2,) [m] from the map; ``swapped_with``: whose place that seems."""
-
-    landmark: str
-    offset: Array
-    sightings: int
-    swapped_with: str | None = None
-
-    def __str__(self) -> str:
-        distance = float(np.hypot(*self.offset))
-        text = f"landmark {self.landmark}: {self.sightings} sightings put it {distance:.2f} m from its place in the map"
-        return f"{text}; swapped with {self.swapped_with}?" if self.swapped_with else text
-
-
-@dataclass(frozen=True)
 class Inspection:
-    """What a log holds. ``unseen``: landmarks of the map without a sighting; ``unknown``: sightings by name that the map lacks.
-    ``rfid``, ``images``, ``pixels``: None where the log has no reads of tags, no images, no identified pixels."""
+    """What a log holds: its streams and reference, what each sensor's package says of it (``sensors``, by name), and everything
+    that looks wrong, as lines for people. What the sensors found is an attribute too, by its key (``unseen``, ``rfid``, ...)."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
-    unseen: tuple[str, ...]
-    unknown: Mapping[str, int]
-    suspects: tuple[Suspect, ...]
     problems: tuple[str, ...]
-    rfid: RfidSummary | None = None
-    images: ImageSummary | None = None
-    pixels: PixelSummary | None = None
+    sensors: Mapping[str, Summary]
+
+    @property
+    def found(self) -> dict[str, Any]:
+        """What all sensors found, by its key."""
+        return {key: value for summary in self.sensors.values() for key, value in summary.found.items()}
+
+    @property
+    def in_map(self) -> dict[str, int]:
+        """How many things of each layer of the map there are."""
+        return {layer: count for summary in self.sensors.values() for layer, count in summary.in_map.items()}
+
+    def __getattr__(self, name: str) -> Any:
+        found = self.found if "sensors" in self.__dict__ else {}  # which it lacks while it is unpickled
+        if name in found:
+            return found[name]
+        raise AttributeError(f"an inspection has no {name!r}")
 
 
 def inspect(log: Log) -> Inspection:
     """Summaries of a log's streams, and everything about it that looks wrong, as lines for people in ``problems``."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = _summary(log.reference.t) if log.reference is not None else None
-    unseen, unknown = _unmatched(log)
-    suspects = find_suspects(log)
     problems = list(log.warnings)
     problems += [f"the log has no {sensor}, which the rig lists" for sensor in log.rig.sensors if sensor not in streams]
     problems += [f"{name} is empty" for name, summary in streams.items() if summary.rows == 0]
     problems += [_gaps(name, summary.gaps) for name, summary in streams.items() if summary.gaps]
     if reference is not None and reference.gaps:
         problems.append(_gaps("reference", reference.gaps))
-    problems += motion_problems(log)
-    problems += [f"landmark {name} of the map is never seen" for name in unseen]
-    problems += [f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()]
-    problems += [str(suspect) for suspect in suspects]
-    rfid = summarize_rfid(log)
-    if rfid is not None:
-        problems += rfid_problems(log, rfid)
-    images, pixels = summarize_images(log), summarize_pixels(log)
-    problems += camera_problems(log, images, pixels)
-    return Inspection(streams, reference, unseen, unknown, suspects, tuple(problems), rfid, images, pixels)
-
-
-def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """The landmarks that their sightings from the reference poses put elsewhere than the map does; none without a reference.
-
-    The map is doubted beyond ``MIN_OFFSET`` and beyond five standard errors.
-    """
-    implied: dict[str, tuple[Array, int]] = {}
-    for name, seen in _seen_from_reference(log).items():
-        passes = len(np.unique(seen.t // PASS))
-        if len(seen.t) < MIN_SIGHTINGS or passes < MIN_PASSES:
-            continue
-        place = _place(log.world, name)
-        position, spread = _by_range_and_bearing(seen) if seen.has_bearing else _by_range(seen, place)
-        if _distance(position, place) > max(MIN_OFFSET, 5.0 * spread / np.sqrt(passes)):
-            implied[name] = (position, len(seen.t))
-    return tuple(
-        Suspect(name, position - _place(log.world, name), count, _partner(log.world, name, implied))
-        for name, (position, count) in implied.items()
-    )
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Sightings of one landmark from the reference: times (N,), poses of the sensor (N, 3), calibrated range and bearing (N,)."""
-
-    t: Array
-    sensors: Array
-    ranges: Array
-    bearings: Array
-
-    @property
-    def has_bearing(self) -> bool:
-        return bool(np.isfinite(self.bearings).any())
-
-
-def _seen_from_reference(log: Log) -> dict[str, _Seen]:
-    """The sightings with a range, by landmark of the map, where the reference has poses."""
-    stream = log.streams.get("bearing_range")
-    if log.reference is None or log.rig.bearing_range is None or not isinstance(stream, BearingRangeStream):
-        return {}
-    model = log.rig.bearing_range.model()
-    t = stream.t + log.rig.time_offset("bearing_range")
-    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + _ROUNDING), np.array(model.mounting))
-    ranges = stream.range / model.range_scale
-    bearings = stream.bearing - model.bearing_bias
-    if not log.reference.has_heading:
-        bearings = np.full_like(bearings, np.nan)
-    names = np.array(stream.landmark, dtype=str)
-    usable = np.isfinite(sensors[:, :2]).all(axis=1) & np.isfinite(ranges)
-    out = {}
-    for name in log.world.landmarks:
-        rows = usable & (names == name)
-        out[name] = _Seen(t[rows], sensors[rows], ranges[rows], bearings[rows])
-    return out
-
-
-def _by_range_and_bearing(seen: _Seen) -> tuple[Array, float]:
-    """Median of the positions that each sighting implies, and their robust standard deviation [m]."""
-    rows = np.isfinite(seen.bearings)
-    direction = seen.sensors[rows, 2] + seen.bearings[rows]
-    points = seen.sensors[rows, :2] + seen.ranges[rows, None] * np.stack(
-        (np.cos(direction), np.sin(direction)), axis=-1
-    )
-    centre = np.median(points, axis=0)
-    return centre, MAD_TO_SIGMA * float(np.median(np.hypot(*(points - centre).T)))
-
-
-def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
-    """Robust trilateration from the map's place, and the spread that, over sqrt(passes), is its standard error [m]."""
-
-    def residual(point: Array) -> Array:
-        away: Array = seen.sensors[:, :2] - point
-        return np.hypot(away[:, 0], away[:, 1]) - seen.ranges
-
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual(place)))), 1e-3)
-    fit = least_squares(residual, place, loss="soft_l1", f_scale=scale)
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))), 1e-3)
-    fit = least_squares(residual, fit.x, loss="cauchy", f_scale=scale)
-    information = fit.jac.T @ fit.jac / len(seen.t)
-    weakest = max(float(np.linalg.eigvalsh(information)[0]), 1e-9)
-    return fit.x, MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))) / np.sqrt(weakest)
-
-
-def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
-    """The other suspect, where each of the two is seen nearer to the other's place than to its own."""
-    for other in implied:
-        if other != name:
-            mine, theirs = _place(world, name), _place(world, other)
-            at, other_at = implied[name][0], implied[other][0]
-            if _distance(at, theirs) < _distance(at, mine) and _distance(other_at, mine) < _distance(other_at, theirs):
-                return other
-    return None
-
-
-def _place(world: World, name: str) -> Array:
-    landmark = world.landmarks[name]
-    return np.array((landmark.x, landmark.y))
-
-
-def _distance(a: Array, b: Array) -> float:
-    return float(np.hypot(*(a - b)))
+    sensors = {name: summarize(log) for name, summarize in functions("summarize")}
+    problems += [line for summary in sensors.values() for line in summary.problems]
+    return Inspection(streams, reference, tuple(problems), sensors)
 
 
 def _summary(t: Array) -> StreamSummary:
@@ -224,13 +87,3 @@ def _gaps(name: str, gaps: tuple[tuple[float, float], ...]) -> str:
     if len(gaps) == 1:
         return f"{name} has a gap of {length:.1f} s at {start:.1f} s"
     return f"{name} has {len(gaps)} gaps above {LONG_GAP:g} s, the longest {length:.1f} s at {start:.1f} s"
-
-
-def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
-    """Landmarks of the map that are never seen, and the count of sightings of names that the map lacks."""
-    stream = log.streams.get("bearing_range")
-    if not isinstance(stream, BearingRangeStream):
-        return (), {}
-    counts = Counter(stream.landmark)
-    unseen = tuple(name for name in log.world.landmarks if name not in counts)
-    return unseen, {name: count for name, count in sorted(counts.items()) if name not in log.world.landmarks}

@@ -8,14 +8,15 @@ whose value is the place of its :class:`SensorType`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.model.sections import Layer, Section
-from factorgraph_loc.plugins import SENSORS, Place
+from factorgraph_loc.plugins import SENSORS, Place, load
 from factorgraph_loc.text import plain, quoted
 
 
@@ -36,12 +37,17 @@ class Channel:
 
 @dataclass(frozen=True)
 class SensorType:
-    """What a sensor brings: its ``channels``, the sections of the rig that are its ``settings``, its ``layers`` of the world."""
+    """What a sensor brings: its ``channels``, the sections of the rig that are its ``settings``, its ``layers`` of the world, and
+    the places of its functions, "" where it has none; :func:`functions` gives those of all sensors.
+
+    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log.
+    """
 
     name: str
     channels: tuple[Channel, ...]
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
+    summarize: Place = ""
 
 
 @cache
@@ -75,6 +81,13 @@ def sensor_of(channel: str) -> SensorType:
         if any(own.name == channel for own in sensor.channels):
             return sensor
     raise InputError(f"no sensor is called {quoted(channel)}{nearest(channel, list(channels()))}")
+
+
+def functions(kind: str) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """The functions of one kind, a field of :class:`SensorType`, of the sensors that have one, with their names."""
+    for name, sensor in sensors().items():
+        if place := getattr(sensor, kind):
+            yield name, load(place)
 
 
 def forget() -> None:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from factorgraph_loc.evaluation.inspect import find_suspects, inspect
+from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
@@ -13,6 +13,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.summary import find_suspects
 from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors.landmarks import model as bearing_range
 

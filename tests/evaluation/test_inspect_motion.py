@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.evaluation.inspect_motion import motion_problems
 from factorgraph_loc.io.look_over import look_over
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -55,6 +54,12 @@ def later(log, **shifts):
     """The log with streams that are stamped later, by name."""
     streams = {k: replace(s, t=s.t + shifts.get(k, 0.0)) for k, s in log.streams.items()}
     return replace(log, streams=streams)
+
+
+def motion_problems(log):
+    """What the odometry's and the landmarks' packages say of a log."""
+    sensors = inspect(log).sensors
+    return [*sensors["odometry"].problems, *sensors["landmarks"].problems]
 
 
 def test_a_log_that_fits_has_no_problems(log):

@@ -32,4 +32,5 @@ SENSOR = SensorType(
         "camera": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
         "camera_right": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
     },
+    summarize="factorgraph_loc.sensors.camera.summary:summarize",
 )

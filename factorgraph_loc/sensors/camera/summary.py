@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.summary import Paragraph, Summary
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import read_image
 from factorgraph_loc.vision.settings import FrontendSettings
@@ -43,6 +44,25 @@ class PixelSummary:
     known: int
     unknown: Mapping[str, int]
     outside: int
+
+
+def summarize(log: Log) -> Summary:
+    """``images``, an :class:`ImageSummary`, and ``pixels``, a :class:`PixelSummary`, of a log; None where it has no such stream."""
+    images, pixels = summarize_images(log), summarize_pixels(log)
+    text = []
+    if images is not None:
+        sizes = ", ".join(images.sizes) or "unknown"
+        text.append(
+            f"images: {images.images}, of {sizes} px; {images.readable} of the {images.looked_at} looked at can be read, "
+            f"with {images.features:.0f} {images.feature} features (median)"
+        )
+    if pixels is not None:
+        unknown = f"{len(pixels.unknown)} others" if pixels.unknown else "no others"
+        text.append(
+            f"identified pixels: {pixels.rows} in {pixels.frames} images, of {pixels.known} points of the map and {unknown}"
+        )
+    problems = camera_problems(log, images, pixels)
+    return Summary({"images": images, "pixels": pixels}, {}, problems, tuple(map(Paragraph, text)))
 
 
 def summarize_images(log: Log) -> ImageSummary | None:

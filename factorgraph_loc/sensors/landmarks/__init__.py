@@ -15,4 +15,5 @@ SENSOR = SensorType(
     ),
     settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
     layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.map:Landmark")},
+    summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
 )

@@ -29,4 +29,5 @@ SENSOR = SensorType(
         "odometry": Section("factorgraph_loc.sensors.odometry.settings:OdometrySettings", always=True),
         "imu": Section("factorgraph_loc.sensors.odometry.settings:ImuSettings"),
     },
+    summarize="factorgraph_loc.sensors.odometry.summary:summarize",
 )

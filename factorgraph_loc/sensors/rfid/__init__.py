@@ -20,4 +20,5 @@ SENSOR = SensorType(
         "survey": Section("factorgraph_loc.sensors.rfid.settings:SurveySettings", always=True),
     },
     layers={"tags": Layer("factorgraph_loc.sensors.rfid.map:Tag")},
+    summarize="factorgraph_loc.sensors.rfid.summary:summarize",
 )

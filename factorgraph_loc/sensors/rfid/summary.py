@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.summary import Paragraph, Summary
 
 STOPPED = 10.0  # s: an antenna that is silent for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
@@ -42,6 +43,29 @@ class RfidSummary:
     unread: tuple[str, ...]
     unknown: Mapping[str, int]
     late: tuple[int, float]
+
+
+def summarize(log: Log) -> Summary:
+    """The reads of a log: ``rfid`` is an :class:`RfidSummary`, or None where there is no stream of that name."""
+    found, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
+    if found is None:
+        return Summary({"rfid": None}, in_map)
+    return Summary({"rfid": found}, in_map, rfid_problems(log, found), (_told(found),))
+
+
+def _told(found: RfidSummary) -> Paragraph:
+    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
+    header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
+    rows = [
+        (name, str(a.reads), str(a.rounds), f"{a.rate:.2f}", str(a.silent), f"{a.last:.1f}")
+        for name, a in found.antennas.items()
+    ]
+    return Paragraph(
+        f"RFID: {found.reads} reads of {found.known} tags of the map and of {unknown}, in {found.rounds} rounds, "
+        f"{found.scans} scans",
+        header,
+        tuple(rows),
+    )
 
 
 def summarize_rfid(log: Log) -> RfidSummary | None:

@@ -1,7 +1,6 @@
-"""Whether what tells of the same motion agrees: odometry, gyro, reference and sightings, in time, in sign and in unit.
+"""Whether what tells of the same motion agrees: odometry, gyro and reference, in time, in sign and in unit.
 
-Turn rates (of a reference without heading: speeds) are compared at shifts of time. Sightings are compared with where the reference
-says that their landmarks are, at shifts of time too.
+Turn rates (of a reference without heading: speeds) are compared at shifts of time.
 """
 
 from __future__ import annotations
@@ -12,25 +11,18 @@ import numpy as np
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors import clock_shift
+from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
-from factors import se2
-from factors.landmarks import model as bearing_range
+from factorgraph_loc.sensors.summary import Summary
 from factors.odometry.chain import OdometryChain
 from factors.se2 import Array
 
-STEP = 0.05  # s between times and between shifts that are compared
 WINDOW = 0.2  # s over which a rate is taken, at least
-FARTHEST = 2.5  # s of shift
-LARGE = 0.15  # s: of a shift that is told
-SLOWEST = 1.0  # s between poses of a reference that tells rates
-FEWEST = 200  # times, and sightings, that are compared
 MOVES = 0.03  # rad/s and m/s: root mean square of rates, at least
 ALIKE = 0.6  # correlation of the same motion, at least
-BETTER = 0.7  # what is left unexplained at a shift that is told, at most, of what is at none
 DEGREES = (20.0, 150.0)  # times radians
 COVERED = 0.9  # share of a log whose reference is whole
-MOST = 2000  # sightings that are compared
 
 
 @dataclass(frozen=True)
@@ -41,8 +33,13 @@ class Match:
     slope: float
 
 
+def summarize(log: Log) -> Summary:
+    """What does not fit the odometry of a log."""
+    return Summary(problems=motion_problems(log))
+
+
 def motion_problems(log: Log) -> list[str]:
-    """Lines on sensors and a reference that do not fit the odometry, and on a reference that is shorter than it. Of a log with long
+    """Lines on a gyro and a reference that do not fit the odometry, and on a reference that is shorter than it. Of a log with long
     gaps the longest part between them is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -70,7 +67,7 @@ def motion_problems(log: Log) -> list[str]:
     else:
         found = match(_rates(way, window), _speeds(poses[:, :2], window))
         lines += _compared("odometry", "the reference", found and Match(found.shift, 1.0))
-    return lines + _sightings(log)
+    return lines
 
 
 def _longest(t: Array) -> tuple[float, float]:
@@ -88,16 +85,14 @@ def match(rates: Array, others: Array) -> Match | None:
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(others)) < FEWEST:
         return None
-    count = round(FARTHEST / STEP)
-    shifts = np.arange(-count, count + 1)
-    found = np.array([_correlation(rates, others, int(k)) for k in shifts])
-    best, none = int(np.argmax(np.abs(found[:, 0]))), count
+    found = np.array([_correlation(rates, others, int(k)) for k in SHIFTS])
+    best, none = int(np.argmax(np.abs(found[:, 0]))), len(SHIFTS) // 2
     if abs(found[best, 0]) < ALIKE:
         return None
     left = 1.0 - found[:, 0] ** 2
-    if abs(shifts[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
+    if abs(SHIFTS[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
         best = none
-    return Match(float(shifts[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
+    return Match(float(SHIFTS[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
 
 
 def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
@@ -127,14 +122,8 @@ def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
     if found.shift:
         # what is stamped too late gets a negative offset, and the odometry is too early where the other is too late
         offset = -found.shift if sensor == "imu" else found.shift
-        lines.append(_off(name, found.shift, f"{sensor}.time_offset = {offset:+.2f}"))
+        lines.append(clock_shift.line(name, found.shift, "the odometry", sensor, offset))
     return lines
-
-
-def _off(name: str, shift: float, mends: str) -> str:
-    late = "later" if shift > 0.0 else "earlier"
-    than = "the reference" if name == "bearing_range" else "the odometry"
-    return f"{name} is stamped about {abs(shift):.2f} s {late} than {than}: {mends} in the rig"
 
 
 def _integrated(log: Log, stream: VelocityStream | IncrementStream) -> OdometryChain:
@@ -170,32 +159,3 @@ def _coverage(log: Log, stream: VelocityStream | IncrementStream) -> list[str]:
     if end <= begin:
         return ["the reference has no pose while there is odometry"]
     return [f"the reference covers {begin:.1f} to {end:.1f} s of the odometry's {first:.1f} to {last:.1f} s"]
-
-
-def _sightings(log: Log) -> list[str]:
-    """A line, if sightings of mapped landmarks fit the reference better at another time."""
-    stream, reference = log.streams.get("bearing_range"), log.reference
-    if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.bearing_range is None:
-        return []
-    rows = np.array([i for i, name in enumerate(stream.landmark) if name in log.world.landmarks], dtype=np.int64)
-    if len(rows) < FEWEST:
-        return []
-    rows = rows[:: max(1, len(rows) // MOST)]
-    marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
-    places = np.array([(mark.x, mark.y) for mark in marks])
-    model, t = log.rig.bearing_range.model(), stream.t[rows] + log.rig.time_offset("bearing_range")
-    count = round(FARTHEST / STEP)
-    shifts = STEP * np.arange(-count, count + 1)
-    costs = []
-    for shift in shifts.tolist():
-        ranges, bearings = bearing_range.predict(model, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
-        off = [np.abs(stream.range[rows] - ranges) / model.range_sigma]
-        if reference.has_heading:
-            off.append(np.abs(se2.wrap(stream.bearing[rows] - bearings)) / model.bearing_sigma)
-        told = [kept for one in off if len(kept := one[np.isfinite(one)]) >= FEWEST // 2]
-        costs.append(sum(float(np.median(one)) for one in told) if told else np.inf)
-    best = int(np.argmin(costs))
-    if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[count]:
-        return []
-    shift = float(shifts[best])
-    return [_off("bearing_range", shift, f"bearing_range.time_offset = {-shift:+.2f}")]

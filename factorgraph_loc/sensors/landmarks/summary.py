@@ -1,0 +1,207 @@
+"""What the sightings of landmarks in a log hold, and what looks wrong with them and with the map.
+
+Where there is a reference, each landmark's position is also estimated from its own sightings, taken from the reference poses:
+by the robust median where range and bearing are measured, by robust trilateration from ranges alone. A landmark whose map position
+lies far from that is a suspect. Sightings are also compared with where the reference says that their landmarks are, at shifts of
+time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors import clock_shift
+from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.summary import Summary
+from factors import se2
+from factors.landmarks import model as bearing_range
+from factors.se2 import Array
+
+MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
+MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
+MIN_PASSES = 3
+MAD_TO_SIGMA = 1.4826  # of a Gaussian
+PASS = 10.0  # s; errors of sightings in one pass are not independent, so passes are counted, not sightings
+MOST = 2000  # sightings that are compared at shifts of time
+_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
+_ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A landmark that its sightings put elsewhere: ``offset`` (2,) [m] from the map; ``swapped_with``: whose place that seems."""
+
+    landmark: str
+    offset: Array
+    sightings: int
+    swapped_with: str | None = None
+
+    def __str__(self) -> str:
+        distance = float(np.hypot(*self.offset))
+        text = f"landmark {self.landmark}: {self.sightings} sightings put it {distance:.2f} m from its place in the map"
+        return f"{text}; swapped with {self.swapped_with}?" if self.swapped_with else text
+
+
+def summarize(log: Log) -> Summary:
+    """Landmarks that are never seen (``unseen``), the count of sightings by name that the map lacks (``unknown``), and landmarks
+    that their sightings put elsewhere (``suspects``)."""
+    unseen, unknown = _unmatched(log)
+    suspects = find_suspects(log)
+    problems = [
+        *_shifted(log),
+        *(f"landmark {name} of the map is never seen" for name in unseen),
+        *(f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()),
+        *map(str, suspects),
+    ]
+    found = {"unseen": unseen, "unknown": unknown, "suspects": suspects}
+    return Summary(found, {"landmarks": len(log.world.landmarks)}, problems)
+
+
+def find_suspects(log: Log) -> tuple[Suspect, ...]:
+    """The landmarks that their sightings from the reference poses put elsewhere than the map does; none without a reference.
+
+    The map is doubted beyond ``MIN_OFFSET`` and beyond five standard errors.
+    """
+    implied: dict[str, tuple[Array, int]] = {}
+    for name, seen in _seen_from_reference(log).items():
+        passes = len(np.unique(seen.t // PASS))
+        if len(seen.t) < MIN_SIGHTINGS or passes < MIN_PASSES:
+            continue
+        place = _place(log.world, name)
+        position, spread = _by_range_and_bearing(seen) if seen.has_bearing else _by_range(seen, place)
+        if _distance(position, place) > max(MIN_OFFSET, 5.0 * spread / np.sqrt(passes)):
+            implied[name] = (position, len(seen.t))
+    return tuple(
+        Suspect(name, position - _place(log.world, name), count, _partner(log.world, name, implied))
+        for name, (position, count) in implied.items()
+    )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Sightings of one landmark from the reference: times (N,), poses of the sensor (N, 3), calibrated range and bearing (N,)."""
+
+    t: Array
+    sensors: Array
+    ranges: Array
+    bearings: Array
+
+    @property
+    def has_bearing(self) -> bool:
+        return bool(np.isfinite(self.bearings).any())
+
+
+def _seen_from_reference(log: Log) -> dict[str, _Seen]:
+    """The sightings with a range, by landmark of the map, where the reference has poses."""
+    stream = log.streams.get("bearing_range")
+    if log.reference is None or log.rig.bearing_range is None or not isinstance(stream, BearingRangeStream):
+        return {}
+    model = log.rig.bearing_range.model()
+    t = stream.t + log.rig.time_offset("bearing_range")
+    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + _ROUNDING), np.array(model.mounting))
+    ranges = stream.range / model.range_scale
+    bearings = stream.bearing - model.bearing_bias
+    if not log.reference.has_heading:
+        bearings = np.full_like(bearings, np.nan)
+    names = np.array(stream.landmark, dtype=str)
+    usable = np.isfinite(sensors[:, :2]).all(axis=1) & np.isfinite(ranges)
+    out = {}
+    for name in log.world.landmarks:
+        rows = usable & (names == name)
+        out[name] = _Seen(t[rows], sensors[rows], ranges[rows], bearings[rows])
+    return out
+
+
+def _by_range_and_bearing(seen: _Seen) -> tuple[Array, float]:
+    """Median of the positions that each sighting implies, and their robust standard deviation [m]."""
+    rows = np.isfinite(seen.bearings)
+    direction = seen.sensors[rows, 2] + seen.bearings[rows]
+    points = seen.sensors[rows, :2] + seen.ranges[rows, None] * np.stack(
+        (np.cos(direction), np.sin(direction)), axis=-1
+    )
+    centre = np.median(points, axis=0)
+    return centre, MAD_TO_SIGMA * float(np.median(np.hypot(*(points - centre).T)))
+
+
+def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
+    """Robust trilateration from the map's place, and the spread that, over sqrt(passes), is its standard error [m]."""
+
+    def residual(point: Array) -> Array:
+        away: Array = seen.sensors[:, :2] - point
+        return np.hypot(away[:, 0], away[:, 1]) - seen.ranges
+
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual(place)))), 1e-3)
+    fit = least_squares(residual, place, loss="soft_l1", f_scale=scale)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))), 1e-3)
+    fit = least_squares(residual, fit.x, loss="cauchy", f_scale=scale)
+    information = fit.jac.T @ fit.jac / len(seen.t)
+    weakest = max(float(np.linalg.eigvalsh(information)[0]), 1e-9)
+    return fit.x, MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))) / np.sqrt(weakest)
+
+
+def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
+    """The other suspect, where each of the two is seen nearer to the other's place than to its own."""
+    for other in implied:
+        if other != name:
+            mine, theirs = _place(world, name), _place(world, other)
+            at, other_at = implied[name][0], implied[other][0]
+            if _distance(at, theirs) < _distance(at, mine) and _distance(other_at, mine) < _distance(other_at, theirs):
+                return other
+    return None
+
+
+def _place(world: World, name: str) -> Array:
+    landmark = world.landmarks[name]
+    return np.array((landmark.x, landmark.y))
+
+
+def _distance(a: Array, b: Array) -> float:
+    return float(np.hypot(*(a - b)))
+
+
+def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
+    """Landmarks of the map that are never seen, and the count of sightings of names that the map lacks."""
+    stream = log.streams.get("bearing_range")
+    if not isinstance(stream, BearingRangeStream):
+        return (), {}
+    counts = Counter(stream.landmark)
+    unseen = tuple(name for name in log.world.landmarks if name not in counts)
+    return unseen, {name: count for name, count in sorted(counts.items()) if name not in log.world.landmarks}
+
+
+def _shifted(log: Log) -> list[str]:
+    """A line, if sightings of mapped landmarks fit the reference better at another time."""
+    stream, reference = log.streams.get("bearing_range"), log.reference
+    if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.bearing_range is None:
+        return []
+    if len(reference.t) < 2 or float(np.median(np.diff(reference.t))) > SLOWEST:
+        return []
+    rows = np.array([i for i, name in enumerate(stream.landmark) if name in log.world.landmarks], dtype=np.int64)
+    if len(rows) < FEWEST:
+        return []
+    rows = rows[:: max(1, len(rows) // MOST)]
+    marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
+    places = np.array([(mark.x, mark.y) for mark in marks])
+    model, t = log.rig.bearing_range.model(), stream.t[rows] + log.rig.time_offset("bearing_range")
+    shifts = STEP * SHIFTS
+    costs = []
+    for shift in shifts.tolist():
+        ranges, bearings = bearing_range.predict(model, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
+        off = [np.abs(stream.range[rows] - ranges) / model.range_sigma]
+        if reference.has_heading:
+            off.append(np.abs(se2.wrap(stream.bearing[rows] - bearings)) / model.bearing_sigma)
+        told = [kept for one in off if len(kept := one[np.isfinite(one)]) >= FEWEST // 2]
+        costs.append(sum(float(np.median(one)) for one in told) if told else np.inf)
+    best = int(np.argmin(costs))
+    if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[len(SHIFTS) // 2]:
+        return []
+    shift = float(shifts[best])
+    return [clock_shift.line("bearing_range", shift, "the reference", "bearing_range", -shift)]
