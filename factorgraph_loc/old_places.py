@@ -62,6 +62,16 @@ _MODULES: dict[str, tuple[str, ...]] = {
     ),
 }
 _PACKAGES = ("factorgraph_loc.estimators", "factorgraph_loc.readers")
+_SCRIPTS = {  # what the project's own benchmarks need alone
+    "factorgraph_loc.evaluation.ensembles": "benchmarking/statistics.py",
+    "factorgraph_loc.evaluation.grid_filter": "rfid_benchmark/grid_filter.py",
+    "factorgraph_loc.evaluation.paper_figures": "paper_figures.py",
+    "factorgraph_loc.experiments.ensemble": "benchmarking/ensemble.py",
+    "factorgraph_loc.experiments.optimal": "rfid_benchmark/optimal.py",
+    "factorgraph_loc.experiments.simulated_trials": "rfid_benchmark/simulated_trials.py",
+    "factorgraph_loc.experiments.trials": "benchmarking/trials.py",
+    "factorgraph_loc.vision.weight_learning": "weight_learning.py",
+}
 
 
 class OldPlaces(MetaPathFinder, Loader):
@@ -71,6 +81,10 @@ class OldPlaces(MetaPathFinder, Loader):
         """The module, if it is one of them."""
         if name in _MODULES or name in _PACKAGES:
             return ModuleSpec(name, self, is_package=name in _PACKAGES)
+        if name in _SCRIPTS:
+            raise ImportError(
+                f"{name} is not installed any more: it is scripts/{_SCRIPTS[name]} of the sources", name=name
+            )
         return None
 
     def exec_module(self, module: ModuleType) -> None:

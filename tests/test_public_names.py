@@ -114,6 +114,13 @@ def test_places_of_0_1_0_still_work_with_a_warning():
         exec("from factorgraph_loc.rig import Nothing", {})
     with pytest.raises(ImportError):
         exec("import factorgraph_loc.readers.nothing", {})
+    with pytest.raises(ImportError, match=r"is not installed any more: it is scripts/benchmarking/trials.py of the"):
+        exec("from factorgraph_loc.experiments.trials import run_trials", {})
+
+
+@pytest.mark.parametrize("script", old_places._SCRIPTS.values())
+def test_what_is_not_installed_is_there_for_the_benchmarks(script):
+    assert (ROOT / "scripts" / script).is_file()
 
 
 @pytest.mark.parametrize("places", old_places._MODULES.values(), ids=old_places._MODULES)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.ensembles import wilson
 from factorgraph_loc.evaluation.paired import Interval, mcnemar, median_difference, median_ratio, quantile
+from factorgraph_loc.fitting.shares import wilson
 from factors.se2 import Array
 
 Row = Mapping[str, Any]

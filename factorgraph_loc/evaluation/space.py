@@ -1,4 +1,4 @@
-"""How far poses in space are from the reference, whether their covariances say so, and where known points are seen from them."""
+"""How far poses in space are from the reference, and whether their covariances say so."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import pairs_in_space
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.camera.stream import SightingStream
 from factors import positive
-from factors.camera.model import linearize_in_space, mounted
 from factors.se2 import Array
 
 DOF = 6
@@ -66,36 +63,3 @@ def pose_errors(found: Trajectory3, truth: Trajectory3) -> Array:
     back = found.rotations.transpose(0, 2, 1)
     turns = Rotation.from_matrix(back @ truth.rotations).as_rotvec()
     return np.column_stack((turns, np.einsum("nij,nj->ni", back, truth.positions - found.positions)))
-
-
-def reprojection_residuals(found: Trajectory3, log: Log, sensor: str = "sightings") -> Array:
-    """Where the points of the map that a camera names are seen, less where they should be from the trajectory (K, 2) [px].
-
-    ``sensor``: ``sightings`` or ``sightings_right``. Points that the map lacks, and sightings before or after the trajectory, are
-    left out.
-    """
-    stream = log.streams[sensor]
-    settings = log.rig.camera if sensor == "sightings" else log.rig.camera_right
-    assert isinstance(stream, SightingStream)
-    assert settings is not None
-    assert log.world.points is not None
-    model, points, t = settings.model(), log.world.points, stream.t + settings.time_offset
-    known = np.array([name in points.index for name in stream.point], dtype=bool)
-    rows = np.flatnonzero(known & (t >= found.t[0]) & (t <= found.t[-1]))
-    times, which = np.unique(t[rows], return_inverse=True)
-    poses = found.at(times)
-    out = np.empty((len(rows), 2))
-    for k in range(len(times)):
-        here = np.flatnonzero(which == k)
-        seen = points.positions[[points.index[stream.point[i]] for i in rows[here].tolist()]]
-        out[here] = -linearize_in_space(model, *mounted(model, poses.positions[k], poses.rotations[k]), seen)[0]
-    return out + np.column_stack((stream.u[rows], stream.v[rows]))
-
-
-def spread_of(residuals: Array) -> dict[str, float]:
-    """Median absolute value and root mean square [px] of residuals (K, 2), by coordinate."""
-    figures = {}
-    for i, axis in enumerate("uv"):
-        figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
-        figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
-    return figures

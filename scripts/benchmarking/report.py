@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarking.ensemble import Series
+from benchmarking.statistics import Ratio, rmse_ratio
 from factorgraph_loc.errors import FglocError
-from factorgraph_loc.evaluation.ensembles import Ratio, rmse_ratio, wilson
 from factorgraph_loc.evaluation.statistics import pooled_rms
-from factorgraph_loc.experiments.ensemble import Series
+from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.processes import run_each
 
 
@@ -78,13 +79,13 @@ def rmses(runs: Sequence[Series]) -> np.ndarray:
 
 def pooled(runs: Sequence[Series]) -> tuple[float, float]:
     """Position [m] and heading [degrees] RMSE, pooled over runs."""
-    return pooled_rms(rmses(runs)), float(np.degrees(pooled_rms([one.heading_rmse() for one in runs])))
+    return pooled_rms(rmses(runs).tolist()), float(np.degrees(pooled_rms([one.heading_rmse() for one in runs])))
 
 
 def together(runs: Sequence[Series]) -> np.ndarray:
     """The position errors of all times of all runs."""
     errors = np.concatenate([one.position for one in runs])
-    return errors[np.isfinite(errors)]
+    return np.asarray(errors[np.isfinite(errors)])
 
 
 def spread_cell(runs: Sequence[Series]) -> str:

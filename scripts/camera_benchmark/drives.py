@@ -118,7 +118,9 @@ def map_of(drive: Drive, folder: Path) -> PointMap:
     path = folder / f"{_key(other)}-{code_of('calibration')}.points.parquet"
     if not path.exists():
         log, _ = log_of(other, folder)
-        made = map_points(other.settings().rig.camera.model(), posed_frames(with_errors(log, other.seed), 0.0, 0.0))
+        camera = other.settings().rig.camera
+        assert camera is not None
+        made = map_points(camera.model(), posed_frames(with_errors(log, other.seed), 0.0, 0.0))
         write_points(made.points, path)
     return read_points(path)
 

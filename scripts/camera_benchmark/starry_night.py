@@ -13,8 +13,8 @@ from benchmarking.report import Report
 from matplotlib import pyplot as plt
 
 from camera_benchmark.options import CameraOptions
+from camera_benchmark.reprojection import reprojection_residuals, spread_of
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.space import reprojection_residuals, spread_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log

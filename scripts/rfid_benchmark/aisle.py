@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from benchmarking.ensemble import RunErrors, run_errors, series
 from benchmarking.report import Options, Report, pooled, spread_cell
+from benchmarking.statistics import first_held
+from benchmarking.trials import HOLD, POSITION
 
-from factorgraph_loc.evaluation.ensembles import first_held
-from factorgraph_loc.experiments.ensemble import RunErrors, run_errors, series
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.experiments.trials import HOLD, POSITION
 from factorgraph_loc.io.native.rig_file import read_rig, write_rig
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, cut

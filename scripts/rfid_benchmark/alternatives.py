@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarking.ensemble import Series, series
 from benchmarking.report import Options, Report, pooled
 
-from factorgraph_loc.experiments.ensemble import Series, series
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.problem import Problem
@@ -85,7 +85,7 @@ class GaussianFactor:
         by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
         by_pose[:, 0, 2], by_pose[:, 1, 2] = seen[:, 1], -seen[:, 0]
         c, s = np.cos(self._places[:, 2]), np.sin(self._places[:, 2])
-        turn = np.moveaxis(np.array(((c, s), (-s, c))), 2, 0)
+        turn: Array = np.moveaxis(np.array(((c, s), (-s, c))), 2, 0)
         residual = self._roots @ (turn @ (seen - self._places[:, :2])[..., None] - self._means[..., None])
         return residual.ravel(), [(self._roots @ turn @ by_pose).reshape(-1, 3)]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from benchmarking.ensemble import EnsembleJob, RunErrors, Series, run_ensemble
 from benchmarking.report import Options, Report, pooled, ratio_cells
 
-from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, Series, run_ensemble
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation.settings import preset

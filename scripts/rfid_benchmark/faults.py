@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from benchmarking.ensemble import EnsembleJob, RunErrors, run_ensemble
 from benchmarking.report import Options, Report, pooled
 
-from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation.settings import preset

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from benchmarking.ensemble import EnsembleJob, RunErrors, run_ensemble, stacked
 from benchmarking.report import Options, Report, pooled, ratio_cells, together
+from benchmarking.statistics import share_in_band
 
-from factorgraph_loc.evaluation.ensembles import share_in_band
-from factorgraph_loc.experiments.ensemble import EnsembleJob, RunErrors, run_ensemble, stacked
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation.settings import preset
 

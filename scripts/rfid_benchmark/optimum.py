@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarking.ensemble import EnsembleJob, Series, job_log, run_ensemble, run_errors, series
 from benchmarking.report import Options, Report, pooled, ratio_cells
 
-from factorgraph_loc.experiments.ensemble import EnsembleJob, Series, job_log, run_ensemble, run_errors, series
-from factorgraph_loc.experiments.optimal import optimal_filter, without_constants
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.optimal import optimal_filter, without_constants
 
 ROOMS, OFFICES = 20, 10
 ROOM = {"world": {"plan": "hall", "width": 6, "depth": 4, "tags": 8}, "drive": {"duration": 60}}

@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 from benchmarking.report import Options, Report, share_text
 
-from factorgraph_loc.experiments.simulated_trials import SimulatedTrial, SimulatedTrialJob, run_simulated_trials
 from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.simulated_trials import Kind, SimulatedTrial, SimulatedTrialJob, run_simulated_trials
 
 SEEDS = 100
 CHUNK = 10  # trials of one process
 FIRST = 1000  # seeds that the other sections do not use
-KINDS = (("unknown start", "office", 5.0), ("unknown start", "sparse", 10.0), ("kidnapping", "office", 15.0))
+KINDS: tuple[tuple[Kind, str, float], ...] = (
+    ("unknown start", "office", 5.0),
+    ("unknown start", "sparse", 10.0),
+    ("kidnapping", "office", 15.0),
+)
 
 
 def section(options: Options) -> Report:

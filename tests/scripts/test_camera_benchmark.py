@@ -5,13 +5,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from benchmarking.ensemble import RunErrors, Series
 from camera_benchmark import faulty
 from camera_benchmark.drives import SIGMAS, with_errors
 from camera_benchmark.faults import cells, said
 from camera_benchmark.faulty import Given
 from camera_benchmark.report import NOTHING, Attempt, accuracy_cells, paired, ratio_cell
+from camera_benchmark.reprojection import reprojection_residuals, spread_of
+from space_world import SIGMA, carried
 
-from factorgraph_loc.experiments.ensemble import RunErrors, Series
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -141,3 +143,10 @@ def test_cells_of_an_estimator_that_says_nothing_before_the_end():
     batch = replace(one.errors, causal=nothing)
 
     assert accuracy_cells([batch, batch]) == ("–", "–", "0.0100", "0.573", "0.0100", "– / 3.00", "– / 100 %")
+
+
+def test_residuals_of_the_true_poses_are_the_noise_of_the_pixels():
+    log = carried(2)
+    assert spread_of(reprojection_residuals(log.reference3, log, "sightings_right"))["u_rms"] == pytest.approx(
+        SIGMA, rel=0.1
+    )

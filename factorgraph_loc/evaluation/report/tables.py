@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from statistics import median
 
 from factorgraph_loc.drawing.markup import Html, join, table, tag
-from factorgraph_loc.evaluation.ensembles import wilson
 from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.report.metrics import Metric, number
 from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, score
 from factorgraph_loc.evaluation.tables import counted
 from factorgraph_loc.evaluation.warned import by_text, label_of
+from factorgraph_loc.fitting.shares import wilson
 
 TIMINGS = (
     "timing.update_ms_median",

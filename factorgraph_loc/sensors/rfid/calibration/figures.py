@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.drawing.figures import COLOURS
 from factorgraph_loc.drawing.panels import axes_of, legend, name_axes, png
+from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
 from factors.rfid.model import probability
 from factors.se2 import Array
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 BINS = 12
 VIEW = 6.0  # m around the antenna
 _STEP = 0.1  # m
-_Z = 1.96  # of the 95 % interval
 
 
 def reliability_figure(found: RfidKnowledge) -> bytes:
@@ -79,15 +79,8 @@ def reliability(found: RfidKnowledge) -> tuple[Array, Array, Array, Array, Array
     used = count > 0.0
     n: Array = count[used]
     mean, share = weighted[used] / n, hits[used] / n
-    low, high = wilson(share, n)
+    low, high = wilson(hits[used], n)
     return mean, share, low, high, n
-
-
-def wilson(share: Array, count: Array) -> tuple[Array, Array]:
-    """The 95 % interval of a probability of which ``share`` of ``count`` trials was seen (Wilson, JASA 22, 1927)."""
-    middle = (share + _Z**2 / (2.0 * count)) / (1.0 + _Z**2 / count)
-    half = _Z / (1.0 + _Z**2 / count) * np.sqrt(share * (1.0 - share) / count + _Z**2 / (4.0 * count**2))
-    return middle - half, middle + half
 
 
 def _observed(found: RfidKnowledge, mine: NDArray[np.bool_], axis: Array) -> Array:

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarking import trials
+from benchmarking.trials import kidnapping_trials, start_trials
 
-from factorgraph_loc.experiments import trials
 from factorgraph_loc.experiments.run import run
-from factorgraph_loc.experiments.trials import kidnapping_trials, start_trials
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log

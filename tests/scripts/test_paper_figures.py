@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_figures import deviations, fusion
 
 from factorgraph_loc.evaluation.figures import Track
-from factorgraph_loc.evaluation.paper_figures import deviations, fusion
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
@@ -51,3 +51,15 @@ def test_fusion_shows_errors_and_says_what_is_final(log):
 def test_fusion_without_reference_has_the_trajectories(log):
     figure = fusion(replace(log, reference=None), {"ekf": track(log, 0.1)})
     assert labels(figure) == {"walls", "tags", "ekf"}
+
+
+@pytest.mark.parametrize("draw", [fusion, deviations])
+def test_no_line_is_drawn_across_a_gap(log, draw):
+    once = log.reference
+    t = np.concatenate((once.t, once.t + 3600.0))
+    twice = Trajectory(t, np.tile(once.poses, (2, 1)), np.tile(0.01 * np.eye(3), (len(t), 1, 1)))
+    figure = draw(replace(log, reference=twice), {"ekf": Track(twice, twice, np.array([0.1]))})
+    lines = [line for axis in figure.axes for line in axis.lines if len(line.get_xdata()) > 50]
+    assert len(lines) >= 3
+    for line in lines:
+        assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [30]

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarking.ensemble import EnsembleJob, run_ensemble, series, stacked
+from rfid_benchmark import simulated_trials
+from rfid_benchmark.optimal import optimal_filter, without_constants
+from rfid_benchmark.simulated_trials import SimulatedTrialJob, run_simulated_trials
 
-from factorgraph_loc.experiments import simulated_trials
-from factorgraph_loc.experiments.ensemble import EnsembleJob, run_ensemble, series, stacked
-from factorgraph_loc.experiments.optimal import optimal_filter, without_constants
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.experiments.simulated_trials import SimulatedTrialJob, run_simulated_trials
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
 

@@ -1,7 +1,6 @@
 """What many runs of one kind say together: covariances at each time, ratios of errors, counts, times.
 
-NEES over runs: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.2. The
-interval of a share is that of Wilson (Journal of the American Statistical Association 22(158), 1927).
+NEES over runs: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.2.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.metrics import CONFIDENCE
 from factorgraph_loc.evaluation.statistics import pooled_rms
@@ -52,16 +51,6 @@ def rmse_ratio(a: Array, b: Array) -> Ratio:
     low, high = np.percentile(np.sqrt(squares), (tail, 100.0 - tail))
     value = pooled_rms(a.tolist()) / pooled_rms(b.tolist())
     return Ratio(value, float(low), float(high), float(np.max(a / b)))
-
-
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share, of which ``successes`` of ``count`` trials were seen."""
-    z = float(norm.ppf((1.0 + CONFIDENCE) / 2.0))
-    share = successes / count
-    middle = share + z * z / (2.0 * count)
-    half = z * math.sqrt(share * (1.0 - share) / count + z * z / (4.0 * count * count))
-    low, high = ((middle + sign * half) / (1.0 + z * z / count) for sign in (-1.0, 1.0))
-    return max(low, 0.0), min(high, 1.0)
 
 
 def first_held(t: Array, good: NDArray[np.bool_], hold: float) -> float:

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from rfid_benchmark.grid_filter import GridFilter
 
-from factorgraph_loc.evaluation.grid_filter import GridFilter
 from factorgraph_loc.model.belief import PosePrior
 from factors import se2
 from factors.motion import Increment, propagate

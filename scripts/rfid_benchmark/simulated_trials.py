@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from benchmarking.statistics import first_held
+from benchmarking.trials import BEFORE, HOLD, JUMP, is_right
 
-from factorgraph_loc.evaluation.ensembles import first_held
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.experiments.trials import BEFORE, HOLD, JUMP, is_right
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
@@ -19,6 +19,8 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 
 AWAY = 3.0  # m that a robot is carried at least
 APART = 60.0  # s between the parts of a log that a kidnapping joins
+
+Kind = Literal["unknown start", "kidnapping"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class SimulatedTrial:
 class SimulatedTrialJob:
     """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]."""
 
-    kind: Literal["unknown start", "kidnapping"]
+    kind: Kind
     simulation: SimulationSettings
     seeds: tuple[int, ...]
     estimator: str

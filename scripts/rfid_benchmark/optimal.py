@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.grid_filter import GridFilter
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -25,6 +24,7 @@ from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import se2
 from factors.rfid.detection import Looks, RfidLikelihood
 from factors.se2 import Array
+from rfid_benchmark.grid_filter import GridFilter
 
 SENSORS = ("odometry", "rfid")
 

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-
-from factorgraph_loc.evaluation.ensembles import first_held, rmse_ratio, share_in_band, wilson
+from benchmarking.statistics import first_held, rmse_ratio, share_in_band
 
 
 def test_right_covariances_are_in_the_band_at_95_percent_of_the_times():
@@ -34,17 +33,6 @@ def test_a_ratio_pools_squares_and_pairs_logs():
     found = rmse_ratio(np.array((3.0, 4.0)), np.array((4.0, 3.0)))
     assert (found.value, found.worst) == pytest.approx((1.0, 4.0 / 3.0))
     assert (found.low, found.high) == pytest.approx((3.0 / 4.0, 4.0 / 3.0))
-
-
-def test_wilson_agrees_with_its_published_figures():
-    """Newcombe, Statistics in Medicine 17(8), 1998, table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29."""
-    for seen, expected in (
-        ((81, 263), (0.2553, 0.3662)),
-        ((15, 148), (0.0624, 0.1605)),
-        ((0, 20), (0.0, 0.1611)),
-        ((1, 29), (0.0061, 0.1718)),
-    ):
-        assert wilson(*seen) == pytest.approx(expected, abs=6e-5)
 
 
 def test_held_is_what_stays_good_long_enough_to_tell():

@@ -1,0 +1,44 @@
+"""Where known points are seen from poses in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.camera.stream import SightingStream
+from factors.camera.model import linearize_in_space, mounted
+from factors.se2 import Array
+
+
+def reprojection_residuals(found: Trajectory3, log: Log, sensor: str = "sightings") -> Array:
+    """Where the points of the map that a camera names are seen, less where they should be from the trajectory (K, 2) [px].
+
+    ``sensor``: ``sightings`` or ``sightings_right``. Points that the map lacks, and sightings before or after the trajectory, are
+    left out.
+    """
+    stream = log.streams[sensor]
+    settings = log.rig.camera if sensor == "sightings" else log.rig.camera_right
+    assert isinstance(stream, SightingStream)
+    assert settings is not None
+    assert log.world.points is not None
+    model, points, t = settings.model(), log.world.points, stream.t + settings.time_offset
+    known = np.array([name in points.index for name in stream.point], dtype=bool)
+    rows = np.flatnonzero(known & (t >= found.t[0]) & (t <= found.t[-1]))
+    times, which = np.unique(t[rows], return_inverse=True)
+    poses = found.at(times)
+    out = np.empty((len(rows), 2))
+    for k in range(len(times)):
+        here = np.flatnonzero(which == k)
+        seen = points.positions[[points.index[stream.point[i]] for i in rows[here].tolist()]]
+        out[here] = -linearize_in_space(model, *mounted(model, poses.positions[k], poses.rotations[k]), seen)[0]
+    return out + np.column_stack((stream.u[rows], stream.v[rows]))
+
+
+def spread_of(residuals: Array) -> dict[str, float]:
+    """Median absolute value and root mean square [px] of residuals (K, 2), by coordinate."""
+    figures = {}
+    for i, axis in enumerate("uv"):
+        figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
+        figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
+    return figures
