@@ -21,10 +21,10 @@ from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
-from factorgraph_loc.experiments.images import CAMERA, fill_cache, takes_pixels
 from factorgraph_loc.experiments.output import remove_run, write_run
+from factorgraph_loc.experiments.preparation import columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.prior import check_prior
-from factorgraph_loc.experiments.run import OF_READS, RunConfig, run
+from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
 from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.fusion import registry
@@ -90,8 +90,10 @@ def compare(
     _prepare(out, overwrite, _asked(logs, configs))
     work = [_Job(log, config, _folder(out, log.name, config)) for log in logs for config in configs]
     for log in logs:
-        if any(CAMERA in (config.sensors or log.rig.sensors) and takes_pixels(config.estimator) for config in configs):
-            fill_cache(log)
+        fill_cache(
+            use_of(log, c.sensors or log.rig.sensors, c.estimator, registry.settings_of(c.estimator, c.settings))
+            for c in configs
+        )
     outcomes: dict[int, _Outcome | Exception] = {}
     try:
         for i, outcome in run_each(_execute, work, jobs or os.cpu_count() or 1):
@@ -144,7 +146,7 @@ def _is_deterministic(estimator: str) -> bool:
 def _check(logs: Sequence[Log], configs: Sequence[RunConfig]) -> None:
     if not logs or not configs:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
-    streams = [*dict.fromkeys(name for log in logs for name in log.streams), *OF_READS]
+    streams = list(dict.fromkeys(name for log in logs for name in (*log.streams, *columns_of(log.streams))))
     for config in configs:
         registry.settings_of(config.estimator, config.settings)
         check_prior(config.prior)

@@ -85,10 +85,10 @@ class Facts:
 
 
 def _facts(log: Any) -> LogFacts:
-    from factorgraph_loc.experiments.run import OF_READS  # noqa: PLC0415
+    from factorgraph_loc.experiments.preparation import columns_of  # noqa: PLC0415
 
     first, last = log.span()
-    return LogFacts(log.name, last - first, (*log.streams, *(OF_READS if "rfid" in log.streams else ())))
+    return LogFacts(log.name, last - first, (*log.streams, *columns_of(log.streams)))
 
 
 def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:

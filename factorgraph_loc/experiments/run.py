@@ -16,19 +16,9 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.doubts import (
-    check_free_map,
-    dead_tags,
-    findable,
-    never_localized,
-    partly_scored,
-    with_pauses,
-    without_points,
-    without_tags,
-)
-from factorgraph_loc.experiments.images import OF_CAMERA, Prepared, prepare
+from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
+from factorgraph_loc.experiments.preparation import moves, prepare, unused, use_of, used_sensors
 from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
-from factorgraph_loc.files.models import nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
@@ -36,17 +26,16 @@ from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Measurement, Odometry, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.usage import Prepared
+from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
 from factors.se2 import Array
-
-OF_READS = ("rssi", "phase")  # sensors without a stream of their own: their data come with those of rfid
 
 
 @dataclass(frozen=True)
@@ -93,15 +82,17 @@ def run(
     check_tick_gap(config.tick_gap)
     require_bounds(log)  # of one that a program made, too
     require_one_span(log)
-    sensors = _sensors(log, config.sensors)
+    sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
-    check_free_map(log, sensors, config.estimator, settings)
+    use = use_of(log, sensors, config.estimator, settings)
+    for _, check in functions("check"):
+        check(use)
     prior, prior_source = resolve_prior(log, config.prior)
     setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
         estimator = registry.create(config.estimator, setup, settings)
-    if "odometry" not in log.streams and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
+    if not moves(log.streams, "floor") and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
             f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
             f"expected one of {', '.join(registry.in_space())}"
@@ -122,7 +113,7 @@ def run(
         )
 
     report = progress or (lambda _: None)
-    prepared = prepare(log, sensors, config.estimator, lambda share: report(0.5 * share))
+    prepared = prepare(use, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
     ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
     loop = _Loop(
@@ -175,11 +166,9 @@ def run(
         warnings=_once(
             *log.warnings,
             *unstated,
-            *_doubts(log, sensors),
+            *unused(log, sensors),
             *prepared.warnings,
-            *without_points(log, sensors, config.estimator, estimator, settings),
-            *without_tags(log, config.estimator, estimator.diagnostics),
-            *(dead_tags(log, estimator.diagnostics) if "rfid" in sensors else ()),
+            *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics)),
             *never_localized(log, sensors, loop.estimates, final),
             *partly_scored(log, final, config.max_gap),
             *with_pauses(log, ticks.skipped, config.tick_gap),
@@ -223,13 +212,13 @@ class _Loop:
         """Feed everything, ticks included."""
         started = perf_counter()
         initialized = self._prior is None
-        for (t, is_odometry), group in groupby(self._measurements(), lambda m: (m.t, isinstance(m, Odometry))):
+        for (t, is_motion), group in groupby(self._measurements(), lambda m: (m.t, m.is_motion)):
             if not initialized and t > self._start:
                 self._initialize()
                 initialized = True
             for tick in self._ticks.before(t):
                 self._tick(tick)
-            if is_odometry:
+            if is_motion:
                 for m in group:
                     self._guard.process(self._estimator, m)
             elif t < self._start:
@@ -317,48 +306,6 @@ def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
     if not stamps:
         raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
     return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
-
-
-def _sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The sensors to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
-    there = (*log.streams, *(s for s in OF_READS if _is_read(log, s)))
-    if asked is not None:
-        for sensor in asked:
-            if sensor in OF_READS and "rfid" not in asked:
-                raise InputError(f"{log.name}: {sensor} comes with reads of tags, expected rfid among the sensors too")
-            if sensor in OF_READS and sensor not in there:
-                raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: none of its reads has a value of it")
-            if sensor not in there:
-                raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(there))}")
-            if sensor in OF_CAMERA and log.rig.camera is None:
-                raise InputError(f"{log.name}: {sensor} needs [camera] in the rig, and {log.rig.name} has none")
-    sensors = tuple(s for s in (log.rig.sensors if asked is None else asked) if s in there and s not in _blind(log))
-    if not sensors:
-        raise InputError(
-            f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(there))}"
-        )
-    return sensors
-
-
-def _blind(log: Log) -> tuple[str, ...]:
-    """Sensors of the log that tell nothing, as the rig has no camera."""
-    return () if log.rig.camera is not None else tuple(s for s in OF_CAMERA if s in log.streams)
-
-
-def _is_read(log: Log, sensor: str) -> bool:
-    """Whether any read has a value of ``sensor``, one of ``OF_READS``."""
-    stream = log.streams.get("rfid")
-    return isinstance(stream, RfidStream) and bool(np.any(np.isfinite(getattr(stream, sensor))))
-
-
-def _doubts(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
-    missing = [s for s in log.rig.sensors if s not in log.streams and not (s in OF_READS and _is_read(log, s))]
-    doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in missing]
-    if blind := [s for s in _blind(log) if s in log.rig.sensors]:
-        doubts.append(f"{log.name}: {', '.join(blind)} left out, as the rig {log.rig.name} has no [camera]")
-    if "odometry" not in sensors and "twist" not in sensors:
-        doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
-    return tuple(doubts)
 
 
 def _once(*warnings: str) -> tuple[str, ...]:

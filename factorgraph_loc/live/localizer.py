@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_loc.errors import InputError, RunFailedError, bad_field
-from factorgraph_loc.experiments.images import CAMERA, frontend_for, takes_pixels
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import Estimator, ForgettingEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_trajectory
@@ -28,6 +27,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.ticks import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.prepare import frontend_of
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.text import plain
 from factorgraph_loc.vision.frame import CameraFrame
@@ -137,7 +137,8 @@ class Localizer:
         t = seconds_of("image", t)
         if self._rig.camera is None:
             raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
-        if CAMERA not in self._sensors or not takes_pixels(self._name):
+        modalities = getattr(registry.estimator_type(self._name), "modalities", ())
+        if "camera" not in self._sensors or "camera" not in modalities:
             with self._lock:
                 self._begun(f"image at {t:.3f} s").diagnostics.ignore("images")
             return
@@ -146,7 +147,7 @@ class Localizer:
                 # imported here, as without images no OpenCV is needed
                 from factorgraph_loc.sensors.camera.live import LiveFrontend  # noqa: PLC0415
 
-                self._frontend = LiveFrontend(frontend_for(self._rig, self._world), self._rig.camera.model())
+                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), self._rig.camera.model())
             frame = self._frontend.frame(t, image)
         self.push(frame)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.experiments.images import CAMERA
+from factorgraph_loc.experiments.preparation import lacking_section
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import FARTHEST, nearest
@@ -43,7 +43,7 @@ def require_options(rig: object, world: object, settings: object, history: objec
 
 
 def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The sensors that may be used: without those that need a camera if there is none. InputError if one is unknown."""
+    """The sensors that may be used: without those that need a section that the rig lacks. InputError if one is unknown."""
     if asked is None:
         asked = rig.sensors
     if isinstance(asked, str) or not isinstance(asked, Sequence):
@@ -51,7 +51,7 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
     for name in asked:
         if not isinstance(name, str) or name not in ALL_SENSORS:
             raise InputError(f"no sensor is called {quoted(name)}{nearest(str(name), list(ALL_SENSORS))}")
-    return tuple(name for name in asked if rig.camera is not None or not name.startswith((CAMERA, "sightings")))
+    return tuple(name for name in asked if not lacking_section(rig, name))
 
 
 def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
@@ -25,14 +25,20 @@ class Channel:
     """A name in ``--sensors``, and of a log's streams.
 
     ``streams``, ``measurements``: the classes that a stream of this name may have, and what it yields. Both are empty of a channel
-    that only says how the rows of another one are used, as ``rssi`` and ``phase`` do of those of ``rfid``. ``section``: the one of
-    the rig that has the ``time_offset`` of its stamps.
+    that only says how the rows of another one are used, as ``rssi`` and ``phase`` do of those of ``rfid``: they are columns of it
+    (``column_of``). ``rows``: what its rows are called. ``section``: the one of the rig that has the ``time_offset`` of its stamps,
+    without which it tells nothing if it ``needs_section``. ``motion``: whether it tells how the robot moves on a floor or in space,
+    or how it turns.
     """
 
     name: str
     streams: tuple[Place, ...] = ()
     measurements: tuple[Place, ...] = ()
     section: str = ""
+    needs_section: bool = False
+    column_of: str = ""
+    rows: str = "rows"
+    motion: Literal["", "floor", "space", "turn"] = ""
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,11 @@ class SensorType:
     the places of its functions, "" where it has none; :func:`functions` gives those of all sensors.
 
     ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log.
+
+    Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
+    together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
+    diagnostics)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in the map
+    and the words for that nothing of it was found, or None.
     """
 
     name: str
@@ -48,6 +59,10 @@ class SensorType:
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
     summarize: Place = ""
+    check: Place = ""
+    prepare: Place = ""
+    doubts: Place = ""
+    findable: Place = ""
 
 
 @cache

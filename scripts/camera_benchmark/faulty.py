@@ -11,9 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factorgraph_loc.experiments.images import frontend_of
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.prepare import frontend_of
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.simulation.filming import JPEG
 
@@ -184,7 +184,7 @@ def images_of(log: Log) -> ImageStream:
 
 
 def features_of(log: Log) -> FeatureStream:
-    stream = with_features(log, frontend_of(log))[0].streams["camera"]
+    stream = with_features(log, frontend_of(log.rig, log.world))[0].streams["camera"]
     assert isinstance(stream, FeatureStream)
     return stream
 

@@ -9,11 +9,11 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments import compare as comparing
-from factorgraph_loc.experiments import images
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.sensors.camera import frontend
+from factorgraph_loc.sensors.camera.prepare import frontend_of
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
 from factorgraph_loc.vision.settings import FrontendSettings
@@ -115,15 +115,15 @@ def test_a_rig_without_camera_leaves_images_out_unless_they_are_asked_for(seeing
 
 
 def test_the_feature_is_that_of_the_map(seeing):
-    assert images.frontend_of(seeing) == FrontendSettings(feature="orb", count=30)
+    assert frontend_of(seeing.rig, seeing.world) == FrontendSettings(feature="orb", count=30)
     nothing = np.zeros((1, 3))
     points = PointMap(
         ("a",), nothing, np.zeros((1, 3, 3)), "sift", np.array([0]), np.zeros((1, 128)), nothing, np.ones(1)
     )
     world = seeing.world.model_copy(update={"points": points})
-    assert images.frontend_of(replace(seeing, world=world)) == FrontendSettings(feature="sift", count=30)
+    assert frontend_of(seeing.rig, world) == FrontendSettings(feature="sift", count=30)
     named = seeing.world.model_copy(update={"points": PointMap.of(["a"], nothing)})
-    assert images.frontend_of(replace(seeing, world=named)) == FrontendSettings(feature="orb", count=30)
+    assert frontend_of(seeing.rig, named) == FrontendSettings(feature="orb", count=30)
 
 
 def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):

@@ -7,9 +7,11 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.compare import compare
-from factorgraph_loc.experiments.doubts import dead_tags
+from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.sensors.rfid.describe import doubts
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
@@ -40,7 +42,7 @@ def test_rssi_and_phase_are_sensors_of_the_reads(reading, fake):
     run(reading, RunConfig("fake", sensors=ALL[:3]))
     assert fake.made.setup.sensors == ALL[:3]
     assert sum(kind == "RfidScan" for kind, _ in fake.made.calls) == 2
-    with pytest.raises(InputError, match="has no sensor 'phase': none of its reads has a value of it"):
+    with pytest.raises(InputError, match="has no sensor 'phase': none of its reads of tags has a value of it"):
         run(reading, RunConfig("fake", sensors=ALL))
     stream = replace(reading.streams["rfid"], phase=np.array((np.nan, 0.5)))
     run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL))
@@ -70,11 +72,12 @@ def test_an_estimator_is_given_all_tags_whatever_the_log_reads_later(reading, fa
 
 def test_tags_that_are_believed_dead_are_named(reading):
     found = Diagnostics(dead_tags={"b": 0.7, "c": 0.999})
-    assert dead_tags(reading, found) == (
+    use = use_of(reading, ALL, "smoother", settings_of("smoother", {}))
+    assert list(doubts(use, found)) == [
         "straight: 2 of 3 tags of the map are believed dead, as they were not read from where they should have been: "
         "c (> 99 %), b (70 %)",
-    )
-    assert dead_tags(reading, Diagnostics()) == ()
+    ]
+    assert list(doubts(use, Diagnostics())) == []
 
 
 @pytest.mark.usefixtures("fake")

@@ -14,18 +14,21 @@ SENSOR = SensorType(
             ),
             measurements=("factorgraph_loc.vision.frame:CameraFrame",),
             section="camera",
+            needs_section=True,
         ),
         Channel(
             "sightings",
             streams=("factorgraph_loc.sensors.camera.stream:SightingStream",),
             measurements=("factorgraph_loc.sensors.camera.measurement:PixelSightings",),
             section="camera",
+            needs_section=True,
         ),
         Channel(
             "sightings_right",
             streams=("factorgraph_loc.sensors.camera.stream:RightSightingStream",),
             measurements=("factorgraph_loc.sensors.camera.measurement:PixelSightings",),
             section="camera_right",
+            needs_section=True,
         ),
     ),
     settings={
@@ -33,4 +36,7 @@ SENSOR = SensorType(
         "camera_right": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
     },
     summarize="factorgraph_loc.sensors.camera.summary:summarize",
+    prepare="factorgraph_loc.sensors.camera.prepare:prepare",
+    doubts="factorgraph_loc.sensors.camera.describe:doubts",
+    findable="factorgraph_loc.sensors.camera.describe:findable",
 )

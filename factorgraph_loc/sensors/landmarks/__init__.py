@@ -16,4 +16,6 @@ SENSOR = SensorType(
     settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
     layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.map:Landmark")},
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
+    check="factorgraph_loc.sensors.landmarks.describe:check",
+    findable="factorgraph_loc.sensors.landmarks.describe:findable",
 )

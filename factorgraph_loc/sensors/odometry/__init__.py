@@ -17,12 +17,14 @@ SENSOR = SensorType(
                 "factorgraph_loc.sensors.odometry.measurement:IncrementOdometry",
             ),
             section="odometry",
+            motion="floor",
         ),
         Channel(
             "imu",
             streams=("factorgraph_loc.sensors.odometry.stream:YawRateStream",),
             measurements=("factorgraph_loc.sensors.odometry.measurement:YawRate",),
             section="imu",
+            motion="turn",
         ),
     ),
     settings={

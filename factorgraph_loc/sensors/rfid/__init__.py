@@ -11,9 +11,10 @@ SENSOR = SensorType(
             streams=("factorgraph_loc.sensors.rfid.stream:RfidStream",),
             measurements=("factorgraph_loc.sensors.rfid.measurement:RfidScan",),
             section="rfid",
+            rows="reads of tags",
         ),
-        Channel("rssi"),
-        Channel("phase"),
+        Channel("rssi", column_of="rfid"),
+        Channel("phase", column_of="rfid"),
     ),
     settings={
         "rfid": Section("factorgraph_loc.sensors.rfid.settings:RfidSettings"),
@@ -21,4 +22,6 @@ SENSOR = SensorType(
     },
     layers={"tags": Layer("factorgraph_loc.sensors.rfid.map:Tag")},
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
+    doubts="factorgraph_loc.sensors.rfid.describe:doubts",
+    findable="factorgraph_loc.sensors.rfid.describe:findable",
 )

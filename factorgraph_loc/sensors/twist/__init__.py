@@ -11,6 +11,7 @@ SENSOR = SensorType(
             streams=("factorgraph_loc.sensors.twist.stream:TwistStream",),
             measurements=("factorgraph_loc.sensors.twist.measurement:Twist",),
             section="twist",
+            motion="space",
         ),
     ),
     settings={"twist": Section("factorgraph_loc.sensors.twist.settings:TwistSettings")},

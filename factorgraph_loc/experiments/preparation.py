@@ -1,0 +1,106 @@
+"""Which sensors a run uses, and what their packages make ready before an estimator runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.files.models import FileModel, nearest
+from factorgraph_loc.fusion import registry
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.registry import channels, functions
+from factorgraph_loc.sensors.usage import Prepared, Use
+from factorgraph_loc.text import listed, quoted
+
+
+def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
+    """The channels that are columns of ``streams``."""
+    there = set(streams)
+    return tuple(channel.name for channel in channels().values() if channel.column_of in there)
+
+
+def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The sensors to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
+    there = (*log.streams, *_told_columns(log))
+    for sensor in asked or ():
+        channel = channels().get(sensor)
+        rows = channels()[channel.column_of] if channel is not None and channel.column_of else None
+        if rows is not None and rows.name not in (asked or ()):
+            raise InputError(f"{log.name}: {sensor} comes with {rows.rows}, expected {rows.name} among the sensors too")
+        if rows is not None and sensor not in there:
+            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: none of its {rows.rows} has a value of it")
+        if sensor not in there:
+            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(there))}")
+        if section := lacking_section(log.rig, sensor):
+            raise InputError(f"{log.name}: {sensor} needs [{section}] in the rig, and {log.rig.name} has none")
+    sensors = tuple(
+        s for s in (log.rig.sensors if asked is None else asked) if s in there and not lacking_section(log.rig, s)
+    )
+    if not sensors:
+        raise InputError(
+            f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(there))}"
+        )
+    return sensors
+
+
+def moves(sensors: Iterable[str], *motions: str) -> bool:
+    """Whether one of ``sensors`` tells how the robot moves: on the ``floor``, or in ``space``."""
+    return any(channels()[name].motion in motions for name in sensors if name in channels())
+
+
+def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
+    """What the rig lists and cannot be used, and that nothing tells how the robot moves."""
+    there = (*log.streams, *_told_columns(log))
+    doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in log.rig.sensors if s not in there]
+    lacking = {s: section for s in log.streams if s in log.rig.sensors and (section := lacking_section(log.rig, s))}
+    for section in dict.fromkeys(lacking.values()):
+        names = ", ".join(name for name, of in lacking.items() if of == section)
+        doubts.append(f"{log.name}: {names} left out, as the rig {log.rig.name} has no [{section}]")
+    if not moves(sensors, "floor", "space"):
+        doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
+    return tuple(doubts)
+
+
+def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel) -> Use:
+    """What the sensors' packages are told of a run."""
+    kind = registry.estimator_type(estimator)
+    modalities = frozenset(getattr(kind, "modalities", ()))
+    return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
+
+
+def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> Prepared:
+    """The log of a run, and what is in doubt of it, after all that its sensors make ready."""
+    made = Prepared(use.log)
+    for _, function in functions("prepare"):
+        one: Prepared = function(replace(use, log=made.log), progress)
+        images, seconds = made.images + one.images, made.seconds + one.seconds
+        made = Prepared(one.log, (*made.warnings, *one.warnings), images, seconds)
+    return made
+
+
+def fill_cache(uses: Iterable[Use]) -> None:
+    """Find the features of a log's images, so that runs of it in several processes find them in the cache.
+
+    What is wrong with the log is for the runs to tell.
+    """
+    with suppress(FglocError):
+        any(prepare(use).images for use in uses)
+
+
+def lacking_section(rig: Rig, sensor: str) -> str:
+    """The section without which a sensor tells nothing, if the rig lacks it."""
+    channel = channels().get(sensor)
+    if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
+        return ""
+    return channel.section
+
+
+def _told_columns(log: Log) -> tuple[str, ...]:
+    """The columns that any row of the log has a value in."""
+    names = columns_of(log.streams)
+    return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[channels()[n].column_of], n, np.nan))))

@@ -1,0 +1,36 @@
+"""What a run can do with a camera, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.usage import Use
+
+NAMES = ("camera", "sightings")
+
+
+def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
+    """What ``sensors`` could find in the map, and the words for that nothing of it was."""
+    if log.world.points is not None and any(name in sensors for name in NAMES):
+        return "points", "no point of the map was found in an image"
+    return None
+
+
+def doubts(use: Use, _: Diagnostics) -> Iterator[str]:
+    """A map without points that the camera could find, where the estimator needs them."""
+    used = [name for name in NAMES if name in use.sensors]
+    points = use.log.world.points
+    if not used or "camera" not in use.modalities:
+        return
+    if points is not None and len(points.owners if used == ["camera"] else points):
+        return
+    if getattr(use.settings, "visual_odometry", False):
+        return
+    others = ""
+    if use.estimates_points:
+        if getattr(use.settings, "landmarks", "known") != "known":
+            return
+        others = f", or {use.estimator}.landmarks=unknown"
+    yield f"{use.log.name}: the map has no points that a camera could find: give --world{others}"

@@ -1,0 +1,51 @@
+"""What is done with a log's images before an estimator runs: their features are found, or they are set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.sensors.usage import Prepared, Use
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.settings import FrontendSettings
+
+
+def frontend_of(rig: Rig, world: World) -> FrontendSettings:
+    """What is looked for in images: what the map's points look like in them, else what the rig's camera says."""
+    settings = rig.camera.frontend if rig.camera is not None else FrontendSettings()
+    points = world.points
+    if points is None or not points.feature or points.feature == settings.feature:
+        return settings
+    return FrontendSettings.model_validate(settings.model_dump() | {"feature": points.feature})
+
+
+def prepare(use: Use, progress: Callable[[float], None]) -> Prepared:
+    """The log with features in place of images, if the run has them; an estimator that takes none is given empty frames."""
+    log, stream = use.log, use.log.streams.get("camera")
+    if "camera" not in use.sensors or not isinstance(stream, ImageStream):
+        return Prepared(log)
+    if "camera" not in use.modalities:
+        return _set_aside(log, stream, use.estimator)
+    from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
+
+    started = perf_counter()
+    found, warnings = with_features(log, frontend_of(log.rig, log.world), progress)
+    return Prepared(found, warnings, len(stream.t), perf_counter() - started)
+
+
+def _set_aside(log: Log, stream: ImageStream, estimator: str) -> Prepared:
+    """Frames without features: their stamps still count for when the run begins and ends."""
+    nothing = CameraFrame(
+        0.0, "", np.empty((0, 2)), np.empty(0), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64)
+    )
+    frames = FeatureStream(stream.t, [nothing] * len(stream.t))
+    told = (f"{log.name}: {estimator} takes no images: all {len(stream.t)} are ignored",)
+    by_name = estimator == "dead_reckoning"  # which says so by its name
+    return Prepared(replace(log, streams={**log.streams, "camera": frames}), () if by_name else told)

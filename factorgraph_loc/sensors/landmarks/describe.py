@@ -1,0 +1,40 @@
+"""What a run can do with landmarks, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.usage import Use
+
+
+def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
+    """What ``sensors`` could find in the map, and the words for that nothing of it was."""
+    if log.world.landmarks and "bearing_range" in sensors:
+        return "landmarks", "no landmark of the map was seen"
+    return None
+
+
+def check(use: Use) -> None:
+    """InputError where landmarks are to be estimated (by the setting ``landmarks`` of the estimator) and no sighting tells where
+    one is, nor is of one that the map keeps: all would be ignored."""
+    log, wanted = use.log, getattr(use.settings, "landmarks", "known")
+    stream = log.streams.get("bearing_range")
+    if wanted == "known" or "bearing_range" not in use.sensors:
+        return
+    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+        return
+    if np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        return
+    if wanted == "extended" and any(landmark in log.world.landmarks for landmark in stream.landmark):
+        return
+    lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
+    name = use.estimator
+    raise InputError(
+        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be placed; give a map of "
+        f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
+    )

@@ -1,0 +1,32 @@
+"""How a run uses a sensor: what the sensors' packages are told of it, and what they make ready for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.log import Log
+
+
+@dataclass(frozen=True)
+class Use:
+    """A run of a log. ``sensors``: names of those that it may use; ``estimator``: its name, and its ``settings``; ``modalities``:
+    of measurements that it uses; ``estimates_points``: whether it may estimate points that the map lacks."""
+
+    log: Log
+    sensors: tuple[str, ...]
+    estimator: str
+    settings: FileModel
+    modalities: frozenset[str]
+    estimates_points: bool
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A ``log`` that can be run: no images are left in it that are used. ``images``: of how many the features were found or
+    taken from the cache, in ``seconds``."""
+
+    log: Log
+    warnings: tuple[str, ...] = ()
+    images: int = 0
+    seconds: float = 0.0
