@@ -26,12 +26,12 @@ def load(place: Place) -> Any:
 class Group(Mapping[str, Any]):
     """Things of one kind by name, ours first; each is loaded when it is asked for.
 
-    ``kind``: what they are called; ``own``: the places of ours. InputError if another package's cannot be loaded, or has a name
-    that is taken.
+    ``kind``: what they are called; ``own``: the places of ours; ``needs``: attributes that one has. InputError if another package's
+    cannot be loaded, lacks one of them, or has a name that is taken.
     """
 
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
+    def __init__(self, kind: str, *needs: str) -> None:
+        self.kind, self.needs = kind, needs
         self.own: dict[str, Place] = {}
         self._others: dict[str, tuple[Place, str]] | None = None  # with the name of the package
 
@@ -61,11 +61,14 @@ class Group(Mapping[str, Any]):
         if name in self.own:
             return load(self.own[name])
         place, package = self._installed()[name]
+        what = f"{self.kind}: {plain(name)} of {package}"
         try:
-            return load(place)
+            found = load(place)
         except Exception as error:  # whatever the code of others raises
-            what = f"{self.kind}: {plain(name)} of {package}"
             raise InputError(f"{what} cannot be loaded from {place}: {told(error)}") from error
+        if missing := [needed for needed in self.needs if not hasattr(found, needed)]:
+            raise InputError(f"{what} has no {missing[0]}, expected one that the docs describe")
+        return found
 
     def __iter__(self) -> Iterator[str]:
         yield from (*self.own, *self._installed())
@@ -74,4 +77,6 @@ class Group(Mapping[str, Any]):
         return len(self.own) + len(self._installed())
 
 
-SENSORS, ESTIMATORS, READERS = Group("sensors"), Group("estimators"), Group("readers")
+SENSORS = Group("sensors", "channels", "settings", "layers")
+ESTIMATORS = Group("estimators", "process", "estimate")
+READERS = Group("readers", "Options", "read")

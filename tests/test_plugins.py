@@ -50,7 +50,10 @@ def sonar(monkeypatch):
     """A module ``sonar`` with a sensor, an estimator and what a reader needs."""
     module = ModuleType("sonar")
     module.SENSOR, module.Options, module.read = SONAR, type("Options", (FileModel,), {}), print
-    module.Guess, module.GuessSettings = type("Guess", (), {}), type("GuessSettings", (FileModel,), {})
+    module.Guess, module.GuessSettings = (
+        type("Guess", (), {"process": print, "estimate": print}),
+        type("GuessSettings", (FileModel,), {}),
+    )
     monkeypatch.setitem(sys.modules, "sonar", module)
     return module
 
@@ -89,7 +92,9 @@ def test_what_cannot_be_loaded_is_one_line(install, place, why):
 @pytest.mark.usefixtures("sonar")
 def test_what_is_no_sensor_is_refused(install):
     install(("sensors", "sonar", "sonar:Guess"))
-    with pytest.raises(InputError, match=r"^sensors: sonar is type, expected a SensorType$"):
+    with pytest.raises(
+        InputError, match=r"^sensors: sonar of sonar-package has no channels, expected one that the docs describe$"
+    ):
         registry.sensors()
 
 

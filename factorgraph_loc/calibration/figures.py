@@ -12,6 +12,7 @@ from factorgraph_loc.drawing.figures import COLOURS
 from factorgraph_loc.drawing.panels import axes_of, legend, name_axes, png
 from factorgraph_loc.sensors.odometry.calibration.noise import BLACKOUT, LENGTHS
 from factorgraph_loc.sensors.odometry.calibration.windows import cut
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.text import plain
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
@@ -84,7 +85,7 @@ def correlation_figure(knowledge: Knowledge) -> bytes:
 
 def odometry_figure(knowledge: Knowledge) -> bytes:
     """Residuals of the odometry over windows: in time, over distance, and how they grow with the length of the window."""
-    model = knowledge.rig.odometry_model()
+    model = odometry_model(knowledge.rig)
     figure, axes = axes_of(3, 3)
     residuals = [one.residuals(model) for one in knowledge.windows]
     lengths = (*LENGTHS, BLACKOUT)

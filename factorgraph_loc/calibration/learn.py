@@ -17,6 +17,7 @@ from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.calibration import constants as odometry
 from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
 from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
 from factorgraph_loc.sensors.rfid.calibration.choice import Kind
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
@@ -188,7 +189,7 @@ def sightings_with(log: Log) -> Sightings:
 
 def _fit_wheels(windows: Sequence[Windows], rig: Rig) -> WheelsFit:
     constants = odometry.constants_of(windows[0], rig.odometry)
-    model = rig.odometry_model()
+    model = odometry_model(rig)
     start = {c.name: c.neutral for c in constants}
     start |= {name: max(start[name], odometry.LAGGING_START) for name in ("delay", "lag") if name in start}
     for _ in range(ROUNDS):
@@ -209,7 +210,7 @@ def _settle_wheels(
     *,
     by_log: bool,
 ) -> tuple[list[Learnt], NoiseFit]:
-    model, constants, sigmas, start = rig.odometry_model(), wheels.everything.constants, wheels.sigmas, wheels.start
+    model, constants, sigmas, start = odometry_model(rig), wheels.everything.constants, wheels.sigmas, wheels.start
     kept = _kept("odometry", constants, wheels.gain, accepted)
     pooled = odometry.fit_odometry(windows, model, kept, sigmas, start) if kept else None
     model = odometry.with_constants(model, pooled.as_dict() if pooled else {})

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
@@ -46,6 +47,17 @@ class FileModel(BaseModel):
     def bounded(cls, **values: Any) -> Self:
         """One of computed values, numbers beyond the bounds of their field at the bound."""
         return cls(**{key: _within(cls, key, value) for key, value in values.items()})
+
+
+def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
+    """Give a model more fields, each with its type and default, that stand after another one."""
+    there = dict(model.model_fields)
+    behind = list(there)[list(there).index(after) + 1 :]
+    added = {name: FieldInfo.from_annotated_attribute(kind, default) for name, (kind, default) in fields.items()}
+    model.model_fields.clear()
+    model.model_fields.update({name: there[name] for name in there if name not in behind} | added)
+    model.model_fields.update({name: there[name] for name in behind})
+    model.model_rebuild(force=True)
 
 
 Model = TypeVar("Model", bound=BaseModel)

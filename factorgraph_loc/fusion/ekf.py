@@ -112,10 +112,10 @@ class Ekf(Filter):
     def __init__(self, setup: Setup, settings: EkfSettings) -> None:
         super().__init__(setup, settings)
         self._iterations = settings.iterations
-        self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
-        self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
+        self._odometry_constants = setup.rig.estimated("odometry") if settings.self_calibration else NOTHING
+        self._sensor_constants = setup.rig.estimated("bearing_range") if settings.self_calibration else NOTHING
         self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
-        self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
+        self._camera_constants = setup.rig.estimated("camera") if settings.self_calibration else NOTHING
         self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, motion=self._motion)
         self._finder = PixelFinder(self._points, self._motion)
         self.supports_unknown_start = self._points.known

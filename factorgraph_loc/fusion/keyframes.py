@@ -71,9 +71,9 @@ class KeyframeGraph(ABC):
         self._graph_settings = settings
         self_calibration = settings.self_calibration
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=self_calibration)
-        self._odometry_constants = setup.rig.estimated_odometry() if settings.self_calibration else NOTHING
-        self._sensor_constants = setup.rig.estimated_bearing_range() if settings.self_calibration else NOTHING
-        self._camera_constants = setup.rig.estimated_camera() if settings.self_calibration else NOTHING
+        self._odometry_constants = setup.rig.estimated("odometry") if settings.self_calibration else NOTHING
+        self._sensor_constants = setup.rig.estimated("bearing_range") if settings.self_calibration else NOTHING
+        self._camera_constants = setup.rig.estimated("camera") if settings.self_calibration else NOTHING
         self._places: dict[str, int] = {}  # numbers of the landmarks that were taken in
         self._unknown: UnknownPoints | None = None
         # points that have left the graph: estimate and covariance

@@ -86,7 +86,7 @@ class ParticleFilter(Filter):
         self._odometry_constants = self._sensor_constants = NOTHING
         sensor = setup.rig.bearing_range
         if settings.self_calibration:
-            self._odometry_constants = setup.rig.estimated_odometry()
+            self._odometry_constants = setup.rig.estimated("odometry")
             self._sensor_constants = Estimated.of(bearing_range.PARAMETERS[:TIME_OFFSET], sensor and sensor.uncertainty)
         middle = len(self._odometry_constants.names)
         self._odometry_part = slice(0, middle)  # where they lie in the constants of the particles

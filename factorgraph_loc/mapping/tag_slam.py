@@ -86,7 +86,7 @@ class _Way:
 
     def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = looks, prior, known
-        self._constants = log.rig.estimated_odometry()
+        self._constants = log.rig.estimated("odometry")
         sensors = ("odometry", "imu") if "imu" in log.rig.sensors else ("odometry",)
         motion = Motion(log.rig, sensors, Diagnostics())
         motion.keep(FOREVER)

@@ -1,91 +1,79 @@
 """What the robot carries, and what we believe about it, read from and written to ``NAME.rig.toml``.
 
-Every number has its unit in the description; the bounds are there to catch wrong units (degrees for radians, mm for m).
+Each sensor has its own section, whose class its package registers. Every number has its unit in the description; the bounds are
+there to catch wrong units (degrees for radians, mm for m).
 """
 
 from __future__ import annotations
 
-import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.variable import Estimated
-from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
-from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
-from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factors.camera import model as reprojection
-from factors.landmarks import model as bearing_range
-from factors.odometry import model as odometry
-from factors.odometry.model import OdometryModel
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel, add_fields
+from factorgraph_loc.model.sections import sections, sections_of_channels
+from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.variable import NOTHING, Estimated
+from factorgraph_loc.plugins import load
 
-# m, rad, s: how long the error of a constant acts before what is seen corrects it
-WAY, TURN, TIME = 4.0, 4.0, 8.0
+S = TypeVar("S", bound=FileModel)
 
 
 class Rig(FileModel):
-    """A robot: the sensors that estimators use by default, and the settings of each."""
+    """A robot: the sensors that estimators use by default, and the settings of each, as attributes by the names of the sections:
+    None of a sensor that it has not."""
 
     name: str = "rig"
     sensors: tuple[str, ...] = ("odometry", "bearing_range")
-    odometry: OdometrySettings = OdometrySettings()
-    imu: ImuSettings | None = None
-    bearing_range: BearingRangeSettings | None = None
-    rfid: RfidSettings | None = None
-    twist: TwistSettings | None = None
-    camera: CameraSettings | None = None
-    camera_right: CameraSettings | None = None
-    survey: SurveySettings = SurveySettings()
 
-    def odometry_model(self, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
-        """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
+    if TYPE_CHECKING:
 
-        ``constants_as_noise``: for an estimator that does not estimate the uncertain constants, whose error then is in its
-        noise: as of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
-        """
-        s = self.odometry
-        along, heading = s.noise.along.model(), s.noise.heading.model()
-        if constants_as_noise:
-            u = s.uncertainty
-            along = along.widened(per_distance=u.scale_distance * math.sqrt(WAY))
-            heading = heading.widened(
-                per_distance=u.heading_drift * math.sqrt(WAY),
-                per_rotation=u.scale_rotation * math.sqrt(TURN),
-                per_time=u.heading_rate_bias * math.sqrt(TIME),
-            )
-        imu = self.imu or ImuSettings()
-        return OdometryModel(
-            scale_distance=s.scale_distance,
-            scale_rotation=s.scale_rotation,
-            speed_bias=s.speed_bias,
-            heading_rate_bias=s.heading_rate_bias,
-            heading_drift=s.heading_drift,
-            direction=s.direction,
-            delay=s.delay,
-            lag=s.lag,
-            turn_slowdown=s.turn_slowdown,
-            gyro_bias=imu.bias,
-            max_hold=s.max_hold,
-            unknown_distance=s.unknown_distance,
-            unknown_rotation=s.unknown_rotation,
-            along=along,
-            lateral=s.noise.lateral.model(),
-            heading=imu.heading.model() if use_gyro else heading,
-        )
+        def __init__(self, **values: Any) -> None: ...
+        def __getattr__(self, section: str) -> Any: ...
 
-    def estimated_odometry(self) -> Estimated:
-        """Which of ``factors.odometry.model.PARAMETERS`` are estimated on the way."""
-        return Estimated.of(odometry.PARAMETERS, self.odometry.uncertainty)
+    def find(self, kind: type[S], section: str | None = None) -> S | None:
+        """The settings of a class, of the ``section`` if a rig may have several of that class; None if it has none."""
+        found: S | None = getattr(self, section or _section_of(kind))
+        return found
 
-    def estimated_bearing_range(self) -> Estimated:
-        """Which of ``factors.landmarks.model.PARAMETERS`` are estimated on the way."""
-        return Estimated.of(bearing_range.PARAMETERS, self.bearing_range and self.bearing_range.uncertainty)
+    def of(self, kind: type[S], section: str | None = None) -> S:
+        """Those of :meth:`find`; InputError if it has none."""
+        found = self.find(kind, section)
+        if found is None:
+            raise InputError(f"the rig {self.name} has no [{section or _section_of(kind)}]")
+        return found
 
-    def estimated_camera(self) -> Estimated:
-        """Which of ``factors.camera.model.PARAMETERS`` are estimated on the way."""
-        return Estimated.of(reprojection.PARAMETERS, self.camera and self.camera.uncertainty)
+    def estimated(self, section: str) -> Estimated:
+        """Which constants of a sensor are learnt on the way; none of one that it has not."""
+        found = getattr(self, section)
+        return found.estimated() if isinstance(found, SensorSettings) else NOTHING
 
-    def time_offset(self, sensor: str) -> float:
-        """Seconds to add to the stamps of a sensor's stream; those of identified pixels are the cameras'."""
-        settings = getattr(self, sensor.replace("sightings", "camera"), None)
-        return 0.0 if settings is None else float(settings.time_offset)
+    def time_offset(self, channel: str) -> float:
+        """Seconds to add to the stamps of a channel."""
+        settings = getattr(self, _CLOCKS.get(channel, ""), None)
+        return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
+
+    def placed(self, folder: Path) -> Self:
+        """The same, read from a file in ``folder``, where files that it names are."""
+        return self.model_copy(update={name: found.placed(folder) for name, found in self._of_sensors().items()})
+
+    def write_beside(self, folder: Path) -> None:
+        """Write the files that it names into the ``folder`` of its own."""
+        for found in self._of_sensors().values():
+            found.write_beside(folder)
+
+    def _of_sensors(self) -> dict[str, SensorSettings]:
+        return {name: found for name in _KINDS if isinstance(found := getattr(self, name), SensorSettings)}
+
+
+def _section_of(kind: type[FileModel]) -> str:
+    return next(name for name, other in _KINDS.items() if other is kind)
+
+
+_KINDS: dict[str, type[FileModel]] = {name: load(section.kind) for name, section in sections().items()}
+_CLOCKS = sections_of_channels()
+add_fields(
+    Rig,
+    {n: (_KINDS[n], _KINDS[n]()) if s.always else (_KINDS[n] | None, None) for n, s in sections().items()},
+    after="sensors",
+)

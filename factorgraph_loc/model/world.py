@@ -1,38 +1,59 @@
-"""What is around the robot: landmarks and tags with their positions, read from and written to ``NAME.world.toml``.
+"""What is around the robot, read from and written to ``NAME.world.toml``: layers of things by name, whose classes the packages of
+sensors register, points that cameras see, and walls.
 
 Many tags are better kept in a table beside it, ``NAME.tags.csv``; points that a camera sees always are, as ``NAME.points.parquet``.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, TypeVar
+
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from factorgraph_loc.files.models import Coordinate, FileModel
+from factorgraph_loc.files.models import Coordinate, FileModel, add_fields
 from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.model.sections import layers
+from factorgraph_loc.plugins import load
 from factors.se2 import Array
+
+L = TypeVar("L", bound=FileModel)
 
 
 class World(FileModel):
-    """A map. ``landmarks``: by name, as measurements name them. ``tags``: RFID tags by EPC, as they were surveyed: what a rig
-    knows of the survey's errors is applied where they are used. ``points``: what a camera sees. ``walls``: segments (x1, y1, x2,
-    y2) [m]."""
+    """A map. ``points``: what a camera sees. ``walls``: segments (x1, y1, x2, y2) [m]. Layers, such as ``landmarks`` by name as
+    measurements name them and RFID ``tags`` by EPC, hold what was surveyed, as it was surveyed."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     name: str = "world"
-    landmarks: dict[str, Landmark] = Field(default_factory=dict)
-    tags: dict[str, Tag] = Field(default_factory=dict)
     points: PointMap | None = None
     walls: tuple[tuple[Coordinate, Coordinate, Coordinate, Coordinate], ...] = ()
 
-    def position(self, landmark: str) -> Array | None:
-        """Position (2,) of a landmark, or None if the map lacks it."""
-        found = self.landmarks.get(landmark)
+    if TYPE_CHECKING:
+
+        def __init__(self, **values: Any) -> None: ...
+        def __getattr__(self, layer: str) -> Any: ...
+
+    def of(self, kind: type[L]) -> dict[str, L]:
+        """The layer of things of a class."""
+        found: dict[str, L] = getattr(self, next(name for name, other in _KINDS.items() if other is kind))
+        return found
+
+    def position(self, name: str, layer: str | None = None) -> Array | None:
+        """Position (2,) of a thing of a ``layer``, by default the first; None if the map lacks it."""
+        found = getattr(self, layer or next(iter(_KINDS))).get(name)
         return None if found is None else np.array((found.x, found.y))
 
-    def positions(self) -> Array:
-        """Positions (K, 2) of all landmarks, in the order of the map."""
-        return np.array([(m.x, m.y) for m in self.landmarks.values()]).reshape(-1, 2)
+    def positions(self, layer: str | None = None) -> Array:
+        """Positions (K, 2) of all things of a ``layer``, by default the first, in the order of the map."""
+        things = getattr(self, layer or next(iter(_KINDS))).values()
+        return np.array([(thing.x, thing.y) for thing in things]).reshape(-1, 2)
+
+
+_KINDS: dict[str, type[FileModel]] = {name: load(layer.kind) for name, layer in layers().items()}
+add_fields(
+    World,
+    {n: (dict.__class_getitem__((str, kind)), Field(default_factory=dict)) for n, kind in _KINDS.items()},
+    after="name",
+)

@@ -8,6 +8,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
 from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.camera.model import CameraModel
 from factors.landmarks.model import BearingRangeModel
@@ -45,7 +46,7 @@ class Sensors:
         """All sensors of a rig that find something in the world."""
         return Sensors(
             world,
-            rig.odometry_model(constants_as_noise=True),
+            odometry_model(rig, constants_as_noise=True),
             RfidLikelihood(rig.rfid.model(), tag_map(world, rig.survey).tags) if rig.rfid and world.tags else None,
             rig.bearing_range.model() if rig.bearing_range and world.landmarks else None,
             rig.camera.model() if rig.camera and world.points is not None else None,

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
-from factorgraph_loc.model.sections import Layer, Section
+from factorgraph_loc.model.sections import Layer, Section, registered
 from factorgraph_loc.plugins import SENSORS, Place, load
-from factorgraph_loc.text import plain, quoted
+from factorgraph_loc.text import quoted
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,9 @@ class SensorType:
     findable: Place = ""
 
 
-@cache
 def sensors() -> Mapping[str, SensorType]:
     """All sensors by name, ours first. InputError if one of another package cannot be loaded, or if two bring the same name."""
-    found: dict[str, SensorType] = {}
-    owners: dict[tuple[str, str], str] = {}
-    for name, sensor in SENSORS.items():
-        if not isinstance(sensor, SensorType):
-            raise InputError(f"sensors: {plain(name)} is {type(sensor).__name__}, expected a SensorType")
-        names = {"channel": [c.name for c in sensor.channels], "setting": sensor.settings, "layer": sensor.layers}
-        for key in ((kind, each) for kind, several in names.items() for each in several):
-            if key in owners:
-                raise InputError(f"sensors: {plain(name)} and {owners[key]} both have the {key[0]} {plain(key[1])}")
-            owners[key] = name
-        found[name] = sensor
-    return found
+    return cast(Mapping[str, SensorType], registered())
 
 
 @cache
@@ -108,5 +96,5 @@ def functions(kind: str) -> Iterator[tuple[str, Callable[..., Any]]]:
 def forget() -> None:
     """Look once more for what is installed."""
     SENSORS.forget()
-    for function in (sensors, channels, sensor_of):
+    for function in (registered, channels, sensor_of):
         function.cache_clear()

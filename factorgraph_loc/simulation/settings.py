@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside, nearest, parse_model, read_toml
-from factorgraph_loc.io.native.rig_file import placed, read_rig
+from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.simulation_units import Hertz
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
@@ -225,7 +225,7 @@ def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> Simul
         base["rig"] = read_rig(file).model_dump(mode="json", exclude_none=True)
         folder = file.parent
     settings = parse_model(SimulationSettings, merged(merged(base, content), changes or {}), path)
-    return settings.model_copy(update={"rig": placed(settings.rig, folder)})
+    return settings.model_copy(update={"rig": settings.rig.placed(folder)})
 
 
 def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:

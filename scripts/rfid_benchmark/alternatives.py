@@ -153,7 +153,7 @@ def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tu
     assert prior is not None
     assert tags.likelihood is not None
     motion = Motion(log.rig, SENSORS, Diagnostics(), self_calibration=True)
-    constants = log.rig.estimated_odometry()
+    constants = log.rig.estimated("odometry")
     factors: list[tuple[Factor, tuple[int, ...]]] = [
         (PriorFactor(prior.pose, se2.world_to_body(prior.pose, prior.covariance)), (pose_key(0),)),
         (VectorPriorFactor(np.zeros(len(constants.names)), constants.sigmas), (ODOMETRY_KEY,)),

@@ -16,6 +16,7 @@ from factorgraph_loc.planning.paths import look_around, primitives, waypoint_pat
 from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.rfid.detection import RfidLikelihood, TagArray
@@ -179,7 +180,7 @@ def test_a_wrong_name_is_an_error():
 def one_place(tags, candidates):
     """A situation with one place in the middle, known to 0.8 m and 0.1 rad, and what is seen from ways."""
     s = situation(candidates=candidates, tags=tags)
-    sensors = Sensors(World(), Rig(**RACKHAM_RIG).odometry_model(constants_as_noise=True), s.likelihood)
+    sensors = Sensors(World(), odometry_model(Rig(**RACKHAM_RIG), constants_as_noise=True), s.likelihood)
     mode = Mode(1.0, np.array((20.0, 20.0, 0.0)), np.diag((0.64, 0.64, 0.01)))
     return replace(s, modes=(mode,), sensors=sensors)
 

@@ -13,6 +13,7 @@ from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
@@ -57,7 +58,7 @@ def test_uncertain_constants_beside_noise_at_its_bound_make_a_model():
     most = GrowthSettings(per_distance=5.0, per_rotation=5.0, per_time=5.0)
     sure = OdometryUncertainty(scale_distance=1.0, scale_rotation=1.0, heading_rate_bias=1.0, heading_drift=1.0)
     noise = OdometryNoise(along=most, lateral=most, heading=most)
-    model = Rig(odometry=OdometrySettings(noise=noise, uncertainty=sure)).odometry_model(constants_as_noise=True)
+    model = odometry_model(Rig(odometry=OdometrySettings(noise=noise, uncertainty=sure)), constants_as_noise=True)
     assert model.along.per_distance == pytest.approx(math.hypot(5.0, 2.0))
     assert model.heading.per_distance == pytest.approx(math.hypot(5.0, 2.0))
     assert model.heading.per_rotation == pytest.approx(math.hypot(5.0, 2.0))

@@ -50,7 +50,7 @@ def test_odometry_without_constants_keeps_the_noise(room):
         error = odometry.dtheta[1:] - np.arctan2(np.sin(steps[:, 2]), np.cos(steps[:, 2]))
         turned.append(error.sum() / np.sqrt(ds.sum()))
         way.append(error[ds > 0.01] / np.sqrt(ds[ds > 0.01]))
-        assert not log.rig.estimated_odometry().names
+        assert not log.rig.estimated("odometry").names
     each = np.concatenate(way)
     # standard deviations of 2 % and of 14 %: four of them, one false alarm in 16,000
     assert each.std() == pytest.approx(np.radians(1.5), rel=4.0 / np.sqrt(2.0 * len(each)))

@@ -17,7 +17,7 @@ from factorgraph_loc.files.models import FileModel, file_name, inside, parse_mod
 from factorgraph_loc.files.tables import Table, read_table, write_table
 from factorgraph_loc.files.temporary import sweep, temporary_folder
 from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-from factorgraph_loc.io.native.rig_file import placed, read_rig, write_rig
+from factorgraph_loc.io.native.rig_file import read_rig, write_rig
 from factorgraph_loc.io.native.world_file import parse_world, read_world, write_world
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.maps.points import POINTS_SUFFIX
@@ -115,7 +115,7 @@ def rig_of(run: RunFile, source: Path) -> Rig:
         return DEFAULT_RIG
     if isinstance(run.rig, str):
         return read_rig(inside(source.parent, run.rig, source))
-    return placed(parse_model(Rig, run.rig, f"{source} [rig]"), source.parent)
+    return parse_model(Rig, run.rig, f"{source} [rig]").placed(source.parent)
 
 
 def world_of(run: RunFile, source: Path) -> World:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
@@ -40,7 +41,7 @@ class CameraUncertainty(FileModel):
     time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
 
-class CameraSettings(FileModel):
+class CameraSettings(SensorSettings):
     """A camera. See :class:`factors.camera.model.CameraModel` for the model.
 
     Mounted at (x, y, z) it looks along the robot's x axis, then turned by ``roll`` about x, ``pitch`` about y (down where
@@ -50,7 +51,7 @@ class CameraSettings(FileModel):
     image, so that each image tells less than its pixels seem to.
     """
 
-    time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
+    constants: ClassVar[tuple[str, ...]] = reprojection.PARAMETERS
     width: Side = 640
     height: Side = 480
     fx: Focal

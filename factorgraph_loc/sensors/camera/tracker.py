@@ -28,7 +28,7 @@ class PixelTracker:
     """What pixels make of a cloud whose place is known; see the module."""
 
     def __init__(self, setup: Setup, motion: Motion, diagnostics: Diagnostics) -> None:
-        self._constants = setup.rig.estimated_camera()
+        self._constants = setup.rig.estimated("camera")
         self._spread = np.diag(self._constants.sigmas**2)
         self._points = KnownPoints(setup, diagnostics, self._constants, motion=motion)
         self._motion = motion

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.units import Angle, Offset, Seconds
-from factors.landmarks.model import BearingRangeModel
+from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.units import Angle, Offset
+from factors.landmarks.model import PARAMETERS, BearingRangeModel
 
 
 class BearingRangeUncertainty(FileModel):
@@ -22,10 +23,10 @@ class BearingRangeUncertainty(FileModel):
     time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
 
-class BearingRangeSettings(FileModel):
+class BearingRangeSettings(SensorSettings):
     """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model."""
 
-    time_offset: Seconds = 0.0
+    constants: ClassVar[tuple[str, ...]] = PARAMETERS
     x: Offset = 0.0
     y: Offset = 0.0
     heading: Angle = 0.0

@@ -8,6 +8,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Odometry
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factors import se2
 from factors.motion import ChainState, Increment
@@ -41,7 +42,7 @@ class Motion:
         self.horizon = self._chain.horizon = horizon
 
     def _new_chain(self) -> OdometryChain:
-        model = self._rig.odometry_model(use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
+        model = odometry_model(self._rig, use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
     def add(self, m: Odometry) -> None:

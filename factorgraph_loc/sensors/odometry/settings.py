@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.units import Angle, Noise, Rate, Scale, Seconds
-from factors.odometry.model import Growth
+from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.units import Angle, Noise, Rate, Scale
+from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
@@ -43,10 +44,10 @@ class OdometryUncertainty(FileModel):
     heading_drift: Annotated[float, Field(ge=0.0, le=1.0, description="rad/m")] = 0.0
 
 
-class OdometrySettings(FileModel):
+class OdometrySettings(SensorSettings):
     """Wheel odometry. See :class:`factors.odometry.model.OdometryModel` for the model."""
 
-    time_offset: Seconds = 0.0
+    constants: ClassVar[tuple[str, ...]] = PARAMETERS
     scale_distance: Scale = 1.0
     scale_rotation: Scale = 1.0
     speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
@@ -63,10 +64,9 @@ class OdometrySettings(FileModel):
     uncertainty: OdometryUncertainty = OdometryUncertainty()
 
 
-class ImuSettings(FileModel):
+class ImuSettings(SensorSettings):
     """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``, of a rig without
     these settings with the default ones."""
 
-    time_offset: Seconds = 0.0
     bias: Rate = 0.0
     heading: GrowthSettings = GrowthSettings(per_time=0.005)

@@ -13,6 +13,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
 from factorgraph_loc.sensors import clock_shift
 from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.summary import Summary
 from factors.odometry.chain import OdometryChain
@@ -127,7 +128,7 @@ def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
 
 
 def _integrated(log: Log, stream: VelocityStream | IncrementStream) -> OdometryChain:
-    chain = OdometryChain(log.rig.odometry_model(), horizon=np.inf)
+    chain = OdometryChain(odometry_model(log.rig), horizon=np.inf)
     t = stream.t + log.rig.time_offset("odometry")
     if isinstance(stream, VelocityStream):
         chain.add_velocities(t, stream.v, stream.w)

@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from factorgraph_loc.files.models import Coordinate, FileModel, inside
-from factorgraph_loc.sensors.rfid.grids import read_grid
+from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
 from factorgraph_loc.text import listed, quoted
 from factors import se2
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
@@ -142,7 +143,7 @@ def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings
     return {"default": BeamSettings()}
 
 
-class RfidSettings(FileModel):
+class RfidSettings(SensorSettings):
     """The RFID reader. ``antennas`` by the name that reads give, or a ``preset`` of them at the height ``preset_z``.
 
     ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
@@ -152,7 +153,6 @@ class RfidSettings(FileModel):
     ``phase``: what is made of them, where an estimator is given these sensors.
     """
 
-    time_offset: Annotated[float, Field(ge=-5.0, le=5.0, description="s")] = 0.0
     preset: Literal["rackham"] | None = None
     preset_z: Offset = 1.0
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
@@ -178,6 +178,17 @@ class RfidSettings(FileModel):
 
     def all_antennas(self) -> Mapping[str, AntennaSettings]:
         return self.antennas if self.preset is None else rackham(self.preset_z)
+
+    def placed(self, folder: Path) -> RfidSettings:
+        """The same, whose grids are files in ``folder``."""
+        models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in self.models.items()}
+        return self.model_copy(update={"models": models})
+
+    def write_beside(self, folder: Path) -> None:
+        """Write its grids into ``folder``."""
+        for model in self.models.values():
+            if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
+                write_grid(model.model(), folder / model.file)
 
     def model(self) -> RfidModel:
         """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""

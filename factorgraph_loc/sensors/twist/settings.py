@@ -6,16 +6,14 @@ from typing import Annotated
 
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.units import Seconds
+from factorgraph_loc.model.settings import SensorSettings
 
 PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)")]
 
 
-class TwistSettings(FileModel):
+class TwistSettings(SensorSettings):
     """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: standard deviations of the errors of
     position and orientation along the robot's axes, which grow with the root of time."""
 
-    time_offset: Seconds = 0.0
     shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
     turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]

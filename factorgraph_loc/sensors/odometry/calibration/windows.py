@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors import se2
 from factors.motion import ChainState
@@ -64,7 +65,7 @@ def cut(log: Log, length: float) -> Windows:
     begin, end = edges[:-1], edges[1:]
     poses = log.reference.at(edges, max_gap=REFERENCE_GAP)
     motion = se2.between(poses[:-1], poses[1:])
-    chain = integrated(log, log.rig.odometry_model())
+    chain = integrated(log, odometry_model(log.rig))
     gap = chain.states(end)[:, 6] - chain.states(begin - BEFORE)[:, 6]
     good = np.isfinite(motion[:, 0]) & (gap < 1e-6)
     return Windows(log, begin[good], end[good], motion[good])
