@@ -6,8 +6,6 @@ All of them are reached from the package, as ``factorgraph_loc.run``. Where a lo
 so a script that calls them needs the usual ``if __name__ == "__main__"``.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Modules of version 0.1.0 whose content is elsewhere now: what is imported from them comes with a DeprecationWarning."""
 
-from __future__ import annotations
-
 import importlib
 import warnings
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 What this module imports must be light: it is the first that a new process loads, and the last before it is tied to its parent.
 """
 
-from __future__ import annotations
-
 import ctypes
 import multiprocessing
 import os

@@ -9,8 +9,6 @@ would, as with too little curvature for the gradient, the curvature along g is r
 ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. Without any curvature that is Gauss-Newton's of the plain residual sqrt(2 nll).
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

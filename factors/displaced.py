@@ -1,7 +1,5 @@
 """What factors of sightings share: a pose variable that lies a known motion before the sighting, and noise that is widened."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factors import positive, se2

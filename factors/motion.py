@@ -1,7 +1,5 @@
 """Increments of motion, and how a covariance grows along them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

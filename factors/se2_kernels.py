@@ -1,7 +1,5 @@
 """What compiled code needs of :mod:`factors.se2`: single poses, by their components."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -1,7 +1,5 @@
 """A complete rig from logs with reference poses: learn, make consistent, keep what pays, cross-validate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

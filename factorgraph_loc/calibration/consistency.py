@@ -4,8 +4,6 @@ Errors of neighbouring sightings are nearly the same, while estimators take them
 an estimator is far too sure. One factor on the sigmas of range and bearing makes up for that.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What became of each constant that was fitted, and how well it is known."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Stretches of logs on which an estimator judges what was learnt from the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The report of a calibration: one HTML page that needs no other file, and the same as a document for programs."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math

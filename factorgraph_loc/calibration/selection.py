@@ -6,8 +6,6 @@ the fits gain least by, and last what depends on them: noise, uncertainty, model
 remain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

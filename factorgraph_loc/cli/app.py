@@ -1,7 +1,5 @@
 """The commands of ``fgloc``. The command line only parses and prints; numerical libraries are imported inside the commands."""
 
-from __future__ import annotations
-
 import sys
 import traceback
 from typing import Annotated, Any

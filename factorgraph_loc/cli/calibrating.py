@@ -1,7 +1,5 @@
 """``fgloc calibrate``: a rig from logs with reference poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

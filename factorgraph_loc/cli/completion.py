@@ -1,7 +1,5 @@
 """What the shell completes: names of logs, estimators and presets. Nothing here may load numerical libraries: a key was pressed."""
 
-from __future__ import annotations
-
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.plugins import ESTIMATORS
 

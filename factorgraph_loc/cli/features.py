@@ -1,7 +1,5 @@
 """``fgloc features``: how well point features of images repeat and match."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

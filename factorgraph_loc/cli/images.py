@@ -1,7 +1,5 @@
 """``fgloc images``: how well images are located in a map that was made from others."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The entry point of ``fgloc``. What the command needs is imported inside, so that a signal may come meanwhile as at any time."""
 
-from __future__ import annotations
-
 import sys
 
 

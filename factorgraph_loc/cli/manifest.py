@@ -1,7 +1,5 @@
 """``fgloc manifest``, and what ``fgloc info`` says of a ROS bag: its topics, and what they could be."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Signals that end the command, as an interrupt from the keyboard does: what was begun is cleared away first."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

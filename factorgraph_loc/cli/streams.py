@@ -1,8 +1,6 @@
 """Standard output and standard error as the command uses them: what they cannot take, being closed, full or of few characters,
 ends in a line and an exit code, never in a traceback, nor in a message of the interpreter as it ends."""
 
-from __future__ import annotations
-
 import io
 import os
 import sys

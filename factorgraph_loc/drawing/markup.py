@@ -1,7 +1,5 @@
 """The few pieces of HTML that the page is made of. Whatever comes from outside is escaped here and nowhere else."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Iterable

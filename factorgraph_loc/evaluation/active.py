@@ -3,8 +3,6 @@
 A run that did not end localized, or did not end well at all, counts as one that never comes there: its metres are infinite.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ The alignment is that of Umeyama, "Least-squares estimation of transformation pa
 equations 40 to 42 with the scale kept at 1. In the plane its rotation is one angle, and no reflection can come out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

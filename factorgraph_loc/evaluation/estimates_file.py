@@ -1,8 +1,6 @@
 """``estimates.parquet`` of a run, read with the types that it is written with; see
 :func:`~factorgraph_loc.experiments.output.write_run`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import polars as pl

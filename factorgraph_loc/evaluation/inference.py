@@ -12,8 +12,6 @@ Applications to Tracking and Navigation", 2001, section 5.4, for as many values 
 Monte Carlo", Statistical Science 7(4), 1992, section 3.3).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a log holds and what looks wrong with it, before any estimator sees it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

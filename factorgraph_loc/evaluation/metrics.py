@@ -6,8 +6,6 @@ Applications to Tracking and Navigation", 2001, section 5.4. Relative pose error
 RGB-D SLAM systems", 2012, section IV.A, taken over path length instead of time.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ bootstrap over the cases (Efron and Tibshirani, "An Introduction to the Bootstra
 infinite: a median is known as long as more than half of the cases are finite.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

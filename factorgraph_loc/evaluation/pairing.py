@@ -9,8 +9,6 @@ neighbours, the error ``(1 - f) a + f b`` has no greater covariance than ``(1 - 
 correlated, and just this one where both are the same.
 """
 
-from __future__ import annotations
-
 import bisect
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How far poses in space are from the reference, and whether their covariances say so."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Runs are paired by log and seed; logs are clusters. The interval is a percentile
 (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Warnings that concern results: kept with the scores of a run and in its row, and told once however many runs they concern."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 What is done is kept while the rest is under way, so that an experiment which was interrupted goes on where it was.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

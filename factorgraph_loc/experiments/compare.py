@@ -1,7 +1,5 @@
 """Several estimators on several logs: every pair in a process of its own, one table, the differences, and plots."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import traceback

@@ -1,7 +1,5 @@
 """What a run says of itself where the map and what was measured do not come together."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

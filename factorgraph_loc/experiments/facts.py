@@ -1,7 +1,5 @@
 """What planning must know of logs and estimators, kept in a file: to look it up takes numerical libraries, or a log's reading."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

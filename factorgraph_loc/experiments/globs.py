@@ -1,7 +1,5 @@
 """Paths that match a pattern, found without walking through a whole disk."""
 
-from __future__ import annotations
-
 import fnmatch
 import os
 import re

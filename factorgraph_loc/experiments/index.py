@@ -1,7 +1,5 @@
 """All results of an experiment in one table, a row a run."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterable
 from pathlib import Path

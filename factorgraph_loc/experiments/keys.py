@@ -1,7 +1,5 @@
 """What a run's result depends on, as one key: the log, the configuration, the rule of scoring, the code, the libraries."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json

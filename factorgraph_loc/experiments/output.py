@@ -1,7 +1,5 @@
 """The files of one run: trajectories, estimates, what was learnt, events, scores, and the configuration."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """The particles of a run. They are too many to be kept with its results, so the run is made again, as its configuration says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

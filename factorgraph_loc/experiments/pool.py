@@ -3,8 +3,6 @@
 A run that takes too long or too much memory is ended with its process, and stored as failed; the others go on.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections import Counter

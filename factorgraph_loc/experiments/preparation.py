@@ -1,7 +1,5 @@
 """Which sensors a run uses, and what their packages make ready before an estimator runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace

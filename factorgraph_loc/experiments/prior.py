@@ -1,7 +1,5 @@
 """Where a run starts: what the user says, what the log says, or where the reference is."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of an experiment's results, from what is stored."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from dataclasses import dataclass

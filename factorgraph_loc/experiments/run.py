@@ -1,7 +1,5 @@
 """One log run by one estimator: feed the measurements in the order of arrival, keep what it says, and time it."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import platform
 import resource

@@ -1,7 +1,5 @@
 """Seeds as people write them: ``0:10``, ``3``."""
 
-from __future__ import annotations
-
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 

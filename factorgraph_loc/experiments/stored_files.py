@@ -1,7 +1,5 @@
 """What the small files of the store hold; one that holds anything else is damaged."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, TypeVar
 

@@ -3,8 +3,6 @@
 What the same run gives on another day is the same to the byte but for that file.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A process that makes one planned run after the other. What it imports first must be light: threads are chosen before numpy is."""
 
-from __future__ import annotations
-
 from multiprocessing.connection import Connection
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Messages are JSON, stamped with the absolute time of the log. Frames: ``world``,
 by the run's name. The library ``mcap`` is optional, and imported where it is used only.
 """
 
-from __future__ import annotations
-
 import base64
 import heapq
 import json

@@ -3,8 +3,6 @@
 Fields and their meaning: https://docs.foxglove.dev/docs/sdk/schemas. Ours alone is ``fgloc.Estimate``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 Schema = dict[str, Any]

@@ -5,8 +5,6 @@ the formats of its types ``slam2d``. What such a graph can say is in it: the mot
 whose range and bearing were measured at once (``EDGE_SE2_XY``). Ranges or bearings alone, reads of tags and pixels are not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The particles of a run, as viewers show them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from factors.se2 import Array

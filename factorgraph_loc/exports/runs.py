@@ -1,7 +1,5 @@
 """Runs read back from the folders that ``fgloc run`` and ``fgloc compare`` write."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What viewers draw of a log, whatever the viewer: what is read or seen when, ellipses, images."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence

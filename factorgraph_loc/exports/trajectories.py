@@ -4,8 +4,6 @@ A row of KITTI is the upper three rows of a pose (4, 4), row by row: A. Geiger, 
 driving? The KITTI vision benchmark suite", CVPR 2012. The stamps are in a file of their own, one a row.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ All that comes from a file comes through here: only regular files are opened, as
 ends, and a size, be it the file's own or one that it declares, is compared with a limit before memory is taken for it.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """What every reader checks of its rows. What cannot be mended is an InputError with its row, the rest a line of warning."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 CSV with any separator, with a header or without, or JSON lines. Only text is read here; what it means is the caller's business.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The cells of a CSV with a header, and what is checked of any of them."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What the heads of images say, before anything is decoded."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Iterator

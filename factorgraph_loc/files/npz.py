@@ -1,7 +1,5 @@
 """Arrays of numbers in ``.npz`` files of numpy, without pickles; their declared sizes are checked before memory is taken."""
 
-from __future__ import annotations
-
 import io
 import math
 import zipfile

@@ -1,7 +1,5 @@
 """Parquet files, whose declared sizes are checked before polars unpacks them."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from pathlib import Path

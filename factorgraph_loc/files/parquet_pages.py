@@ -5,8 +5,6 @@ and takes the memory. So the footer and the heads of all pages are read here, in
 length of the file, with each other and with limits.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from factorgraph_loc.files.bounded import CELLS, DATA, RATIO, require_size

@@ -3,8 +3,6 @@
 libpng and libjpeg write there whatever OpenCV's log level is, and threads of polars that stumble over a page before they raise.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator

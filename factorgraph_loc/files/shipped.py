@@ -1,7 +1,5 @@
 """Where the manifests lie that ship with the project. Importable without numerical libraries, for the completion of shells."""
 
-from __future__ import annotations
-
 import sysconfig
 from pathlib import Path
 

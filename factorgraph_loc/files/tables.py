@@ -1,7 +1,5 @@
 """The tables of the native format: CSV with a header, or Parquet with the same columns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ the system lets go of when its process ends, however it ends. What nobody holds 
 folder begins.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re

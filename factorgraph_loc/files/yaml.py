@@ -4,8 +4,6 @@ What YAML 1.1 would make of plain texts besides is not wanted: ``on``, ``no`` an
 such as ``!!opencv-matrix`` is passed over. Aliases are refused: a small file of them may stand for gigabytes.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ half-quadratic regularization algorithms for computed imaging", 1994). Standard 
 correlated in any way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How well a share is known by counted trials."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

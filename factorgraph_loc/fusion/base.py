@@ -1,7 +1,5 @@
 """The interface that all estimators share, and what they report."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior

@@ -8,8 +8,6 @@ Where points that the map lacks are estimated, such a guess drifts too far to te
 smoother goes ahead: its graph is the problem, its estimates are the start.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated
 

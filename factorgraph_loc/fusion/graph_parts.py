@@ -1,7 +1,5 @@
 """What a graph estimator is made of: its settings, keyframes, what a measurement adds, and the trajectory between keyframes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated

@@ -6,8 +6,6 @@ they become a :class:`~factorgraph_loc.errors.RunFailedError` that names the est
 with the program itself (a name, a type, a key) is none of these, and passes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

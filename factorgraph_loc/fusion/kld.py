@@ -1,7 +1,5 @@
 """How many particles a density needs: KLD sampling (Fox, IJRR 22(12), 2003); and kernels as wide as befits their number."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

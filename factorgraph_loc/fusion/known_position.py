@@ -4,8 +4,6 @@ It is a Gaussian on the position, and uniform in the heading. Along the odometry
 pose, beside what is seen, and the place to look for hypotheses.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Cholesky loses half of the digits, and takes a long chain of dead reckoning for 
 "Matrix Computations", section 5.3). Where that fails too each variable is held by a share of its own information, the damping.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

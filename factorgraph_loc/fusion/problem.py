@@ -4,8 +4,6 @@ Levenberg-Marquardt in Python with GTSAM's sparse elimination: our factors are l
 because each callback from GTSAM would copy all of them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

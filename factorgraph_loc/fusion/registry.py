@@ -1,7 +1,5 @@
 """The estimators by name, and how one is made for a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 

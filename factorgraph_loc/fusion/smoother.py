@@ -5,8 +5,6 @@ that it left the window with. GTSAM's solvers are lost after any exception in an
 graph is also kept here, and the solver is rebuilt from it.
 """
 
-from __future__ import annotations
-
 import bisect
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence

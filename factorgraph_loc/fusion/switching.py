@@ -6,8 +6,6 @@ constants of the odometry which are uncertain count as noise in both. The final 
 (Rauch, Tung, Striebel, 1965), from what was believed at each time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Warnings about a whole log."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorgraph_loc.errors import InputError

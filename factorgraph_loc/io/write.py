@@ -1,7 +1,5 @@
 """A log into files: the native format, or a ROS bag where the name is one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Measurements from a running program: checked and copied, so that whoever made them may use the arrays again."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """What a :class:`~factorgraph_loc.live.localizer.Localizer` is made with and begins from, checked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

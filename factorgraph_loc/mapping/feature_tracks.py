@@ -4,8 +4,6 @@ Poses say where in another image a feature can be: near its epipolar line (Hartl
 chapter 9). Matching there alone keeps features that look alike apart, and finds more of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ to image; and a camera that moves on as it did. It is an offline smoother: later
 tells follows from points that well-placed neighbours share, so that images of places beside the map are located too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

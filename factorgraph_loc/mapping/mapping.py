@@ -11,8 +11,6 @@ alignment takes it away, so they are scaled by the variance of unit weight that 
 Hypothesis Testing in Linear Models", 1999).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ parallax, and points and cameras adjusted together. What is seen often enough an
 from a few sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

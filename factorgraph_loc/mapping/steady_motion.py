@@ -4,8 +4,6 @@ The change of velocity between two frames is white noise, as of the impulses of 
 29(6), 2007, section 3.4.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a log tells of its RFID tags: all looks of all antennas, and what is given of each tag beside its place."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

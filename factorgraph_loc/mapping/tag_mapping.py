@@ -3,8 +3,6 @@
 What is written is in the frame of the survey of the log's rig (``[survey]``), so that the map works with that rig as it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal

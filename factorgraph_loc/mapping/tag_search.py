@@ -7,8 +7,6 @@ two modes, and their weights say so. Weights are those of Laplace's method under
 A facing that matters to the model and is not known is tried in :data:`DIRECTIONS`, then between the best of them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

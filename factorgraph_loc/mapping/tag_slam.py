@@ -6,8 +6,6 @@ are searched along the way (:mod:`factorgraph_loc.mapping.tag_search`), and come
 reads. At the end all tags are searched once more along the whole way, and the problem is solved again where one lies elsewhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Where a robot can drive: cells of a grid that are free, distances to walls, and shortest paths over the cells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

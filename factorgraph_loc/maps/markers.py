@@ -1,7 +1,5 @@
 """Fiducial markers of a map: squares whose four corners a camera sees as points with names."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """Occupancy maps of ROS's map_server as walls: an image of cells and a YAML file that says what its greys mean."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """Lines of sight and walls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

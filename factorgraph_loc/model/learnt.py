@@ -1,7 +1,5 @@
 """What an estimator has estimated beside the poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

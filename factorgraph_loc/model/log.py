@@ -1,7 +1,5 @@
 """A logged run: rig, world, measurements by sensor, and the reference trajectory if there is one."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

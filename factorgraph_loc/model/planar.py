@@ -1,7 +1,5 @@
 """Poses in space laid onto the floor, and how the axes of a file or a sensor stand: what is lost that way is told."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What a run leaves behind: the causal estimates, the final trajectory, and what was counted and timed on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The rule by which runs are scored, and its one setting; light enough for what only plans runs."""
 
-from __future__ import annotations
-
 import math
 
 from factorgraph_loc.errors import InputError

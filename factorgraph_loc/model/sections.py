@@ -3,8 +3,6 @@
 Classes and functions are named by their places, ``package.module:name``, and loaded when they are first used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

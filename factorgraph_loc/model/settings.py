@@ -1,7 +1,5 @@
 """What the settings of all sensors have in common."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar, Self
 

@@ -1,7 +1,5 @@
 """Bounded numbers of what is simulated."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

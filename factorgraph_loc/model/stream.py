@@ -1,7 +1,5 @@
 """The rows of one sensor of a log."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace

@@ -1,7 +1,5 @@
 """How well a surveyed position is known."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import AfterValidator, Field

@@ -1,7 +1,5 @@
 """When a run tells its estimates: on a grid of 10 Hz from its start on, but not inside long gaps between measurements."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 

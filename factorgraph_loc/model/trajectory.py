@@ -1,7 +1,5 @@
 """Stamped planar poses with covariances; interpolation; the TUM text format."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bounded numbers of settings, with their units; the bounds are there to catch wrong units (degrees for radians, mm for m)."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

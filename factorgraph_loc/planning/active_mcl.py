@@ -12,8 +12,6 @@ number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(
 of them expects, all begin anew (after sensor resetting: Lenser, Veloso, ICRA 2000, which replaces a share).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What an active run was like: a robot that drives until it knows where it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

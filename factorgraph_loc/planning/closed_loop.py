@@ -1,7 +1,5 @@
 """A simulated robot that chooses where to drive until it knows where it is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

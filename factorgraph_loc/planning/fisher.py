@@ -5,8 +5,6 @@ give at the mean is added (van Trees, "Detection, Estimation, and Modulation The
 an efficient estimator reaches). No measurement is drawn. It holds while the sensors' models are nearly linear over the belief.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -9,8 +9,6 @@ Entropies are differential, in nats: of a Gaussian with the particles' covarianc
 while it has several.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -8,8 +8,6 @@ All are given the same ways, those of which the robot's proximity sensor finds t
 turned around yet that turn. What leads to places far off is left to those that compare.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

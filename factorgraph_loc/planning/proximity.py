@@ -5,8 +5,6 @@ different, whatever the tags. The lengths of one look are not as independent as 
 the walls' own shape are in error alike: each look counts as few (:data:`TEMPERING`).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

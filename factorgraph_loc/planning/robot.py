@@ -1,7 +1,5 @@
 """A simulated robot that drives as it is told, by its own odometry, and hears tags and sees landmarks on the way."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 

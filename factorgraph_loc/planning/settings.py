@@ -1,7 +1,5 @@
 """What may be set of an active run: the robot, when it knows its place, and how a policy chooses."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

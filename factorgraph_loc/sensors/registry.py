@@ -6,8 +6,6 @@ stand in :mod:`factorgraph_loc.builtin`. Another package registers one by an ent
 whose value is the place of its :class:`SensorType`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache

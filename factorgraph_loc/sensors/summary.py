@@ -1,7 +1,5 @@
 """What ``fgloc info`` says of a sensor, in the form in which each sensor's package says it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """How a run uses a sensor: what the sensors' packages are told of it, and what they make ready for it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from factorgraph_loc.files.models import FileModel

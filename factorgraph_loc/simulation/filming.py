@@ -1,7 +1,5 @@
 """The images that the camera of a simulated robot takes on its drive, one by one or as files of a log."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Nothing is copied from real pictures. All have what a detector of corners looks 
 colour at several scales; and no two are alike.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Floor plans: walls, furniture and shelves as segments, and the surfaces that tags are put on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -7,8 +7,6 @@ level whose texels are about as large as the step.
 What is called for each ray is inlined, as numba counts the references to arrays at each call, which would double the time.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Images of a building as a camera takes them: its lens, its exposure, its noise, and the blur of its motion."""
 
-from __future__ import annotations
-
 import math
 
 import gtsam

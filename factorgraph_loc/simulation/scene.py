@@ -4,8 +4,6 @@ A face is a rectangle above a segment in the plan, seen from the segment's left 
 Textures are kept with their halvings (mip levels; Williams, "Pyramidal parametrics", SIGGRAPH 1983).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A simulated log: world, drive, and what the sensors report, all of one seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The surfaces of a simulated building: what a wall, a piece of furniture, the floor and the ceiling look like."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

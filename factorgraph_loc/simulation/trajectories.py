@@ -1,7 +1,5 @@
 """Drives through free space: a robot that follows shortest paths between random places."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Worlds with tags, landmarks and points: what is put where on a floor plan."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorgraph_loc.errors import InputError

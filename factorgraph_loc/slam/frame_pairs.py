@@ -3,8 +3,6 @@
 No pixel counts twice: tracks of points of the map, of the graph, and of those that wait for it are left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

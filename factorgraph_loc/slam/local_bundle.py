@@ -5,8 +5,6 @@ seen from several keyframes tell their turns much better (bundle adjustment: Tri
 Adjustment, a Modern Synthesis", 2000). What comes out is a guess alone: the sightings enter the graph as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
 from itertools import pairwise
 

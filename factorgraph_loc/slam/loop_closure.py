@@ -8,8 +8,6 @@ from the track than that may have drifted. (Geometric verification and consisten
 Tardos, Neira, IEEE Transactions on Robotics 28(4), 2012.)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

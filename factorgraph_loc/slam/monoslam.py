@@ -10,8 +10,6 @@ is constant up to impulses. Points of the map are looked for where they are expe
 the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated

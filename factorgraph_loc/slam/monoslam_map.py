@@ -4,8 +4,6 @@ Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section II
 should be is deleted. Civera, Davison, Montiel, 2008: new points by inverse depth (:mod:`factors.camera.inverse_depth`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ Journal of Field Robotics 27(5), 2010). Here the corrected pixels come from the 
 are tried, none at random.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorgraph_loc.slam.monoslam_state import Innovation, Integers, Truths, squared

@@ -1,7 +1,5 @@
 """What the monoSLAM filter makes of an image: which pixels are which points, of the map or of its own state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress

@@ -1,7 +1,5 @@
 """What the points of a graph looked like when they were seen last."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

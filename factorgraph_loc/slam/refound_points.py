@@ -4,8 +4,6 @@ Of what is in view where they are predicted, inside the ellipse that pose and po
 nearer than the second (:func:`factorgraph_loc.vision.matching.match_guided`). Whether it is right the other points tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

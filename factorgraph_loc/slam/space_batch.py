@@ -7,8 +7,6 @@ guess; its causal estimates are not the batch's and are never ``localized``. Poi
 Levenberg-Marquardt in Python: the points' factors are linearised here, as :mod:`.problem` does, and GTSAM solves.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

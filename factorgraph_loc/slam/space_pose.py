@@ -1,7 +1,5 @@
 """Poses in space as planar estimates."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorgraph_loc.model.belief import PoseEstimate, SpacePose

@@ -6,8 +6,6 @@ factors too. A point whose pixels disagree :data:`STRIKES` times in a row is ano
 astray.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ wall hides; of what looks alike in its gate the clearly nearest is taken, and al
 of one look alike.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

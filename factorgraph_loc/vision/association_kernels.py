@@ -1,7 +1,5 @@
 """Compiled loops of :mod:`~factorgraph_loc.vision.association`: thousands of points of a map against hundreds of features."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

@@ -3,8 +3,6 @@
 Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5: what a Gaussian
 receptive field measures of a spectrum and of its first two derivatives, for a camera's colours."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

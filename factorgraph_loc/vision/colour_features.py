@@ -1,7 +1,5 @@
 """The paper's colour features behind the interface that all features share."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

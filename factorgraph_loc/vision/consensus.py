@@ -7,8 +7,6 @@ Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 20
 covariance of rank 3, and so has what is corrected.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -6,8 +6,6 @@ scales has a cross of its own size, as coarse structure is seen farther out. Alg
 Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor's wavelets: Daugman, J.
 Opt. Soc. Am. A 2(7), 1985."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

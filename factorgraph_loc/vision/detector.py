@@ -8,8 +8,6 @@ normalised Laplacian of Gaussian is largest (ibid., section 2.1). Direction: the
 scale waits (Brown, Szeliski, Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section
 2.1)."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

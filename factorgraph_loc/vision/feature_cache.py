@@ -3,8 +3,6 @@
 A cache may vanish, be full or be damaged at any time: then things are computed again, and nothing else happens.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

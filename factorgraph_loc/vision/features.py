@@ -3,8 +3,6 @@
 ``extractor("colour")``, ``extractor("sift")`` and ``extractor("orb")`` take and give the same, so that what uses
 features need not know which; a caller asks ``binary`` to choose between Hamming and Euclidean distance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -5,8 +5,6 @@ Each corner of a marker is a point with a name, so that nothing but the reprojec
 it is, is found by :mod:`factorgraph_loc.vision.marker_corners`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 
 import cv2

@@ -1,7 +1,5 @@
 """The features of one image as few bytes, to be sent between processes and kept in a file."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from typing import Any

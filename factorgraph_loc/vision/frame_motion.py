@@ -13,8 +13,6 @@ The information is that of Gaussian noise, to first order. Where the way is shor
 biased besides, as it is where all points lie in one plane: such motions are not told.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images as :mod:`factorgraph_loc.vision` takes them: checked once, then ``uint8``, grey or BGR as OpenCV has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

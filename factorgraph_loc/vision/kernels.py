@@ -4,8 +4,6 @@ each once.
 Everything is ``float32``, as half the memory is half the time.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -6,8 +6,6 @@ white ends if what is grey is counted by its share (Tabatabai, Mitchell, "Edge l
 1984, for moments).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -9,8 +9,6 @@ Distances are computed from products, whose rounding depends on the kernel of th
 resolution is 0, and of two whose distances differ by less neither is the nearest: matches do not depend on the
 processor."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

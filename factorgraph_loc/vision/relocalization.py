@@ -5,8 +5,6 @@ Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as OpenCV has it), and refined by all
 three values tell the pose: they are refined alone, and a camera that would float or tilt is not believed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Settings of the features that are found in images."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

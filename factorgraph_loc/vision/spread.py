@@ -1,7 +1,5 @@
 """A choice of pixels that is spread over an image: neighbours tell nearly the same."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ image, and the pairs together must obey one epipolar geometry: an essential matr
 a moving object too. What an image misses is looked for in the one before.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -5,8 +5,6 @@ Euclidean distance there is Mahalanobis distance of the values (within-class whi
 Statistical Pattern Recognition", 1990, section 10.2). ``scripts/learn_feature_weights`` makes the file that is
 shipped."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources

@@ -9,8 +9,6 @@ A point that is seen for the first time has no depth, but a Gaussian of the inve
 to infinity: such a point tells of the camera's turn at once, and of its shift when it has parallax.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from factors.camera.model import CameraModel, linearize_in_space, rays

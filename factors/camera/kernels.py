@@ -1,7 +1,5 @@
 """The arithmetic of :mod:`factors.camera.model`, compiled: one camera, many points or many poses."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -12,8 +12,6 @@ Points that are nearer than :data:`~factors.camera.kernels.NEAREST` or behind th
 seen far outside of the image: nothing throws, and every value is finite.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -4,8 +4,6 @@ Its error, Jacobians and loss are those of a free :class:`factors.camera.factor.
 constants, at a tenth of the time. Unlike that it throws where the point is behind the camera.
 """
 
-from __future__ import annotations
-
 import gtsam
 
 from factors.camera.model import CameraModel

@@ -5,8 +5,6 @@ is that of :mod:`factors.camera.factor`, and of the update of all sightings, in 
 (:mod:`factors.update`), for this one kind of factor.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ the distance times the cosine of the direction. The noise is Gaussian in its cor
 McClure levels off, jointly for range and bearing of one landmark.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

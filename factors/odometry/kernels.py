@@ -1,8 +1,6 @@
 """The compiled part of the odometry: each measurement asks for relative motion, and graphs linearise the factor tens of thousands
 of times a run."""
 
-from __future__ import annotations
-
 import math
 
 import numba

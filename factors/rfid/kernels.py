@@ -1,7 +1,5 @@
 """Compiled loops behind :mod:`factors.rfid.detection`: each is one pass over poses, antennas and tags."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -6,8 +6,6 @@ boresight, y to the left, z up) and of how it faces the antenna. The probability
 tags and reflections do, which is what makes the likelihood robust. The likelihood itself: :mod:`factors.rfid.detection`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A table holds the field of one antenna model at one height of tags, in cells of 
 has it. Tags are taken one by one, as all poses look at places of a tag's table that are close together.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

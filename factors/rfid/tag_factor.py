@@ -1,7 +1,5 @@
 """What RFID antennas read and did not read of one tag whose place is not known, as a factor on a pose and that place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

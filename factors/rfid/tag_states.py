@@ -16,8 +16,6 @@ the mixture is the plain likelihood. As E is tempered, so is what a silence tell
 The odds that enter a likelihood are those *before* the scan that it is of, so that no scan counts twice.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

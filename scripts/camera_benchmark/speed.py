@@ -153,8 +153,8 @@ def chained(job: Chain) -> Links:
             spent(Associator, "guided") as guided,
             spent(Associator, "relocalized") as relocalized,
         ):
-            settings = registry.settings_of(config.estimator, config.settings)
-            prepared = prepare(use_of(log, config.sensors or (), config.estimator, settings))
+            chosen = registry.settings_of(config.estimator, config.settings)
+            prepared = prepare(use_of(log, config.sensors or (), config.estimator, chosen))
             started = perf_counter()
             run(prepared.log, config)
             smooth = perf_counter() - started

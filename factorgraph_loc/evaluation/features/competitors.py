@@ -5,8 +5,6 @@ Harris-Laplace and Hessian-Laplace: Mikolajczyk, Schmid, "Scale & Affine Invaria
 Fast-Hessian: Bay, Tuytelaars, Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006, section 3. All take the luminance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol

@@ -7,8 +7,6 @@ average accuracy of the homography: Jin et al., "Image Matching across Wide Base
 at the image's corners.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Homographies between two images: mapping points and regions, and what they say about zoom, rotation and tilt."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65,
 ``H1to2p`` to ``H1toNp`` from the first image to each other one.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence as Several
 from dataclasses import dataclass

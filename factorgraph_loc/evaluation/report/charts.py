@@ -1,7 +1,5 @@
 """What the charts of the page show, as plain values for its script."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

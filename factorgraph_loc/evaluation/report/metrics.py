@@ -1,7 +1,5 @@
 """How scores are called, in which unit they are shown, and which is the better."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

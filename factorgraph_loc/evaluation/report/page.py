@@ -4,8 +4,6 @@ The page loads nothing: style, script and data are in it, and its policy forbids
 through unescaped could run. The same results give the same bytes.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Callable, Mapping, Sequence

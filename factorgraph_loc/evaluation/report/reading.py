@@ -1,7 +1,5 @@
 """What the page takes from the files of the runs: trajectories, errors, consistency, configurations."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

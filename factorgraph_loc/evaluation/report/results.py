@@ -1,7 +1,5 @@
 """The rows of an experiment, by what was run (a variant: label, sensors, swept settings) and on which log."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """What came out, in words that the tables and charts of the page can be checked against."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from factorgraph_loc.drawing.markup import Html, join, tag

@@ -1,7 +1,5 @@
 """The tables of the page. Nothing stands in them without what says how sure it is: an interval, a range, or a count."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from statistics import median

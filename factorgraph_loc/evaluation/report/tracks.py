@@ -1,7 +1,5 @@
 """Trajectories and errors of runs, thinned out and packed as small integers, so that hundreds fit on a page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Compressed images are written as they are, others as PGM or PPM, whose pixels are those of the message.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 from collections.abc import Callable

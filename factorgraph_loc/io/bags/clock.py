@@ -1,7 +1,5 @@
 """Which clock stamps the messages of a bag: that of their headers, set where they were measured, or that of the recorder."""
 
-from __future__ import annotations
-
 from array import array
 from typing import Any, Literal
 

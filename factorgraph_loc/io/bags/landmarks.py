@@ -1,7 +1,5 @@
 """Identified landmarks in a bag: markers that a detector found with their poses or their corners, or any message by a mapping."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """A manifest for a bag, proposed from its topics: which of them is which sensor, by the type of messages and by usual names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The messages that our own logs become in a bag: those of ROS where it has one for the purpose, and three of our own."""
 
-from __future__ import annotations
-
 LANDMARK = "factorgraph_loc_msgs/msg/LandmarkSighting"
 PIXEL = "factorgraph_loc_msgs/msg/PixelSighting"
 ROUND = "factorgraph_loc_msgs/msg/RfidRound"

@@ -1,7 +1,5 @@
 """How the robot moved, by what a bag holds of it: poses or velocities of odometry, angles of wheels, the gyro of an IMU."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import numpy as np

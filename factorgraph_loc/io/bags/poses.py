@@ -1,7 +1,5 @@
 """Poses in a bag: those of odometry, and the reference that estimates are scored against."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from operator import attrgetter
 from typing import Any

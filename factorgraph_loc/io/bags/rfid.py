@@ -1,7 +1,5 @@
 """Reads of RFID tags in a bag, from messages of any type by a mapping of fields."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal

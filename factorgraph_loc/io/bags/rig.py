@@ -1,7 +1,5 @@
 """What a bag itself tells of the robot: its camera, and where camera and antennas sit. The rest is as of a robot not known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

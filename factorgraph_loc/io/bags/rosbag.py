@@ -3,8 +3,6 @@
 The bag is read once, as a stream; of its messages only the numbers that a log needs are kept, and images go to files.
 """
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path

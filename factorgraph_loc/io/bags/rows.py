@@ -1,7 +1,5 @@
 """What is gathered of a topic while its bag is read: stamps and numbers, eight bytes each, not messages."""
 
-from __future__ import annotations
-
 from array import array
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rig of a log that brings none."""
 
-from __future__ import annotations
-
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 

@@ -1,7 +1,5 @@
 """Our own format: a folder with ``run.toml``, a CSV or Parquet table per sensor, and ``reference.tum``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

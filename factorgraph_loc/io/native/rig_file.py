@@ -1,7 +1,5 @@
 """Reading and writing ``NAME.rig.toml``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from factorgraph_loc.files.models import parse_model, read_toml, write_toml

@@ -1,7 +1,5 @@
 """Reading and writing ``NAME.world.toml``, with the tables beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

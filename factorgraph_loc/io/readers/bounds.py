@@ -3,8 +3,6 @@
 Readers name the file and the row of what they can tell; what comes out of several rows, or of a format of others, is found here.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

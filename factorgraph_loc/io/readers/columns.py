@@ -1,7 +1,5 @@
 """Text files of numbers in columns between blanks, with lines of comment."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

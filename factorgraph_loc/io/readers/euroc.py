@@ -6,8 +6,6 @@ sits on the body, whose pose is in ``mav0/state_groundtruth_estimate0/data.csv``
 not stand upright, so that it is no turn rate of a robot on a floor, and is not read.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -4,8 +4,6 @@ The folder holds ``sequences/NN`` with ``times.txt``, ``calib.txt`` and ``image_
 is camera 0, x ahead: the poses are its own.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """From what a user names to logs: a manifest, a folder in our own format, a shipped name, or any path with its reader."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping

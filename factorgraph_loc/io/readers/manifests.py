@@ -1,7 +1,5 @@
 """The data sets that ship with the project, each described by a manifest ``NAME.toml``."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Mapping

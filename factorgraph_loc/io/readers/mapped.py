@@ -1,7 +1,5 @@
 """A folder of tables that other programs wrote, each by a mapping of its columns: what a manifest says in place of a program."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

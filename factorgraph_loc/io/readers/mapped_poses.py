@@ -1,7 +1,5 @@
 """Odometry and references by a mapping of columns: velocities, motions, poses or the ways of two wheels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

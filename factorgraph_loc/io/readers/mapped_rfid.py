@@ -1,7 +1,5 @@
 """Reads of RFID tags as readers and their tools log them: CSV or JSON lines by a mapping of columns, with presets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal

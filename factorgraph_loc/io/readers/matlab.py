@@ -4,8 +4,6 @@ The format is that of "MAT-File Format" (The MathWorks, 2019), level 5. It is re
 the process at some damaged files.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """The motion between poses of odometry, and between counts of encoders: both may begin anew in the middle of a log."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factors import se2

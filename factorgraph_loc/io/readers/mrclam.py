@@ -3,8 +3,6 @@
 Landmarks are named by their subject number, which the sightings give as a barcode number.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The Plaza sets (Djugash, Hamner, Roth, JFR 26(9), 2009) as the gtsam wheel ships them: odometry and ranges to beacons."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The log formats by name: modules with a model of their ``Options``, and ``read(path, options)``, which makes the log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ The poses of a run are a reference, not odometry, which is therefore simulated f
 :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -7,8 +7,6 @@ are missing, so they get a nominal rate. The ``camera-intrinsics.txt`` that lies
 is not read.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Poses in space as data sets write them: quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's; and lists of images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -8,8 +8,6 @@ the right of it. ``y_k_j`` (4, N, 20) [px] are u and v in the left and in the ri
 ``v_vk_vk_i``, ``w_vk_vk_i`` (3, N) are velocity and turn rate in the vehicle's frame.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

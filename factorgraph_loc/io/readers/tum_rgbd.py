@@ -1,8 +1,6 @@
 """TUM RGB-D: colour images of a camera in the hand, listed in ``rgb.txt``, and its true poses in ``groundtruth.txt`` (Sturm et
 al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). Depth images and the accelerometer are not read."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The University of Toronto's "Lost in the Woods" (``dataset2.mat``): wheel odometry and a laser that sees known trunks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

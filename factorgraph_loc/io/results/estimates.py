@@ -1,7 +1,5 @@
 """Trajectories in the table of a run."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

@@ -1,7 +1,5 @@
 """The files of a result folder."""
 
-from __future__ import annotations
-
 FILES = (
     "final.tum",
     "causal.tum",

@@ -4,8 +4,6 @@ What is kept is named by a hash of an image's bytes, of what is looked for, and 
 a changed feature is another name, and the same image in two logs is one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Features and tracks of images that come one after the other, as :mod:`.frontend` and :mod:`.tracks` find those of a log."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Sightings of markers in the images of a log."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import replace

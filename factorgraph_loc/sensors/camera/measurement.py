@@ -1,7 +1,5 @@
 """Identified points in an image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

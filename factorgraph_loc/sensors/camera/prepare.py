@@ -1,7 +1,5 @@
 """What is done with a log's images before an estimator runs: their features are found, or they are set aside."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter

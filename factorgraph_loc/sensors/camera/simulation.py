@@ -1,7 +1,5 @@
 """Pixels of named points in sight, drawn from the camera's model without any image."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is simulated of identified points in images."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The rows of cameras: identified points, images and their features."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a log's images and identified pixels hold, and what looks wrong with them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Images are not opened here: whether they can be decoded, and have the size that 
 where their features are looked for (:mod:`factorgraph_loc.sensors.camera.frontend`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a run can do with landmarks, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@
 The sightings of one look are as one with the mean of all, of less noise. Landmarks that are not seen tell nothing.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

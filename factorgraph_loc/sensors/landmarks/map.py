@@ -1,7 +1,5 @@
 """Landmarks of the map."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a sensor of identified landmarks reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Whether a track is lost: told by the innovations of the landmarks."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factors import positive

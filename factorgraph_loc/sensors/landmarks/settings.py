@@ -1,7 +1,5 @@
 """Settings of a sensor of identified landmarks in the rig."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Range and bearing of landmarks in sight, drawn from the model of a rig."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What is simulated of a sensor of landmarks."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

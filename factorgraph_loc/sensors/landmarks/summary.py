@@ -6,8 +6,6 @@ lies far from that is a suspect. Sightings are also compared with where the refe
 time.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What wheel odometry and gyro report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The motion model of a rig."""
 
-from __future__ import annotations
-
 import math
 
 from factorgraph_loc.model.rig import Rig

@@ -1,7 +1,5 @@
 """Settings of wheel odometry and gyro in the rig."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar
 
 from pydantic import Field

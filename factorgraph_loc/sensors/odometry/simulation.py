@@ -3,8 +3,6 @@
 Results with it must say that it was simulated: its errors are those of the model below, not of wheels.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Turn rates (of a reference without heading: speeds) are compared at shifts of time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a run can do with RFID tags, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 from factorgraph_loc.model.diagnostics import Diagnostics

@@ -7,8 +7,6 @@ few: log p(z | x) = sum of log(1 - q) over everything in reach + sum of logit(q)
 the floor of false reads says, so that a tag beyond reach counts nothing. False reads of tags beyond reach are not drawn.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

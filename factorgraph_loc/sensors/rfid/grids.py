@@ -1,7 +1,5 @@
 """Learnt detection grids on disk: ``.npz`` without pickles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inventory rounds of RFID antennas, as all estimators take them in."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

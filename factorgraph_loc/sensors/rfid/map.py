@@ -1,7 +1,5 @@
 """RFID tags of the map, and their tables."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

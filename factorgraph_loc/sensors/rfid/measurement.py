@@ -1,7 +1,5 @@
 """What an RFID reader reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

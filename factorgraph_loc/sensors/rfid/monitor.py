@@ -1,7 +1,5 @@
 """Whether a track is lost: told by what RFID antennas read and did not read."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

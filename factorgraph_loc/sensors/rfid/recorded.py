@@ -4,8 +4,6 @@ What that keeps of a real antenna: its pattern, and that misses last while the r
 places of the virtual world, that several antennas miss one tag at once, and anything that depends on pitch.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

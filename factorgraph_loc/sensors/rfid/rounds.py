@@ -3,8 +3,6 @@
 What a round did not read is as telling as what it did, so a read must not fall into a wrong one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scans of RFID tags that wait on the newest keyframe of a graph until the next one comes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Strength and phase of RFID reads, as all estimators take them in."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What comes with a read: its phase and how strong it was."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorgraph_loc.sensors.rfid.settings import RfidSettings

@@ -1,7 +1,5 @@
 """Tag reads, drawn from the detection model of a rig, and what may go wrong with them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

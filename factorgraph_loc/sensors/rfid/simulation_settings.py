@@ -1,7 +1,5 @@
 """What is simulated of an RFID reader, and its faults."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import ConfigDict, Field

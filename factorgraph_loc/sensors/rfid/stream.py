@@ -1,7 +1,5 @@
 """The rows of an RFID reader."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

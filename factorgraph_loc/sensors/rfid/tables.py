@@ -4,8 +4,6 @@ A read belongs to the round of its antenna that holds its stamp, or to the one t
 are found from the gaps between reads; then a round that read nothing is not known of.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The tags of a map as arrays, in the world's frame."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Measured motion in space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Settings of measured motion in space in the rig."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The rows of measured motion in space."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar

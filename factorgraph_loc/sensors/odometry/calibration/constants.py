@@ -1,7 +1,5 @@
 """Constants of the wheels' odometry, from the relative motion of the reference over short windows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

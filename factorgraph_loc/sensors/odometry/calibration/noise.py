@@ -5,8 +5,6 @@ non-negative variance components (Searle, Casella, McCulloch, "Variance Componen
 lengths tell errors that grow from those of the reference, which do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Which model of detection predicts best what it was not fitted to."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

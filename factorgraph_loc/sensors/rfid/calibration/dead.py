@@ -5,8 +5,6 @@ tells little. The share is the maximum of the posterior of a mixture, by EM (Dem
 prior that is worth :data:`PRIOR_TAGS` tags of the usual share: a few logs of a few tags move it little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

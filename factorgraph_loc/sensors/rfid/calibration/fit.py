@@ -4,8 +4,6 @@ A logit that is linear in its parameters is fitted by Fisher scoring (McCullagh 
 section 2.5), with the derivatives of the likelihood with its floor; steps that do not help are halved.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ What is learnt is how the field differs from a parametric one: smoothly, by a pe
 Between knots the logits are interpolated as :mod:`factors.rfid.model` does it, so that what is fitted is what is used.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

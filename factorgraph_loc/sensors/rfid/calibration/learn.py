@@ -1,7 +1,5 @@
 """What logs with reference poses tell about RFID: survey, mounting, the model of detection, doubtful tags."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Fisher scoring of the likelihood of all reads along the reference. Standard erro
 and Zeger, "Longitudinal data analysis using generalized linear models", 1986): reads within a block of time go together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

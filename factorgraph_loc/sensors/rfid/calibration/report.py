@@ -1,7 +1,5 @@
 """What a calibration tells about RFID, as tables and plain values."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from factorgraph_loc.model.rig import Rig

@@ -1,7 +1,5 @@
 """How strong reads are received, learnt from logs with a reference: see :mod:`factors.rfid.strength`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

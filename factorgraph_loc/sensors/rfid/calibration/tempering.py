@@ -5,8 +5,6 @@ windows of time it has more: by so much the likelihood is too sure (Varin, Reid 
 methods", Statistica Sinica 21, 2011, section 2.2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
