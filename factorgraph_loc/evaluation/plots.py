@@ -15,7 +15,7 @@ from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.marks import marks
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -86,13 +86,10 @@ def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Causal and final trajectories over walls, tags, landmarks and reference; the view is that of the map and the reference.
-
-    Tags are where the estimators take them to be: moved by what the rig knows of their survey.
-    """
-    landmarks, walls = log.world.positions(), np.array(log.world.walls).reshape(-1, 2, 2)
-    tags = tag_map(log.world, log.rig.survey).tags.points[:, :2]
-    view = _view(np.concatenate((landmarks, tags, walls.reshape(-1, 2))), log.reference)
+    """Causal and final trajectories over walls, what sensors draw of the map, and reference; the view is that of the map and the
+    reference."""
+    walls, layers = np.array(log.world.walls).reshape(-1, 2, 2), [m for m in marks(log) if not m.dense]
+    view = _view(np.concatenate((*(m.positions[:, :2] for m in layers), walls.reshape(-1, 2))), log.reference)
     height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
@@ -100,10 +97,10 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
             axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
         if len(walls):
             axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
-        if len(tags):
-            axis.plot(*tags.T, "ks", markersize=5, markerfacecolor="none", label="tags", zorder=2)
-        if len(landmarks):
-            axis.plot(*landmarks.T, "k^", markersize=7, markerfacecolor="none", label="landmarks", zorder=4)
+        for m in sorted(layers, key=lambda m: m.order):
+            if len(m.positions):
+                look: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
+                axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **look)
         for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
             kind, trajectory = track.kinds()[i]
             if trajectory is not None:

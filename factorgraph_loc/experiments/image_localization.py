@@ -21,7 +21,7 @@ from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, ma
 from factorgraph_loc.mapping.triangulation import Cameras
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.camera.prepare import frames_of
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
@@ -192,15 +192,12 @@ def picture(log: str, results: ImageResults) -> Figure:
 
 def _check(log: Log, seen: Log, posed: PosedFrames, numbers: Mapping[str, Sequence[int]]) -> None:
     """InputError for numbers that no image has, or images without a pose."""
-    stream = seen.streams["camera"]
-    assert isinstance(stream, FeatureStream)
-    if len(posed.frames) != len(stream.t):
-        raise InputError(f"{log.name}: {len(stream.t) - len(posed.frames)} of {len(stream.t)} images have no pose")
+    count = len(frames_of(seen)[0])
+    if len(posed.frames) != count:
+        raise InputError(f"{log.name}: {count - len(posed.frames)} of {count} images have no pose")
     for name, wanted in numbers.items():
-        if not wanted or min(wanted) < 0 or max(wanted) >= len(stream.t):
-            raise InputError(
-                f"{log.name}: {name} asks for images {_span(wanted)}, expected some of 0 to {len(stream.t) - 1}"
-            )
+        if not wanted or min(wanted) < 0 or max(wanted) >= count:
+            raise InputError(f"{log.name}: {name} asks for images {_span(wanted)}, expected some of 0 to {count - 1}")
 
 
 def _span(wanted: Sequence[int]) -> str:

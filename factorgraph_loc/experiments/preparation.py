@@ -11,7 +11,7 @@ from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.registry import channels, functions
+from factorgraph_loc.sensors.registry import channels, functions, moving
 from factorgraph_loc.sensors.usage import Prepared, Use
 from factorgraph_loc.text import listed, quoted
 
@@ -46,11 +46,6 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     return sensors
 
 
-def moves(sensors: Iterable[str], *motions: str) -> bool:
-    """Whether one of ``sensors`` tells how the robot moves: on the ``floor``, or in ``space``."""
-    return any(channels()[name].motion in motions for name in sensors if name in channels())
-
-
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     """What the rig lists and cannot be used, and that nothing tells how the robot moves."""
     there = (*log.streams, *_told_columns(log))
@@ -59,7 +54,7 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
         doubts.append(f"{log.name}: {names} left out, as the rig {log.rig.name} has no [{section}]")
-    if not moves(sensors, "floor", "space"):
+    if not moving(sensors, "floor", "space"):
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
 

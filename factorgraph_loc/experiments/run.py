@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
-from factorgraph_loc.experiments.preparation import moves, prepare, unused, use_of, used_sensors
+from factorgraph_loc.experiments.preparation import prepare, unused, use_of, used_sensors
 from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
@@ -29,7 +29,7 @@ from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.registry import functions, moving
 from factorgraph_loc.sensors.usage import Prepared
 from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
@@ -90,7 +90,7 @@ def run(
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
         estimator = registry.create(config.estimator, setup, settings)
-    if not moves(log.streams, "floor") and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
+    if not moving(log.streams, "floor") and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
             f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
             f"expected one of {', '.join(registry.in_space())}"

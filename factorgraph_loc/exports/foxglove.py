@@ -23,6 +23,7 @@ from factorgraph_loc.exports.scene import DARK, LIT, SEEN, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera import draw
 from factors.se2 import Array
 
 WORLD = "world"
@@ -107,8 +108,8 @@ def _stamped(content: Mapping[str, Any], ns: int) -> dict[str, Any]:
 def _streams(log: Log, runs: Sequence[StoredRun], start: float) -> Iterator[Iterator[Message]]:
     """All messages, in streams that are ordered by time each."""
     yield iter([Message(start, "/map", "foxglove.SceneUpdate", _map(log))])
-    yield _lamps("/tags", scene.tag_positions(log), scene.read_tags(log))
-    yield _lamps("/landmarks", scene.landmark_positions(log), scene.seen_landmarks(log))
+    for marks, positions, lights in scene.layers(log):
+        yield _lamps(f"/{marks.layer}", positions, lights)
     yield _images(log)
     yield _sightings(log)
     if log.reference is not None:
@@ -127,9 +128,9 @@ def _streams(log: Log, runs: Sequence[StoredRun], start: float) -> Iterator[Iter
 def _map(log: Log) -> dict[str, Any]:
     walls = np.array(log.world.walls).reshape(-1, 2)
     entities = [_entity("walls", lines=[_line(walls, DARK, LIST)])] if len(walls) else []
-    for what, positions in (("tags", scene.tag_positions(log)), ("landmarks", scene.landmark_positions(log))):
-        if positions:
-            entities.append(_entity(what, **_marks(positions, DARK, MARK)))
+    for marks, positions, _ in scene.layers(log):
+        if positions and not marks.dense:
+            entities.append(_entity(marks.layer, **_marks(positions, DARK, MARK)))
     return _update(entities)
 
 
@@ -201,13 +202,13 @@ def _learnt(run: StoredRun, colour: Colour, start: float) -> Message:
 
 
 def _images(log: Log) -> Iterator[Message]:
-    for t, jpeg in scene.images(log):
+    for t, jpeg in draw.images(log):
         content = {"frame_id": "camera", "data": base64.b64encode(jpeg).decode(), "format": "jpeg"}
         yield Message(t, "/camera/image", "foxglove.CompressedImage", content)
 
 
 def _sightings(log: Log) -> Iterator[Message]:
-    for t, names, pixels in scene.sightings(log):
+    for t, names, pixels in draw.sightings(log):
         places = [{"x": u, "y": v} for u, v in pixels.tolist()]
         colour = _colour(SEEN)
         points = {

@@ -5,7 +5,6 @@ the formats of its types ``slam2d``. What such a graph can say is in it: the mot
 whose range and bearing were measured at once (``EDGE_SE2_XY``). Ranges or bearings alone, reads of tags and pixels are not.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,21 +14,17 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.stream import SEEN
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.landmarks.located import located_landmarks
+from factorgraph_loc.sensors.odometry.whole import whole_motion
+from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import listed
-from factors.landmarks.model import located, sigmas
 from factors.motion import Increment
 from factors.se2 import Array
 
 LEAST = 1e-12  # m^2 or rad^2: the least variance of an edge, as no information is infinite
-STEP = 1e-6  # m or rad, of numerical derivatives
 
 
 @dataclass(frozen=True)
@@ -63,24 +58,26 @@ def pose_graph(
     ``sensors``: which of the log's streams are used. Landmarks are those of the map, or, where it has none, those ``learnt``.
     InputError without two poses, or if the log does not say how the robot moved.
     """
-    moving = [s for s, stream in log.streams.items() if s in sensors and stream.rank < SEEN]
-    if "odometry" not in moving:
+    used = [name for name in log.streams if name in sensors]
+    if not moving(used, "floor"):
         raise InputError(
             f"{log.name}: has no odometry among {listed(sensors)}, expected it for the edges of a pose graph"
         )
     landmarks = {name: np.array((mark.x, mark.y)) for name, mark in log.world.landmarks.items()}
     if not landmarks:
         landmarks = {name: point.position for name, point in (learnt or {}).items()}
-    seen = _seen(log, landmarks) if "bearing_range" in sensors and len(trajectory) else []
-    seen = [s for s in seen if trajectory.t[0] <= s[0] <= trajectory.t[-1]]
-    t = np.unique(np.concatenate((trajectory.t, [at for at, *_ in seen])))
+    seen = located_landmarks(log, sensors, landmarks) if len(trajectory) else []
+    seen = [s for s in seen if trajectory.t[0] <= s.t <= trajectory.t[-1]]
+    t = np.unique(np.concatenate((trajectory.t, [s.t for s in seen])))
     if len(t) < 2:
         raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
     index = {at: i for i, at in enumerate(t.tolist())}
     sightings = tuple(Sighting(index[at], name, point, covariance) for at, name, point, covariance in seen)
-    found = {name for _, name, _, _ in seen}
+    found = {s.landmark for s in seen}
     landmarks = {name: place for name, place in landmarks.items() if name in found}
-    return PoseGraph(t, trajectory.at(t), _motions(log, moving, t), landmarks, bool(log.world.landmarks), sightings)
+    motion = whole_motion(log, moving(used, "floor", "turn"))
+    motions = tuple(motion.relative(a, b) for a, b in pairwise([motion.state(at) for at in t.tolist()]))
+    return PoseGraph(t, trajectory.at(t), motions, landmarks, bool(log.world.landmarks), sightings)
 
 
 def write_g2o(graph: PoseGraph, path: Path) -> None:
@@ -98,35 +95,6 @@ def write_g2o(graph: PoseGraph, path: Path) -> None:
         write_text(path, "\n".join(lines) + "\n")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _motions(log: Log, moving: Sequence[str], t: Array) -> tuple[Increment, ...]:
-    motion = Motion(log.rig, tuple(moving), Diagnostics())
-    motion.keep(math.inf)
-    for m in log.measurements(moving):
-        if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
-            motion.add(m)
-    states = [motion.state(at) for at in t.tolist()]
-    return tuple(motion.relative(a, b) for a, b in pairwise(states))
-
-
-def _seen(log: Log, landmarks: Mapping[str, Array]) -> list[tuple[float, str, Array, Array]]:
-    """Time, name, place in the robot's frame and its covariance, of the landmarks whose range and bearing were measured."""
-    stream, settings = log.streams.get("bearing_range"), log.rig.bearing_range
-    if not isinstance(stream, BearingRangeStream) or settings is None:
-        return []
-    model = settings.model()
-    whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
-    rows = [i for i in whole.tolist() if stream.landmark[i] in landmarks]
-    ranges, bearings = stream.range[rows], stream.bearing[rows]
-    points = located(model, ranges, bearings)
-    spreads = sigmas(model, ranges)
-    t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
-    by_range = (located(model, ranges + STEP, bearings) - points) / STEP
-    by_bearing = (located(model, ranges, bearings + STEP) - points) / STEP
-    jacobians = np.stack((by_range, by_bearing), axis=-1) * spreads[:, None, :]
-    covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
-    return [(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]
 
 
 def _numbers(values: Array) -> str:

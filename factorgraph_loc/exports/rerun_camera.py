@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import LIT, SEEN
+from factorgraph_loc.exports.scene import GAP, LIT, SEEN
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera import draw
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
@@ -31,7 +31,7 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
     import rerun as rr  # noqa: PLC0415
 
     settings = log.rig.camera
-    if settings is None or not has_pictures(log):
+    if settings is None or not draw.has_pictures(log):
         return
     model, at, poses = settings.model(), camera_path(log, runs), _carrier(log, runs)
     if at != CAMERA:
@@ -44,14 +44,14 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
         image_plane_distance=FRUSTUM,
     )
     recording.log(at, lens, static=True)
-    for some in _batches(scene.images(log)):
+    for some in _batches(draw.images(log)):
         _pictures(recording, f"{at}/image", some)
         if log.world.points is not None and poses is not None:
             t = np.array([t for t, _ in some])
-            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=scene.GAP)]
+            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
             _pixels_over_time(recording, f"{at}/image/map", t, expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
-    seen = list(scene.sightings(log))
+    seen = list(draw.sightings(log))
     if seen:
         labels = [name for _, names, _ in seen for name in names]
         t = np.array([t for t, _, _ in seen])
@@ -90,11 +90,6 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
     pixels, depths = reprojection.predict(model, pose, points)
     visible = np.flatnonzero((depths > 0.0) & model.contains(pixels))
     return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
-
-
-def has_pictures(log: Log) -> bool:
-    """Whether the log holds images, or points that were identified in some."""
-    return "camera" in log.streams or "sightings" in log.streams
 
 
 def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:

@@ -20,13 +20,14 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.particles import Particles
-from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, has_pictures, record_camera, times
+from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.camera.draw import has_pictures
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -94,17 +95,19 @@ def _record(
 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
-    """Walls, landmarks, tags and points; and which landmarks and tags are lit when."""
+    """Walls, and what sensors find in the map: landmarks, tags, points; and which of it is lit when."""
     import rerun as rr  # noqa: PLC0415
 
     if log.world.walls:
         walls = np.array(log.world.walls).reshape(-1, 2, 2)
         lines = np.concatenate((walls, np.zeros((len(walls), 2, 1))), axis=2)
         recording.log(f"{WORLD}/walls", rr.LineStrips3D(lines, radii=LINE, colors=DARK), static=True)
-    if log.world.points is not None:
-        recording.log(f"{WORLD}/points", rr.Points3D(log.world.points.positions, radii=LINE, colors=DARK), static=True)
-    _lamps(recording, "tags", scene.tag_positions(log), scene.read_tags(log))
-    _lamps(recording, "landmarks", scene.landmark_positions(log), scene.seen_landmarks(log))
+    for marks, positions, lights in scene.layers(log):
+        if not marks.dense:
+            _lamps(recording, marks.layer, positions, lights)
+        elif positions:
+            dots = rr.Points3D(marks.positions, radii=LINE, colors=DARK)
+            recording.log(f"{WORLD}/{marks.layer}", dots, static=True)
 
 
 def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Array], lights: scene.Lights) -> None:
@@ -257,7 +260,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
     """The middle (2,) of all that is drawn, and its larger side [m]; at least 5, not to look at a small scene from within."""
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
-    parts += [p[None, :2] for p in (*scene.tag_positions(log).values(), *scene.landmark_positions(log).values())]
+    parts += [marks.positions[:, :2] for marks, _, _ in scene.layers(log) if not marks.dense]
     if log.reference is not None:
         parts.append(log.reference.poses[:, :2])
     if log.reference3 is not None:

@@ -1,31 +1,22 @@
-"""What viewers draw of a log, whatever the viewer: what is read or seen when, ellipses, images."""
+"""What viewers draw of a log, whatever the viewer: what is read or seen when, ellipses, paths."""
 
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 
 from factorgraph_loc.drawing import figures as drawing_figures
-from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factorgraph_loc.vision.images import decoded
+from factorgraph_loc.sensors.marks import Marks, marks
 from factors.se2 import Array
 
 LIT_FOR = 0.5  # s that a tag or landmark stays lit after it was read or seen
 GAP = 1.0  # s between poses, above which nothing is said of the way between them
 CORNERS = 32  # of an ellipse
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # sigmas at which a Gaussian of two dimensions holds 95 %
-JPEG_QUALITY = 90
 Colour = tuple[int, int, int]  # red, green, blue of 255
 REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
@@ -47,33 +38,11 @@ def colours() -> Iterator[Colour]:
         yield red, green, blue
 
 
-def read_tags(log: Log) -> Lights:
-    """The tags that are read, each for :data:`LIT_FOR` seconds from when the antenna had it."""
-    stream = log.streams.get("rfid")
-    if not isinstance(stream, RfidStream):
-        return _lights((), ())
-    t = stream.t - stream.age + log.rig.time_offset("rfid")
-    rows = [i for i, epc in enumerate(stream.epc) if epc]
-    return _lights(t[rows].tolist(), [stream.epc[i] for i in rows])
-
-
-def seen_landmarks(log: Log) -> Lights:
-    """The landmarks whose range or bearing is measured, each for :data:`LIT_FOR` seconds."""
-    stream = log.streams.get("bearing_range")
-    if not isinstance(stream, BearingRangeStream):
-        return _lights((), ())
-    return _lights((stream.t + log.rig.time_offset("bearing_range")).tolist(), stream.landmark)
-
-
-def tag_positions(log: Log) -> dict[str, Array]:
-    """Where the tags of the map are (3,) [m], by EPC, the survey's errors corrected as the rig knows them."""
-    known = tag_map(log.world, log.rig.survey)
-    return dict(zip(known.names, known.tags.points, strict=True))
-
-
-def landmark_positions(log: Log) -> dict[str, Array]:
-    """Where the landmarks of the map are (3,) [m], on the floor."""
-    return {name: np.array((mark.x, mark.y, 0.0)) for name, mark in log.world.landmarks.items()}
+def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
+    """What sensors draw of a log and its map, layer by layer: where each thing is (3,) [m], and when it is lit, each for
+    :data:`LIT_FOR` seconds from when it is read or seen."""
+    found = sorted(marks(log), key=lambda one: one.order)
+    return [(one, dict(zip(one.names, one.positions, strict=True)), _lights(one.t.tolist(), one.seen)) for one in found]
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
@@ -93,33 +62,6 @@ def outlines(centres: Array, covariances: Array) -> Array:
     variances, axes = np.linalg.eigh(covariances)
     lengths = SCALE_95 * np.sqrt(np.maximum(variances, 0.0))
     return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
-
-
-def images(log: Log) -> Iterator[tuple[float, bytes]]:
-    """Time and JPEG of each image of the camera; InputError names one that cannot be read."""
-    stream = log.streams.get("camera")
-    if not isinstance(stream, ImageStream):
-        return
-    for t, file in zip((stream.t + log.rig.time_offset("camera")).tolist(), stream.file, strict=True):
-        yield t, _jpeg(Path(file))
-
-
-def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
-    """Time, names (K) and pixels (K, 2) of the identified points in each image."""
-    stream = log.streams.get("sightings")
-    if not isinstance(stream, SightingStream):
-        return
-    for seen in stream.measurements(log.rig.time_offset("sightings")):
-        assert isinstance(seen, PixelSightings)
-        yield seen.t, seen.points, seen.pixels
-
-
-def _jpeg(file: Path) -> bytes:
-    content = read_bytes(file, IMAGE)
-    if content.startswith(b"\xff\xd8"):
-        return content
-    picture = decoded(content, file, cv2.IMREAD_COLOR)
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:

@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.mapping.triangulation import Cameras, Integers
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.camera.prepare import frames_of
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
 from factors.se2 import Array
@@ -40,13 +40,10 @@ def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames
     covariances. Frames that lie outside of the reference or in its gaps are left out. InputError where a camera, features or a
     reference are missing, or nothing is left.
     """
-    stream = log.streams.get("camera")
-    if not isinstance(stream, FeatureStream):
-        raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+    t, found = frames_of(log)
     if log.rig.camera is None:
         raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
     model = log.rig.camera.model()
-    t = stream.t + log.rig.time_offset("camera")
     usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
     if log.reference3 is not None:
         inside = (t >= log.reference3.t[0]) & (t <= log.reference3.t[-1])
@@ -59,9 +56,9 @@ def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames
         cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
     else:
         raise InputError(f"{log.name}: has no reference with headings that says where its images were taken")
-    frames = [frame for frame, keep in zip(stream.frame, inside.tolist(), strict=True) if keep]
+    frames = [frame for frame, keep in zip(found, inside.tolist(), strict=True) if keep]
     if not any(len(frame.pixels) for frame in frames):
-        raise InputError(f"{log.name}: none of its {len(stream.t)} images has features and a pose of the reference")
+        raise InputError(f"{log.name}: none of its {len(t)} images has features and a pose of the reference")
     return PosedFrames(frames, cameras, covariances)
 
 

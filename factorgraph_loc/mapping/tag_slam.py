@@ -21,12 +21,11 @@ from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import Found, search
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.whole import whole_motion
+from factorgraph_loc.sensors.registry import moving
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import Increment
@@ -43,7 +42,6 @@ MARGIN = 1.0  # m beyond the reach: farther from a keyframe a tag that was not r
 ITERATIONS, FINAL_ITERATIONS = 4, 40
 ROUNDS = 3  # of searching all tags once more
 ELSEWHERE = 13.8  # 99.9 % of chi-square with two degrees of freedom
-FOREVER = 1e9  # s
 
 Factors = list[tuple[Factor, tuple[int, ...]]]
 
@@ -85,14 +83,10 @@ class _Way:
     def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = looks, prior, known
         self._constants = log.rig.estimated("odometry")
-        sensors = ("odometry", "imu") if "imu" in log.rig.sensors else ("odometry",)
-        motion = Motion(log.rig, sensors, Diagnostics())
-        motion.keep(FOREVER)
-        for m in log.measurements(sensors):
-            if isinstance(m, (VelocityOdometry, IncrementOdometry, YawRate)):
-                motion.add(m)
+        wheels = moving(log.streams, "floor")
+        motion = whole_motion(log, (*wheels, *moving(log.rig.sensors, "turn")))
         last = max(float(looks.t[-1]), prior.t)
-        self.t = _keyframes(prior.t, last, np.append(looks.t, log.streams["odometry"].t))
+        self.t = _keyframes(prior.t, last, np.concatenate((looks.t, *(log.streams[name].t for name in wheels))))
         states = [motion.state(float(t)) for t in self.t]
         self._steps = [motion.relative(a, b) for a, b in pairwise(states)]
         self._used = looks.t >= prior.t

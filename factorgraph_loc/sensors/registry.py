@@ -6,7 +6,7 @@ stand in :mod:`factorgraph_loc.builtin`. Another package registers one by an ent
 whose value is the place of its :class:`SensorType`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, cast
@@ -44,7 +44,8 @@ class SensorType:
     """What a sensor brings: its ``channels``, the sections of the rig that are its ``settings``, its ``layers`` of the world, and
     the places of its functions, "" where it has none; :func:`functions` gives those of all sensors.
 
-    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log.
+    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log; ``draw``:
+    ``(log) ->`` :class:`~factorgraph_loc.sensors.marks.Marks`, what plots and viewers draw of it.
 
     Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
     together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
@@ -57,6 +58,7 @@ class SensorType:
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
     summarize: Place = ""
+    draw: Place = ""
     check: Place = ""
     prepare: Place = ""
     doubts: Place = ""
@@ -82,6 +84,12 @@ def sensor_of(channel: str) -> SensorType:
         if any(own.name == channel for own in sensor.channels):
             return sensor
     raise InputError(f"no sensor is called {quoted(channel)}{nearest(channel, list(channels()))}")
+
+
+def moving(names: Iterable[str], *motions: str) -> tuple[str, ...]:
+    """The channels among ``names`` that tell how the robot moves on the ``floor`` or in ``space``, or how it turns (``turn``)."""
+    known = channels()
+    return tuple(name for name in names if name in known and known[name].motion in motions)
 
 
 def functions(kind: str) -> Iterator[tuple[str, Callable[..., Any]]]:

@@ -179,9 +179,11 @@ class Made:
 
 SCENE = Scene(
     walls=np.array([[-7.0, -7.0, 7.0, -7.0], [7.0, -7.0, 7.0, 7.0]]),
-    landmarks=np.array([[0.0, 0.0], [6.0, 2.0]]),
-    tags=np.array([[-6.0, 1.0]]),
-    points=np.empty((0, 2)),
+    layers={
+        "landmarks": np.array([[0.0, 0.0], [6.0, 2.0]]),
+        "tags": np.array([[-6.0, 1.0]]),
+        "points": np.empty((0, 2)),
+    },
     reference=(np.column_stack((5.0 * np.cos(np.linspace(0, 5, 50)), 5.0 * np.sin(np.linspace(0, 5, 50)))),),
 )
 

@@ -11,17 +11,22 @@ from hypothesis import strategies as st
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera import draw
 from factorgraph_loc.sensors.camera.stream import ImageStream
 
 
+def lights_of(log):
+    return {marks.layer: lights for marks, _, lights in scene.layers(log)}
+
+
 def test_tags_are_lit_from_when_the_antenna_had_them(log):
-    lights = scene.read_tags(log)
+    lights = lights_of(log)["tags"]
     assert np.allclose(lights.t, [1.0, 1.5, 1.8, 2.0, 2.3, 2.5])
     assert lights.names == (("A",), (), ("A",), ("A", "B"), ("B",), ())
 
 
 def test_a_log_without_reads_has_no_lights(log):
-    assert scene.read_tags(replace(log, streams={})).names == ()
+    assert all(lights.names == () for lights in lights_of(replace(log, streams={})).values())
 
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.sampled_from("abc")), max_size=20))
@@ -53,7 +58,7 @@ def test_poses_without_a_covariance_have_no_ellipse():
 
 
 def test_pictures_become_jpegs(log):
-    pictures = list(scene.images(log))
+    pictures = list(draw.images(log))
     assert [t for t, _ in pictures] == [0.5, 1.5, 2.5]
     for i, (_, content) in enumerate(pictures):
         picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -62,7 +67,7 @@ def test_pictures_become_jpegs(log):
     jpeg = log.streams["camera"].file[0].with_suffix(".jpg")
     jpeg.write_bytes(pictures[1][1])
     kept = replace(log, streams={"camera": ImageStream(np.zeros(1), [jpeg])})
-    assert next(scene.images(kept))[1] == pictures[1][1]
+    assert next(draw.images(kept))[1] == pictures[1][1]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +78,7 @@ def test_a_picture_that_cannot_be_read_is_named(log, tmp_path, content, message)
         (tmp_path / "p.png").write_bytes(content)
     bad = replace(log, streams={"camera": ImageStream(np.zeros(1), [tmp_path / "p.png"])})
     with pytest.raises(InputError, match=f"p.png: {message}"):
-        list(scene.images(bad))
+        list(draw.images(bad))
 
 
 def test_a_path_is_cut_at_gaps():

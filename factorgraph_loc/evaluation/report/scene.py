@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from pydantic import BaseModel, Field
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.marks import Marks, marks
 from factors.se2 import Array
 
 _POSES = 1500  # of the reference, in all
@@ -22,26 +23,20 @@ _POINTS = 1500  # of a map of points
 
 @dataclass(frozen=True)
 class Scene:
-    """In the world's frame [m]: ``walls`` (W, 4) as x1, y1, x2, y2; ``landmarks``, ``tags`` and ``points`` (N, 2) of the map;
-    ``reference``: pieces (N, 2) without a long gap. ``t0_ns``: the log's start, absolute."""
+    """In the world's frame [m]: ``walls`` (W, 4) as x1, y1, x2, y2; ``layers`` of the map (N, 2), such as landmarks, tags and
+    points; ``reference``: pieces (N, 2) without a long gap. ``t0_ns``: the log's start, absolute."""
 
     walls: Array
-    landmarks: Array
-    tags: Array
-    points: Array
+    layers: Mapping[str, Array]
     reference: tuple[Array, ...]
     t0_ns: int = 0
 
     @classmethod
     def of(cls, log: Log) -> Scene:
-        """The scene of a log; tags are where estimators take them to be: moved by what the rig knows of their survey."""
-        world = log.world
-        points = np.empty((0, 2)) if world.points is None else world.points.positions[:, :2]
+        """The scene of a log; things of the map are where estimators take them to be."""
         return cls(
-            walls=np.array(world.walls, dtype=float).reshape(-1, 4),
-            landmarks=world.positions(),
-            tags=tag_map(world, log.rig.survey).tags.points[:, :2],
-            points=points[:: len(points) // _POINTS + 1],
+            walls=np.array(log.world.walls, dtype=float).reshape(-1, 4),
+            layers={one.layer: _thinned(one) for one in marks(log)},
             reference=_pieces(log),
             t0_ns=log.t0_ns,
         )
@@ -50,9 +45,7 @@ class Scene:
         """As plain values, in millimetres."""
         return {
             "walls": _millimetres(self.walls),
-            "landmarks": _millimetres(self.landmarks),
-            "tags": _millimetres(self.tags),
-            "points": _millimetres(self.points),
+            **{name: _millimetres(places) for name, places in self.layers.items()},
             "reference": [_millimetres(piece) for piece in self.reference],
         }
 
@@ -66,9 +59,7 @@ class Scene:
         found = _SceneFile.model_validate_json(path.read_bytes())
         return cls(
             walls=_metres(found.walls, 4),
-            landmarks=_metres(found.landmarks, 2),
-            tags=_metres(found.tags, 2),
-            points=_metres(found.points, 2),
+            layers={name: _metres(places, 2) for name, places in (found.__pydantic_extra__ or {}).items()},
             reference=tuple(_metres(piece, 2) for piece in found.reference),
             t0_ns=found.t0_ns,
         )
@@ -77,15 +68,18 @@ class Scene:
 _Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
-class _SceneFile(BaseModel):
-    """What is kept: coordinates one after the other [mm]."""
+class _SceneFile(BaseModel, extra="allow"):
+    """What is kept: coordinates one after the other [mm], also of each layer of the map."""
 
+    __pydantic_extra__: dict[str, list[_Whole]]
     walls: list[_Whole]
-    landmarks: list[_Whole]
-    tags: list[_Whole]
-    points: list[_Whole]
     reference: list[list[_Whole]]
     t0_ns: _Whole
+
+
+def _thinned(one: Marks) -> Array:
+    places = one.positions[:, :2]
+    return places[:: len(places) // _POINTS + 1] if one.dense else places
 
 
 def _pieces(log: Log) -> tuple[Array, ...]:

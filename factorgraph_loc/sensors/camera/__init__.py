@@ -39,4 +39,5 @@ SENSOR = SensorType(
     prepare="factorgraph_loc.sensors.camera.prepare:prepare",
     doubts="factorgraph_loc.sensors.camera.describe:doubts",
     findable="factorgraph_loc.sensors.camera.describe:findable",
+    draw="factorgraph_loc.sensors.camera.draw:draw",
 )

@@ -1,11 +1,12 @@
 """What is done with a log's images before an estimator runs: their features are found, or they are set aside."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
@@ -13,6 +14,7 @@ from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.sensors.usage import Prepared, Use
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.settings import FrontendSettings
+from factors.se2 import Array
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
@@ -22,6 +24,14 @@ def frontend_of(rig: Rig, world: World) -> FrontendSettings:
     if points is None or not points.feature or points.feature == settings.feature:
         return settings
     return FrontendSettings.model_validate(settings.model_dump() | {"feature": points.feature})
+
+
+def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
+    """Stamps (N,) and features of a log's images, once those were found; InputError if it has none."""
+    stream = log.streams.get("camera")
+    if not isinstance(stream, FeatureStream):
+        raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+    return stream.t + log.rig.time_offset("camera"), stream.frame
 
 
 def prepare(use: Use, progress: Callable[[float], None]) -> Prepared:

@@ -18,4 +18,5 @@ SENSOR = SensorType(
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",
     findable="factorgraph_loc.sensors.landmarks.describe:findable",
+    draw="factorgraph_loc.sensors.landmarks.draw:draw",
 )

@@ -24,4 +24,5 @@ SENSOR = SensorType(
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
     findable="factorgraph_loc.sensors.rfid.describe:findable",
+    draw="factorgraph_loc.sensors.rfid.draw:draw",
 )

@@ -90,11 +90,17 @@ class Tracks {
   bounds() {
     const xs = [], ys = [];
     const add = (flat) => flat.forEach((v, i) => (i % 2 ? ys : xs).push(v / 1000));
-    if (this.scene) [this.scene.walls, this.scene.landmarks, this.scene.tags, ...this.scene.reference].forEach(add);
+    if (this.scene) [this.scene.walls, ...Object.values(this.layers()), ...this.scene.reference].forEach(add);
     if (!xs.length) for (const run of this.shown()) { xs.push(...run[this.kind].x); ys.push(...run[this.kind].y); }
     if (!xs.length) return [0, 1, 0, 1];
     const least = (a) => a.reduce((p, q) => Math.min(p, q)), most = (a) => a.reduce((p, q) => Math.max(p, q));
     return [least(xs), most(xs), least(ys), most(ys)];
+  }
+
+  // things of the map by what they are, but for points, which are too many
+  layers() {
+    const { walls, reference, points, ...layers } = this.scene;
+    return layers;
   }
 
   drawMap() {
@@ -131,7 +137,7 @@ class Tracks {
     const pairs = (flat) => flat.reduce((all, v, i) => (i % 2 ? all[all.length - 1].push(-v / 1000) : all.push([v / 1000]), all), []);
     const g = svg("g", { class: "scene" }, this.plan);
     const join = (points) => "M" + points.map((p) => p[0].toFixed(3) + " " + p[1].toFixed(3)).join("L");
-    const points = pairs(this.scene.points);
+    const points = pairs(this.scene.points || []);
     if (points.length) svg("path", { d: points.map((p) => `M${p[0].toFixed(2)} ${p[1].toFixed(2)}h0`).join(""), class: "points" }, g);
     for (const piece of this.scene.reference) if (piece.length) svg("path", { d: join(pairs(piece)), class: "reference" }, g);
     let walls = "";
@@ -139,10 +145,7 @@ class Tracks {
     for (let i = 0; i + 1 < ends.length; i += 2) walls += join([ends[i], ends[i + 1]]);
     if (walls) svg("path", { d: walls, class: "walls" }, g);
     this.symbols = svg("g", { class: "symbols" }, this.root);
-    this.places = [
-      ...pairs(this.scene.tags).map((p) => [p, "rect"]),
-      ...pairs(this.scene.landmarks).map((p) => [p, "path"]),
-    ];
+    this.places = Object.entries(this.layers()).reverse().flatMap(([name, of]) => pairs(of).map((p) => [p, name === "tags" ? "rect" : "path"]));
   }
 
   // broken where there are no poses for long

@@ -1,0 +1,42 @@
+"""Where single sightings put landmarks, in the robot's frame."""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factors.landmarks.model import located, sigmas
+from factors.se2 import Array
+
+STEP = 1e-6  # m or rad, of numerical derivatives
+
+
+class LocatedLandmark(NamedTuple):
+    """A ``landmark`` that was seen at ``t`` [s of the log] at ``point`` (2,) [m], with ``covariance`` (2, 2) [m^2]."""
+
+    t: float
+    landmark: str
+    point: Array
+    covariance: Array
+
+
+def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
+    """The landmarks of ``names`` whose range and bearing were measured at once; none if the log's sightings are not among the
+    ``sensors``, or its rig does not know that sensor."""
+    stream, settings = log.streams.get("bearing_range"), log.rig.bearing_range
+    if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
+        return []
+    model = settings.model()
+    whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
+    rows = [i for i in whole.tolist() if stream.landmark[i] in names]
+    ranges, bearings = stream.range[rows], stream.bearing[rows]
+    points = located(model, ranges, bearings)
+    spreads = sigmas(model, ranges)
+    t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
+    by_range = (located(model, ranges + STEP, bearings) - points) / STEP
+    by_bearing = (located(model, ranges, bearings + STEP) - points) / STEP
+    jacobians = np.stack((by_range, by_bearing), axis=-1) * spreads[:, None, :]
+    covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
+    return [LocatedLandmark(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]

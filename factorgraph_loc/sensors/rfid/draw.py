@@ -1,0 +1,20 @@
+"""What is drawn of RFID tags."""
+
+import numpy as np
+
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.marks import Marks
+from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+
+
+def draw(log: Log) -> Marks:
+    """The tags of the map, the survey's errors corrected as the rig knows them, and when an antenna has read one."""
+    known = tag_map(log.world, log.rig.survey)
+    stream = log.streams.get("rfid")
+    t, seen = np.empty(0), tuple[str, ...]()
+    if isinstance(stream, RfidStream):
+        rows = [i for i, epc in enumerate(stream.epc) if epc]
+        t = (stream.t - stream.age + log.rig.time_offset("rfid"))[rows]
+        seen = tuple(stream.epc[i] for i in rows)
+    return Marks("tags", known.names, known.tags.points, t, seen, marker="s", size=5.0, order=2.0)
