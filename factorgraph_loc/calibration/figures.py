@@ -1,24 +1,18 @@
 """Plots of what a calibration left over, as PNG images for its report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from factorgraph_loc.calibration.learn import Knowledge
-from factorgraph_loc.drawing.figures import COLOURS
-from factorgraph_loc.drawing.panels import axes_of, legend, name_axes, png
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.sensors.odometry.calibration.noise import BLACKOUT, LENGTHS
 from factorgraph_loc.sensors.odometry.calibration.windows import cut
 from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.text import plain
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
-
-if TYPE_CHECKING:
-    pass
 
 _SHOWN = 3000  # dots of a log in a panel
 _VIEW = 5.0  # robust standard deviations; what lies beyond is drawn at the edge
@@ -31,7 +25,7 @@ def sightings_figure(knowledge: Knowledge) -> bytes:
     errors = [one.errors(settings) for one in knowledge.seen]
     rows = [(0, "range", "m"), (1, "bearing", "rad")]
     rows = [row for row in rows if any(np.isfinite(e[:, row[0]]).any() for e in errors)]
-    figure, axes = axes_of(len(rows), 3)
+    figure, axes = grid(len(rows), 3, 4.0 * len(rows))
     for panels, (column, what, unit) in zip(axes, rows, strict=True):
         typical = np.concatenate(
             [bearing_range.sigmas(settings.model(), one.ranges)[:, column] for one in knowledge.seen]
@@ -52,10 +46,10 @@ def sightings_figure(knowledge: Knowledge) -> bytes:
         scatter = bearing_range.sigmas(settings.model(), distance)[:, column]
         for sign in (-2.0, 2.0):
             panels[1].plot(distance, sign * scatter, color="0.3", linestyle="--", label="2 sigma of the scatter")
-        name_axes(panels[0], f"{what} residual [{unit}]", f"density [1/{unit}]")
-        name_axes(panels[1], "measured range [m]", f"{what} residual [{unit}]")
-        name_axes(panels[2], "time [s]", f"{what} residual [{unit}]")
-    legend(figure, axes.flat)
+        panels[0].set(xlabel=f"{what} residual [{unit}]", ylabel=f"density [1/{unit}]")
+        panels[1].set(xlabel="measured range [m]", ylabel=f"{what} residual [{unit}]")
+        panels[2].set(xlabel="time [s]", ylabel=f"{what} residual [{unit}]")
+    legend(figure, axes.flat, markers=3.0)
     return png(figure)
 
 
@@ -63,7 +57,7 @@ def correlation_figure(knowledge: Knowledge) -> bytes:
     """Autocorrelation of the residuals of one landmark, of each log."""
     columns = [(0, "range"), (1, "bearing")]
     columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in knowledge.correlations)]
-    figure, axes = axes_of(1, max(1, len(columns)))
+    figure, axes = grid(1, max(1, len(columns)), 4.0)
     for axis, (column, what) in zip(axes[0], columns, strict=False):
         for i, (one, seen) in enumerate(zip(knowledge.correlations, knowledge.seen, strict=True)):
             known = np.isfinite(one.function[:, column])
@@ -78,15 +72,15 @@ def correlation_figure(knowledge: Knowledge) -> bytes:
         axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.set_xscale("log")
-        name_axes(axis, "time between two sightings of a landmark [s]", f"correlation of {what} residuals")
-    legend(figure, axes.flat)
+        axis.set(xlabel="time between two sightings of a landmark [s]", ylabel=f"correlation of {what} residuals")
+    legend(figure, axes.flat, markers=3.0)
     return png(figure)
 
 
 def odometry_figure(knowledge: Knowledge) -> bytes:
     """Residuals of the odometry over windows: in time, over distance, and how they grow with the length of the window."""
     model = odometry_model(knowledge.rig)
-    figure, axes = axes_of(3, 3)
+    figure, axes = grid(3, 3, 12.0)
     residuals = [one.residuals(model) for one in knowledge.windows]
     lengths = (*LENGTHS, BLACKOUT)
     growth = [_growth([cut(one.log, length) for one in knowledge.windows], model) for length in lengths]
@@ -106,10 +100,10 @@ def odometry_figure(knowledge: Knowledge) -> bytes:
         panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
         panels[2].set_xscale("log")
         panels[2].set_yscale("log")
-        name_axes(panels[0], "time [s]", f"{what} [{unit}] in 2 s")
-        name_axes(panels[1], "distance [m] in 2 s", f"{what} [{unit}] in 2 s")
-        name_axes(panels[2], "length of the window [s]", f"{what} [{unit}]")
-    legend(figure, axes.flat)
+        panels[0].set(xlabel="time [s]", ylabel=f"{what} [{unit}] in 2 s")
+        panels[1].set(xlabel="distance [m] in 2 s", ylabel=f"{what} [{unit}] in 2 s")
+        panels[2].set(xlabel="length of the window [s]", ylabel=f"{what} [{unit}]")
+    legend(figure, axes.flat, markers=3.0)
     return png(figure)
 
 

@@ -1,15 +1,14 @@
 """The report of a calibration: one HTML page that needs no other file, and the same as a document for programs."""
 
-import base64
-import html
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from factorgraph_loc.calibration import figures
 from factorgraph_loc.calibration.calibrate import Calibration, Scores
 from factorgraph_loc.calibration.constants import Learnt
 from factorgraph_loc.calibration.selection import MODEL, NOISE, SCATTER
+from factorgraph_loc.drawing.markup import image, table, text
 from factorgraph_loc.sensors.rfid.calibration import figures as rfid_figures
 from factorgraph_loc.sensors.rfid.calibration import report as rfid_report
 from factors.se2 import Array
@@ -35,7 +34,7 @@ KINDS = ("causal", "final")
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
 _STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child,td:last-child{text-align:left}img{max-width:100%}
+th:first-child,td:last-child{text-align:left}tbody th{font-weight:normal}.wide{overflow-x:auto}img{max-width:100%}
 .doubt{background:#fff4d6;padding:.5em 1em;margin:.4em 0}"""
 
 
@@ -160,16 +159,16 @@ def page(calibration: Calibration) -> str:
     """The report as one HTML page, with its plots inside."""
     knowledge = calibration.knowledge
     parts = [
-        f"<h1>Calibration of {_text(calibration.rig.name)}</h1>",
-        f"<p>From {_text(', '.join(calibration.logs))}. {_text(_verdict(calibration))}</p>",
-        *(f'<p class="doubt">{_text(doubt)}</p>' for doubt in calibration.doubts),
+        f"<h1>Calibration of {text(calibration.rig.name)}</h1>",
+        f"<p>From {text(', '.join(calibration.logs))}. {text(_verdict(calibration))}</p>",
+        *(f'<p class="doubt">{text(doubt)}</p>' for doubt in calibration.doubts),
         "<h2>Constants</h2>",
         "<p>A constant is kept if it predicts data better that it was not fitted to: "
         + ("the other logs" if len(calibration.logs) > 1 else "another fifth of the log")
         + f", and if the {_estimator(calibration)} is better with it. Else the rig keeps the value of the input. "
         + ("<i>Each log alone</i> says how much it differs between runs." if len(calibration.logs) > 1 else "")
         + "</p>",
-        _table(*_long_constants(calibration)),
+        table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
         *_noise(calibration),
         *_rfid(calibration),
@@ -182,21 +181,21 @@ def page(calibration: Calibration) -> str:
             else "With one log there is no cross-validation: try the rig on another log before you trust it."
         )
         + "</p>",
-        _table(*accuracy_table(calibration)),
+        table(*accuracy_table(calibration)),
     ]
     if knowledge.seen:
         parts += [
             "<h2>How alike neighbouring errors are</h2>",
             "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
             "one, and the noise in the rig must be larger than the scatter.</p>",
-            _table(*_correlations(calibration)),
+            table(*_correlations(calibration)),
             "<h2>Residuals of the sightings</h2>",
-            _image(figures.sightings_figure(knowledge)),
-            _image(figures.correlation_figure(knowledge)),
+            image(figures.sightings_figure(knowledge)),
+            image(figures.correlation_figure(knowledge)),
         ]
     if knowledge.windows:
-        parts += ["<h2>Residuals of the odometry</h2>", _image(figures.odometry_figure(knowledge))]
-    title = f"Calibration of {_text(calibration.rig.name)}"
+        parts += ["<h2>Residuals of the odometry</h2>", image(figures.odometry_figure(knowledge))]
+    title = f"Calibration of {text(calibration.rig.name)}"
     head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
     return f"{head}<body>\n" + "\n".join(parts) + "\n</body></html>\n"
 
@@ -208,11 +207,11 @@ def _verdict(calibration: Calibration) -> str:
         if before["causal.position_rmse"] and after["causal.position_rmse"]
     ]
     kept = sum(c.kept for c in calibration.knowledge.constants)
-    text = f"{kept} of {len(calibration.knowledge.constants)} constants were worth changing."
+    told = f"{kept} of {len(calibration.knowledge.constants)} constants were worth changing."
     if change:
         mean = math.exp(sum(map(math.log, change)) / len(change))
-        text += f" The {_estimator(calibration)}'s position error is {mean:.2f} times that with the input rig."
-    return text
+        told += f" The {_estimator(calibration)}'s position error is {mean:.2f} times that with the input rig."
+    return told
 
 
 def _long_constants(calibration: Calibration) -> Rows:
@@ -237,7 +236,7 @@ def _noise(calibration: Calibration) -> list[str]:
             for error, g in noise.growth.items()
         ]
         header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-        out.append(_table(header, rows))
+        out.append(table(header, rows))
         out.append(
             f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise is {noise.widened:.2f} times "
             "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
@@ -249,7 +248,7 @@ def _noise(calibration: Calibration) -> list[str]:
         out.append("<p>The noise of the sightings is refused: the rig has that of the input.</p>")
     names = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
     rows = [(f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(rig, n))) for n, unit in names.items()]
-    out.append(_table(("noise of the sightings", "scatter", "in the rig"), rows))
+    out.append(table(("noise of the sightings", "scatter", "in the rig"), rows))
     if trial is not None and calibration.accepts(SCATTER):
         out.append(
             f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
@@ -262,16 +261,16 @@ def _rfid(calibration: Calibration) -> list[str]:
     found = calibration.knowledge.rfid
     if found is None:
         return []
-    tables = [_table(*table) for table in rfid_tables(calibration)]
+    tables = [table(*one) for one in rfid_tables(calibration)]
     return [
         "<h2>RFID</h2>",
-        f"<p>{_text(rfid_report.tempering_text(found, calibration.rig))}</p>",
-        f"<p>{_text(rfid_report.dead_text(found))}</p>",
+        f"<p>{text(rfid_report.tempering_text(found, calibration.rig))}</p>",
+        f"<p>{text(rfid_report.dead_text(found))}</p>",
         *tables,
         "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or stretches.</p>",
-        _image(rfid_figures.reliability_figure(found)),
+        image(rfid_figures.reliability_figure(found)),
         "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the model.</p>",
-        _image(rfid_figures.field_figure(found)),
+        image(rfid_figures.field_figure(found)),
     ]
 
 
@@ -284,7 +283,7 @@ def _judgements(calibration: Calibration) -> list[str]:
         f"<p>The {_estimator(calibration)} ran on stretches with what {whose} tell of each parameter (new), and without (old). The "
         "rig has what makes its score, which holds errors and consistency, better by more nats a pose than chance would, and no "
         "error larger by more than 2 %. What is refused has the value of the input rig.</p>",
-        _table(*judgements_table(calibration)),
+        table(*judgements_table(calibration)),
     ]
 
 
@@ -304,19 +303,3 @@ def _correlations(calibration: Calibration) -> Rows:
 def _label(c: Learnt) -> str:
     unit = f" [{UNITS[c.name]}]" if c.name in UNITS else ""
     return f"{c.sensor}.{c.name}{unit}"
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def line(cells: Sequence[str], tag: Callable[[str], str]) -> str:
-        return "<tr>" + "".join(tag(_text(cell)) for cell in cells) + "</tr>"
-
-    body = "".join(line(row, lambda cell: f"<td>{cell}</td>") for row in rows)
-    return f"<table>{line(header, lambda cell: f'<th>{cell}</th>')}{body}</table>"
-
-
-def _image(png: bytes) -> str:
-    return f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-
-
-def _text(text: str) -> str:
-    return html.escape(text)

@@ -1,15 +1,12 @@
-"""``fgloc map``: a map of landmarks, of RFID tags or of points from a log, and what it says about the map that the log has."""
+"""``fgloc map``: a map of landmarks, of RFID tags or of points from a log."""
 
-from __future__ import annotations
-
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from factorgraph_loc.cli import mapping_tags, show
+from factorgraph_loc.cli import map_texts, show
 from factorgraph_loc.cli.options import (
     DataRoot,
     Json,
@@ -25,14 +22,7 @@ from factorgraph_loc.cli.options import (
     parse_settings,
 )
 
-if TYPE_CHECKING:
-    from factorgraph_loc.experiments.maps import DroppedTags
-    from factorgraph_loc.mapping.mapping import LandmarkMap
-    from factorgraph_loc.mapping.point_mapping import PointReport
-    from factorgraph_loc.mapping.tag_mapping import MadeTags
-
 MAPPERS = ("batch", "smoother", "ekf")  # as factorgraph_loc.experiments.maps has them
-HEADER = ("landmark", "given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 OutWorld = Annotated[
     Path, typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture goes beside it.")
 ]
@@ -96,71 +86,10 @@ def map_(
     for warning in made.warnings:
         show.note(f"warning: {warning}")
     if json:
-        show.document(
-            _document(made.details) | {"frame": made.frame, "files": {"map": str(out), "picture": str(picture)}}
-        )
+        files = {"map": str(out), "picture": str(picture)}
+        show.document(map_texts.document(made.details) | {"frame": made.frame, "files": files})
         return
-    for line in (*_tell(made.details), f"the frame of the new map is {made.frame}"):
+    for line in (*map_texts.tell(made.details), f"the frame of the new map is {made.frame}"):
         show.line(line)
     show.line()
     show.line(f"the map is in {out}, a picture of it in {picture}")
-
-
-def _tell(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> tuple[str, ...]:
-    """Print the table of what was found, where there is one, and return what there is to say of it."""
-    from factorgraph_loc.experiments.maps import DroppedTags
-    from factorgraph_loc.mapping.mapping import LandmarkMap
-    from factorgraph_loc.mapping.tag_mapping import MadeTags
-
-    if isinstance(found, DroppedTags):
-        return mapping_tags.tell_dropped(found)
-    if isinstance(found, LandmarkMap):
-        show.table(HEADER, _rows(found))
-        show.line()
-        return (found.summary(), *found.notes)
-    if isinstance(found, MadeTags):
-        show.table(mapping_tags.HEADER, mapping_tags.rows(found))
-        show.line()
-        return (found.made.summary("tags"), *mapping_tags.notes(found))
-    return (
-        f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes",
-        f"reprojection residual: {found.rms:.2f} px root mean square, {found.mad:.2f} px median",
-        f"parallax {found.parallax:.3f} rad, standard deviation in the worst direction {found.sigma:.3f} m (medians)",
-        f"the cameras were moved by {found.shifted:.3f} m and {found.turned:.4f} rad (medians)",
-    )
-
-
-def _rows(made: LandmarkMap) -> list[tuple[str, ...]]:
-    rows = []
-    for entry in made.entries:
-        given = (None, None) if entry.given is None else entry.given
-        learnt = (None, None) if entry.learnt is None else entry.learnt.position
-        numbers = (*given, *learnt, entry.sigma, entry.distance)
-        rows.append((entry.landmark, *(show.number(value) for value in numbers), entry.verdict))
-    return rows
-
-
-def _document(found: LandmarkMap | MadeTags | PointReport | DroppedTags) -> dict[str, Any]:
-    from factorgraph_loc.mapping.mapping import LandmarkMap
-    from factorgraph_loc.mapping.tag_mapping import MadeTags
-
-    if isinstance(found, LandmarkMap):
-        return _landmark_document(found)
-    return mapping_tags.document(found) if isinstance(found, MadeTags) else asdict(found)
-
-
-def _landmark_document(made: LandmarkMap) -> dict[str, Any]:
-    landmarks = [
-        {
-            "landmark": entry.landmark,
-            "given": None if entry.given is None else entry.given.tolist(),
-            "learnt": None if entry.learnt is None else entry.learnt.position.tolist(),
-            "covariance": None if entry.learnt is None else entry.learnt.covariance.tolist(),
-            "sigma": entry.sigma,
-            "distance": entry.distance,
-            "verdict": entry.verdict,
-            "flagged": entry.flagged,
-        }
-        for entry in made.entries
-    ]
-    return {"landmarks": landmarks, "summary": made.summary(), "notes": [*made.notes]}

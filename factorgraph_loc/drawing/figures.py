@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
-_WIDTH, _DPI = 16.0, 100
+_WIDTH, _DPI, _PAGE_DPI = 16.0, 100, 80
 _TITLE, _LINES = 80, 3  # characters and lines of a text at most
 _LABEL, _LEGEND = 60, 160  # characters of a label, and of a line of the legend
 
 
-def empty(height: float, title: str) -> Figure:
+def empty(height: float, title: str = "") -> Figure:
     """A figure without axes, ``height`` in units of 100 px."""
     # Figure without pyplot: no global state, no display, and matplotlib is loaded only where something is plotted
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
@@ -34,11 +34,12 @@ def empty(height: float, title: str) -> Figure:
 
     figure = Figure(figsize=(_WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=16)
+    if title:
+        figure.suptitle(title, fontsize=16)
     return figure
 
 
-def grid(rows: int, columns: int, height: float, title: str) -> tuple[Figure, Any]:
+def grid(rows: int, columns: int, height: float, title: str = "") -> tuple[Figure, Any]:
     """A figure and its axes (rows, columns)."""
     figure = empty(height, title)
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -65,8 +66,8 @@ def styles() -> Iterator[dict[str, Any]]:
         i += 1
 
 
-def legend(figure: Figure, axes: Iterable[Axes]) -> None:
-    """One legend below the axes, of all that is drawn in any of them."""
+def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
+    """One legend below the axes, of all that is drawn in any of them; its ``markers`` are so many times as large."""
     entries: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -74,7 +75,8 @@ def legend(figure: Figure, axes: Iterable[Axes]) -> None:
     if entries:
         labels = [plain(label, _LABEL) for label in entries]
         columns = min(len(labels), max(1, _LEGEND // max(map(len, labels))))
-        figure.legend(entries.values(), labels, loc="outside lower center", ncols=columns, fontsize=13)
+        look = {"ncols": columns, "fontsize": 13, "markerscale": markers}
+        figure.legend(entries.values(), labels, loc="outside lower center", **look)
 
 
 @contextmanager
@@ -94,6 +96,14 @@ def lay_out(figure: Figure) -> None:
     """Lay a figure out once before it is saved: with a fixed aspect the layout needs a second pass."""
     with drawing(figure):
         figure.draw_without_rendering()
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG image, for a page."""
+    out = io.BytesIO()
+    with drawing(figure):
+        figure.savefig(out, format="png", dpi=_PAGE_DPI)
+    return out.getvalue()
 
 
 def save(figure: Figure, path: Path) -> None:

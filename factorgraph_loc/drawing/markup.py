@@ -1,5 +1,6 @@
-"""The few pieces of HTML that the page is made of. Whatever comes from outside is escaped here and nowhere else."""
+"""The few pieces of HTML that pages are made of. Whatever comes from outside is escaped here and nowhere else."""
 
+import base64
 import html
 import json
 from collections.abc import Iterable
@@ -53,3 +54,8 @@ def figure(title: object, caption: object, **attributes: object) -> Html:
     """A place for a chart that the script draws, with title and caption."""
     chart = tag("div", class_="chart", **attributes)
     return tag("figure", tag("h3", title), chart, tag("figcaption", caption) if caption else "")
+
+
+def image(png: bytes) -> Html:
+    """A PNG image that is part of the page."""
+    return Html(f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(png).decode()}">')

@@ -84,8 +84,7 @@ def run_picture(track: SeekingTrack) -> Figure:
     driven, spread = ([getattr(one, key) for one in track.decisions] for key in ("metres", "spread"))
     axes["belief"].semilogy(driven, np.maximum(spread, 1e-3), "o-", color=COLOURS[0], markersize=4)
     axes["belief"].axvline(track.metres, color="0.5", linestyle="--", label="end of the run")
-    axes["belief"].set_xlabel("metres driven")
-    axes["belief"].set_ylabel("spread of the belief [m]")
+    axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
     legend(figure, axes.values())
     lay_out(figure)
     return figure
@@ -124,8 +123,7 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
         axis.step(x, np.append(share, share[-1]), where="post", label=policy, linewidth=2.0, **style)
     axis.set_ylim(0.0, 1.0)
     axis.set_xlim(0.0, longest)
-    axis.set_xlabel("metres driven")
-    axis.set_ylabel("share of runs localized")
+    axis.set(xlabel="metres driven", ylabel="share of runs localized")
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:

@@ -61,8 +61,7 @@ def dropped_figure(
         axis.plot(x, y, "x", color=COLOURS[1], markersize=9, label="believed dead, dropped", zorder=4)
         axis.annotate(name[-LABEL:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
 
@@ -90,8 +89,7 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
         if entry.flagged and entry.given is not None:
             axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
 
@@ -111,8 +109,7 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
     dots = axis.scatter(*shown[:, :2].T, c=shown[:, 2], s=6.0, cmap="viridis", label="point", zorder=2)
     out.colorbar(dots, ax=axis, label="height [m]")
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
 

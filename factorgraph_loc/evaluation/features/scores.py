@@ -190,8 +190,7 @@ def recall_curves(scores: FeatureScores) -> Any:
         axis.set_title(title)
         axis.set_xlim(0.0, 1.0)
         axis.set_ylim(0.0, 1.0)
-        axis.set_xlabel("1 - precision")
-        axis.set_ylabel("recall")
+        axis.set(xlabel="1 - precision", ylabel="recall")
         for name in scores.names():
             ranked = [r for i in scores.of(name, members) if (r := scores.ranked[i]) is not None]
             if ranked:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.drawing.figures import COLOURS
-from factorgraph_loc.drawing.panels import axes_of, legend, name_axes, png
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
 from factors.rfid.model import probability
@@ -25,7 +24,7 @@ _STEP = 0.1  # m
 
 def reliability_figure(found: RfidKnowledge) -> bytes:
     """Held-out probabilities against how often tags were read then, and how many reads each probability stands for."""
-    figure, axes = axes_of(1, 2)
+    figure, axes = grid(1, 2, 4.5)
     predicted, observed, low, high, count = reliability(found)
     panel, amounts = axes[0]
     panel.plot((0.0, 1.0), (0.0, 1.0), color="0.3", linestyle="--", label="ideal")
@@ -38,18 +37,18 @@ def reliability_figure(found: RfidKnowledge) -> bytes:
         capsize=3,
         label="held-out reads, Wilson's 95 % interval",
     )
-    name_axes(panel, "predicted probability of a read", "share of rounds with a read")
+    panel.set(xlabel="predicted probability of a read", ylabel="share of rounds with a read")
     amounts.bar(predicted, count, width=0.7 / BINS, color=COLOURS[0])
     amounts.set_yscale("log")
-    name_axes(amounts, "predicted probability of a read", "rounds times tags")
-    legend(figure, axes.flat)
+    amounts.set(xlabel="predicted probability of a read", ylabel="rounds times tags")
+    legend(figure, axes.flat, markers=3.0)
     return png(figure)
 
 
 def field_figure(found: RfidKnowledge) -> bytes:
     """The probability of a read around the antenna: as seen, on the left, and by each model for tags that face it or not."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in found.models) else (0.0,)
-    figure, axes = axes_of(len(found.models), 1 + len(facings), height=4.2)
+    figure, axes = grid(len(found.models), 1 + len(facings), 5.0 * len(found.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, _STEP)
     image = None
     for row, model in enumerate(found.models):
@@ -97,5 +96,5 @@ def _draw(panel: Axes, axis: Array, values: Array) -> QuadMesh:
     image = panel.pcolormesh(axis, axis, values.T, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
     panel.plot(0.0, 0.0, ">", color=COLOURS[1], markersize=9)
     panel.set_aspect("equal")
-    name_axes(panel, "x, along the boresight [m]", "y, to the left [m]")
+    panel.set(xlabel="x, along the boresight [m]", ylabel="y, to the left [m]")
     return image
