@@ -7,13 +7,14 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from factorgraph_loc.files.columns import TABLES, Table
+from factorgraph_loc.files.columns import POINTS, POSES, Table
 from factorgraph_loc.files.models import bounds
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.sensors.tables import all_tables
 from factorgraph_loc.simulation.settings import SimulationSettings
 
 FILES: dict[str, type[BaseModel]] = {
@@ -57,7 +58,7 @@ def _numbers(annotation: Any, metadata: tuple[Any, ...], key: str) -> Iterator[N
 def tables() -> list[str]:
     """The lines of all tables, with their headings."""
     lines = ["### Columns", ""]
-    for table in TABLES:
+    for table in (*all_tables(), POSES, POINTS):
         lines += [*_of_columns(table), ""]
     lines += ["### Settings", ""]
     for name, model in FILES.items():

@@ -87,6 +87,11 @@ def stamps(source: object, rows: Integers, t: Array, *, per_second: float = 1e9)
     return np.asarray(np.rint(t * per_second).astype(np.int64) * round(1e9 / per_second))
 
 
+def absolute(t: Array, t0_ns: int) -> Integers:
+    """Seconds (N,) after ``t0_ns`` as stamps in nanoseconds."""
+    return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
+
+
 def seconds(t_ns: Integers, t0_ns: int) -> Array:
     """Stamps (N,) in nanoseconds as seconds after ``t0_ns``."""
     return np.asarray((t_ns - t0_ns) / 1e9, dtype=float)

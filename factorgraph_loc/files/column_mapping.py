@@ -68,6 +68,13 @@ class Mapped:
         """The cells (N) of a field as they stand there."""
         return self.cells.columns[self.mapping.columns[field]]
 
+    def names(self, column: Column) -> list[str]:
+        """The names (N) in the field that ``column`` describes; InputError where one is missing."""
+        for row, text in zip(self.cells.rows, self.texts(column.name), strict=True):
+            if not text:
+                raise bad_field(self.path, self.mapping.columns[column.name], text, column.doc, row=row)
+        return list(self.texts(column.name))
+
     def numbers(self, field: str, column: Column) -> Array:
         """A field (N,), what ``column`` describes, in its unit; NaN where it is empty."""
         name = self.mapping.columns[field]

@@ -6,6 +6,7 @@ unit, or is garbage. Readers and :class:`~factorgraph_loc.live.localizer.Localiz
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.models import FARTHEST
+from factorgraph_loc.plugins import Place
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -44,7 +46,8 @@ LARGEST_PIXEL = 1e5  # px
 @dataclass(frozen=True)
 class Column:
     """A column of a table. ``units``: by name, what to multiply with; the first is ours, in which ``low`` and ``high`` are, both
-    included. ``may_lack``: whether a cell may be empty. ``doc``: what it is."""
+    included. ``may_lack``: whether a cell may be empty. ``doc``: what it is. ``field``: of the stream, where it is not ``name``.
+    ``left_out_below``: a cell with less is read as an empty one, with a warning; no stream and no measurement has such a value."""
 
     name: str
     kind: Literal["stamp", "number", "name", "whole", "file"]
@@ -53,6 +56,13 @@ class Column:
     high: float
     may_lack: bool
     doc: str
+    field: str = ""
+    left_out_below: float = -math.inf
+
+    @property
+    def measured(self) -> Column:
+        """What it is in a stream or a measurement."""
+        return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
     def expected(self) -> str:
@@ -95,14 +105,27 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a sensor. ``rows_of_one_stamp``: whether they are one measurement together, or one each."""
+    """A table of a sensor. ``rows_of_one_stamp``: whether they are one measurement together, or one each.
+
+    ``stream``: the class of the stream that its rows make, whose fields are the columns; "" where a function makes it of them.
+    ``optional``: columns that may be missing all together, of several the first that is there; ``("rssi",), ()``: that or none.
+    """
 
     name: str
     columns: tuple[Column, ...]
     rows_of_one_stamp: Literal["one measurement", "one each"]
+    stream: Place = ""
+    optional: tuple[tuple[tuple[str, ...], ...], ...] = ()
 
     def __getitem__(self, name: str) -> Column:
         return next(column for column in self.columns if column.name == name)
+
+    @property
+    def shapes(self) -> tuple[tuple[str, ...], ...]:
+        """The names of the columns that a file may have, the fullest first."""
+        left_out = {name for choices in self.optional for choice in choices for name in choice}
+        always = tuple(column.name for column in self.columns if column.name not in left_out)
+        return tuple((*always, *(n for c in choices for n in c)) for choices in itertools.product(*self.optional))
 
 
 def require_span(tables: Iterable[tuple[object, Sequence[int] | Integers | None, Integers]]) -> None:
@@ -121,161 +144,50 @@ def require_span(tables: Iterable[tuple[object, Sequence[int] | Integers | None,
     raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]) if rows is not None else None)
 
 
-def _number(
-    name: str, units: Mapping[str, float], low: float, high: float, doc: str, *, may_lack: bool = False
+def number(
+    name: str,
+    units: Mapping[str, float],
+    low: float,
+    high: float,
+    doc: str,
+    *,
+    may_lack: bool = False,
+    left_out_below: float = -math.inf,
 ) -> Column:
-    return Column(name, "number", units, low, high, may_lack, doc)
+    """A column of numbers; see :class:`Column`."""
+    return Column(name, "number", units, low, high, may_lack, doc, left_out_below=left_out_below)
 
 
-def _within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    return _number(name, units, -most, most, doc)
+def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
+    """A column of numbers from ``-most`` to ``most``."""
+    return number(name, units, -most, most, doc)
 
 
-def _name(name: str, doc: str, kind: Literal["name", "file"] = "name") -> Column:
-    return Column(name, kind, {}, 0.0, math.inf, False, doc)
+def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field: str = "") -> Column:
+    """A column of names; see :class:`Column`."""
+    return Column(name, kind, {}, 0.0, math.inf, False, doc, field)
 
 
 STAMP = Column("t_ns", "stamp", STAMPS, -LATEST, LATEST, False, "when it was, by the sensor's clock")
 SECONDS = replace(STAMP.in_unit("s")[0], name="t", kind="number")
-LANDMARK = _name("landmark", "the name of a landmark")
-ANTENNA = _name("antenna", "the name of an antenna")
-
-VELOCITIES = Table(
-    "odometry",
-    (
-        STAMP,
-        _within("v", SPEED, FASTEST, "forward speed, held until the next row"),
-        _within("w", RATE, FASTEST_TURN, "turn rate, held until the next row"),
-    ),
-    "one each",
-)
-INCREMENTS = Table(
-    "odometry",
-    (
-        STAMP,
-        _within("dx", LENGTH, LONGEST_WAY, "way ahead since the row before"),
-        _within("dy", LENGTH, LONGEST_WAY, "way to the left since the row before"),
-        _within("dtheta", ANGLE, MOST_TURNED, "turn since the row before"),
-    ),
-    "one each",
-)
-IMU = Table("imu", (STAMP, _within("w", RATE, FASTEST_TURN, "turn rate of a gyro")), "one each")
-TWIST = Table(
-    "twist",
-    (
-        STAMP,
-        _within("v", SPEED, FASTEST, "speed along each axis of the robot"),
-        _within("w", RATE, FASTEST_TURN, "turn rate about each axis of the robot"),
-    ),
-    "one each",
-)
-BEARING_RANGE = Table(
-    "bearing_range",
-    (
-        STAMP,
-        LANDMARK,
-        _number("range", LENGTH, -LONGEST_RANGE, LONGEST_RANGE, "distance; below 0.001 it is left out", may_lack=True),
-        _number("bearing", ANGLE, -FULL_TURN, FULL_TURN, "direction in the sensor's frame", may_lack=True),
-    ),
-    "one measurement",
-)
-# radios that got no answer say 0, and gross errors may lie below: no measurement then
-MEASURED_RANGE = replace(BEARING_RANGE["range"], low=NEAREST)
-AGE = _number("age", DURATION, 0.0, 3600.0, "how long before the end of its round a tag was read")
-RFID = Table(
-    "rfid",
-    (
-        STAMP,
-        ANTENNA,
-        _name("epc", "the EPC of a tag"),
-        _number("rssi", POWER, -200.0, 200.0, "strength of the answer, by the reader's own zero", may_lack=True),
-        _number("phase", ANGLE, -FULL_TURN, FULL_TURN, "phase as the reader reports it", may_lack=True),
-        _number("frequency", FREQUENCY, 1e8, 1e10, "of the carrier", may_lack=True),
-        Column("inventory", "whole", PURE, 1.0, 2.0**53, False, "the row of the round in inventories"),
-    ),
-    "one measurement",
-)
-INVENTORIES = Table(
-    "inventories",
-    (STAMP, ANTENNA, _number("duration", DURATION, 0.0, 3600.0, "how long the round lasted, which ends at the stamp")),
-    "one measurement",
-)
-CAMERA = Table("camera", (STAMP, _name("file", "the name of an image", "file")), "one each")
-SIGHTINGS = Table(
-    "sightings",
-    (
-        STAMP,
-        LANDMARK,
-        _within("u", PIXELS, LARGEST_PIXEL, "to the right; beside the image too"),
-        _within("v", PIXELS, LARGEST_PIXEL, "down"),
-    ),
-    "one measurement",
-)
-FEATURES = Table(
-    "features",
-    (
-        STAMP,
-        _within("pixels", PIXELS, LARGEST_PIXEL, "where it was found"),
-        _number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "how large it is"),
-        _within("descriptors", PURE, 1e6, "what it looks like"),
-        Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number that stays with what is followed"),
-    ),
-    "one measurement",
-)
-WAYS = Table(
-    "odometry",
-    (
-        STAMP,
-        *(_within(side, LENGTH, 1e9, "way of that wheel so far; counters hold 32 bits") for side in ("left", "right")),
-    ),
-    "one each",
-)
 POSES = Table(
     "poses",
     (
         STAMP,
-        *(_within(name, LENGTH, FARTHEST, "position; of odometry in a frame of its own") for name in "xyz"),
-        *(_within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
-        _within("heading", ANGLE, 1e5, "direction of the robot's x axis, or the sum of its turns"),
-    ),
-    "one each",
-)
-TAGS = Table(
-    "tags",
-    (
-        _name("epc", "the EPC of a tag"),
-        _within("x", LENGTH, FARTHEST, "position in the frame of the survey"),
-        _within("y", LENGTH, FARTHEST, "position in the frame of the survey"),
-        _number("z", LENGTH, -FARTHEST, FARTHEST, "height; 0 where it is empty", may_lack=True),
-        _number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that its front faces", may_lack=True),
-        _number("sigma", LENGTH, 0.0, 100.0, "standard deviation of its survey in x and y", may_lack=True),
+        *(within(name, LENGTH, FARTHEST, "position; of odometry in a frame of its own") for name in "xyz"),
+        *(within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
+        within("heading", ANGLE, 1e5, "direction of the robot's x axis, or the sum of its turns"),
     ),
     "one each",
 )
 POINTS = Table(
     "points",
     (
-        _name("point", "the name of a point"),
-        *(_within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
-        *(_within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
-        *(_within(f"from_{name}", LENGTH, FARTHEST, "where the camera of a view was") for name in "xyz"),
-        _number("size", PIXELS, 1e-3, LARGEST_PIXEL, "of the feature in that view"),
+        named("point", "the name of a point"),
+        *(within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
+        *(within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
+        *(within(f"from_{name}", LENGTH, FARTHEST, "where the camera of a view was") for name in "xyz"),
+        number("size", PIXELS, 1e-3, LARGEST_PIXEL, "of the feature in that view"),
     ),
     "one each",
-)
-TABLES = (
-    VELOCITIES,
-    INCREMENTS,
-    IMU,
-    TWIST,
-    BEARING_RANGE,
-    RFID,
-    INVENTORIES,
-    CAMERA,
-    SIGHTINGS,
-    FEATURES,
-    WAYS,
-    POSES,
-    TAGS,
-    POINTS,
 )

@@ -8,21 +8,18 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import LATEST, STAMP, TABLES, Column
+from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
 from factorgraph_loc.files.csv_cells import Shape, read_cells, shape_of
 from factorgraph_loc.files.parquet import read_parquet, text_column
 from factors.se2 import Array, Integers
 
-COLUMNS = {
-    table.name: {column.name: column for other in TABLES if other.name == table.name for column in other.columns}
-    for table in TABLES
-}
-NAMES = {c.name: c.doc for table in TABLES for c in table.columns if c.kind in ("name", "file")}
+NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
+KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.String, "file": pl.String}
 
 
 @dataclass(frozen=True)
-class Table:
-    """Columns of N rows: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN where empty; ``names`` by column, N texts.
+class TableRows:
+    """N rows of a table: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN where empty; ``names`` by column, N texts.
 
     ``rows`` (N,): where each stands in ``path``, as an editor counts lines (Parquet: rows from 1).
     """
@@ -34,18 +31,21 @@ class Table:
     names: dict[str, list[str]]
 
 
-def read_table(path: Path, sensor: str, shapes: Sequence[Shape]) -> Table:
-    """Read CSV or Parquet with the columns of one of ``shapes``, in any order; other columns are not looked at.
+def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
+    """Read CSV or Parquet with the columns of one of ``tables``, in any order; other columns are not looked at.
 
-    InputError names file, row and field of what is missing, is not a number, or lies outside the bounds of the sensor's column.
+    InputError names file, row and field of what is missing, is not a number, or lies outside the bounds of its column.
     """
-    columns = COLUMNS[sensor]
+    shapes = [shape for table in tables for shape in table.shapes]
+    columns = {column.name: column for table in tables for column in table.columns}
     return _read_parquet(path, columns, shapes) if path.suffix == ".parquet" else _read_csv(path, columns, shapes)
 
 
-def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
-    """Write columns of equal length to CSV or Parquet, as the suffix says; NaN becomes an empty field. Numbers keep all digits."""
-    series = [pl.Series(name, column, dtype=_kind(name)) for name, column in columns.items()]
+def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
+    """Write columns of one of ``tables``, of equal length, to CSV or Parquet, as the suffix says; NaN becomes an empty field.
+    Numbers keep all digits."""
+    kinds = {column.name: KINDS[column.kind] for table in tables for column in table.columns}
+    series = [pl.Series(name, column, dtype=kinds[name]) for name, column in columns.items()]
     frame = pl.DataFrame([s.fill_nan(None) if s.dtype.is_float() else s for s in series])
     if path.suffix == ".parquet":
         frame.write_parquet(path)
@@ -53,20 +53,15 @@ def write_table(path: Path, columns: Mapping[str, Array | Integers | Sequence[st
         frame.write_csv(path)
 
 
-def _kind(column: str) -> type[pl.DataType]:
-    if column in {STAMP.name, "inventory"}:
-        return pl.Int64
-    return pl.String if column in NAMES else pl.Float64
-
-
-def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
+def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:
     cells, shape = read_cells(path, shapes)
-    return Table(
+    told = [columns[name] for name in shape]
+    return TableRows(
         path,
         np.array(cells.rows, dtype=np.int64),
         _stamps(path, cells.rows, cells.columns[STAMP.name]),
-        {name: cells.numbers(name, columns[name]) for name in shape if name not in NAMES and name != STAMP.name},
-        {name: _texts(path, cells.rows, name, cells.columns[name]) for name in shape if name in NAMES},
+        {c.name: cells.numbers(c.name, c) for c in told if c.kind in NUMBERS},
+        {c.name: _texts(path, cells.rows, c, cells.columns[c.name]) for c in told if c.kind in NAMES},
     )
 
 
@@ -87,16 +82,16 @@ def _is_stamp(cell: str) -> bool:
         return False
 
 
-def _texts(path: Path, rows: Sequence[int], name: str, cells: Sequence[str | None]) -> list[str]:
+def _texts(path: Path, rows: Sequence[int], column: Column, cells: Sequence[str | None]) -> list[str]:
     texts = []
     for row, cell in zip(rows, cells, strict=True):
         if not cell:
-            raise bad_field(path, name, cell, NAMES[name], row=row)
+            raise bad_field(path, column.name, cell, column.doc, row=row)
         texts.append(cell)
     return texts
 
 
-def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> Table:
+def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:
     frame = read_parquet(path)
     shape = shape_of(path, frame.columns, shapes)
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
@@ -111,7 +106,7 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
     STAMP.require(path, rows, t_ns)
     numbers = {}
     for name in shape:
-        if name in NAMES or name == STAMP.name:
+        if columns[name].kind not in NUMBERS:
             continue
         column = frame[name]
         if not column.dtype.is_numeric() and column.dtype != pl.Null:
@@ -122,5 +117,6 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
             raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
         numbers[name] = column.cast(pl.Float64).to_numpy().copy()
         columns[name].require(path, rows, numbers[name])
-    names = {name: _texts(path, rows.tolist(), name, text_column(frame, name, path)) for name in shape if name in NAMES}
-    return Table(path, rows, t_ns, numbers, names)
+    texts = [columns[name] for name in shape if columns[name].kind in NAMES]
+    names = {c.name: _texts(path, rows.tolist(), c, text_column(frame, c.name, path)) for c in texts}
+    return TableRows(path, rows, t_ns, numbers, names)

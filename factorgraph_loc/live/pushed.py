@@ -10,25 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import (
-    AGE,
-    BEARING_RANGE,
-    FEATURES,
-    IMU,
-    INCREMENTS,
-    MEASURED_RANGE,
-    RFID,
-    SECONDS,
-    SIGHTINGS,
-    TWIST,
-    VELOCITIES,
-    Column,
-)
+from factorgraph_loc.files.columns import SECONDS, Column
 from factorgraph_loc.model.measurement import Exteroceptive, Odometry
+from factorgraph_loc.sensors.camera.columns import FEATURES, SIGHTINGS
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.odometry.columns import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.rfid.columns import READS, RFID
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.twist.columns import TWIST
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factorgraph_loc.text import listed, plain
 from factorgraph_loc.vision.frame import CameraFrame
@@ -57,8 +49,8 @@ COLUMNS: dict[type, dict[str, Column]] = {
     IncrementOdometry: {name: INCREMENTS[name] for name in ("dx", "dy", "dtheta")},
     YawRate: {"w": IMU["w"]},
     Twist: {name: TWIST[name] for name in ("v", "w")},
-    BearingRange: {"range": MEASURED_RANGE, "bearing": BEARING_RANGE["bearing"]},
-    RfidScan: {"age": AGE} | {name: RFID[name] for name in ("rssi", "phase", "frequency")},
+    BearingRange: {"range": BEARING_RANGE["range"].measured, "bearing": BEARING_RANGE["bearing"]},
+    RfidScan: {column.name: column for column in READS.columns},
     PixelSightings: {"pixels": SIGHTINGS["u"]},
     CameraFrame: {name: FEATURES[name] for name in ("pixels", "sizes")},
 }

@@ -24,9 +24,11 @@ class Section:
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of a world, things by name. ``kind``: the class of one, a :class:`~factorgraph_loc.files.models.FileModel`."""
+    """A layer of a world, things by name. ``kind``: the class of one, a :class:`~factorgraph_loc.files.models.FileModel`;
+    ``table``: the description of the table that may hold many of them."""
 
     kind: Place
+    table: Place = ""
 
 
 class _Channel(Protocol):

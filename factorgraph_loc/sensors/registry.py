@@ -27,6 +27,11 @@ class Channel:
     (``column_of``). ``rows``: what its rows are called. ``section``: the one of the rig that has the ``time_offset`` of its stamps,
     without which it tells nothing if it ``needs_section``. ``motion``: whether it tells how the robot moves on a floor or in space,
     or how it turns.
+
+    ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of those in which a log keeps it; ``described``: of
+    further ones, such as what its measurements hold where that is not what the tables do. Where a stream's fields are no columns:
+    ``assemble``: ``(rows by table, reading) -> stream``, ``disassemble``: ``(stream, writing) -> columns by table``, see
+    :mod:`factorgraph_loc.sensors.tables`.
     """
 
     name: str
@@ -37,6 +42,10 @@ class Channel:
     column_of: str = ""
     rows: str = "rows"
     motion: Literal["", "floor", "space", "turn"] = ""
+    tables: tuple[Place, ...] = ()
+    described: tuple[Place, ...] = ()
+    assemble: Place = ""
+    disassemble: Place = ""
 
 
 @dataclass(frozen=True)
@@ -90,6 +99,11 @@ def moving(names: Iterable[str], *motions: str) -> tuple[str, ...]:
     """The channels among ``names`` that tell how the robot moves on the ``floor`` or in ``space``, or how it turns (``turn``)."""
     known = channels()
     return tuple(name for name in names if name in known and known[name].motion in motions)
+
+
+def channel(name: str) -> Channel:
+    """A channel by name; InputError as of :func:`sensor_of`."""
+    return next(own for own in sensor_of(name).channels if own.name == name)
 
 
 def functions(kind: str) -> Iterator[tuple[str, Callable[..., Any]]]:

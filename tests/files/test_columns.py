@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.columns import BEARING_RANGE, MEASURED_RANGE, TABLES, VELOCITIES
+from factorgraph_loc.files.columns import POINTS, POSES
+from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.columns import VELOCITIES
+from factorgraph_loc.sensors.tables import all_tables
 
-COLUMNS = [pytest.param(column, id=f"{table.name}.{column.name}") for table in TABLES for column in table.columns]
+COLUMNS = [
+    pytest.param(column, id=f"{table.name}.{column.name}")
+    for table in (*all_tables(), POSES, POINTS)
+    for column in table.columns
+]
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -39,4 +46,10 @@ def test_only_what_may_lack_may_be_no_number(value):
 
 
 def test_a_measured_range_is_above_zero():
-    assert MEASURED_RANGE.outside(np.array((0.0, 1e-300, 1e-3, 1e5, 2e5))).tolist() == [True, True, False, False, True]
+    assert BEARING_RANGE["range"].measured.outside(np.array((0.0, 1e-300, 1e-3, 1e5, 2e5))).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        True,
+    ]

@@ -10,21 +10,15 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.columns import (
-    BEARING_RANGE,
-    IMU,
-    INCREMENTS,
-    INVENTORIES,
-    LATEST,
-    RFID,
-    SIGHTINGS,
-    STAMP,
-    VELOCITIES,
-)
+from factorgraph_loc.files.columns import LATEST, STAMP
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
 from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.sensors.camera.columns import SIGHTINGS
+from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.columns import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 
 UNIX = 1_700_000_000_000_000_000
 ROW = {"landmark": "A", "antenna": "left", "epc": "E1", "file": "a.png", "duration": 1.0}

@@ -342,7 +342,7 @@ def test_a_write_that_fails_leaves_nothing(native, one, tmp_path):
     log = one(native)
     broken = dataclasses.replace(log, streams={**log.streams, "sonar": object()})
     out = tmp_path / "new"
-    with pytest.raises(AttributeError):
+    with pytest.raises(InputError, match="no sensor is called"):
         write_native(broken, out)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hall"]
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
+from factorgraph_loc.files.checks import absolute
 from factorgraph_loc.files.temporary import sweep, temporary_folder
 from factorgraph_loc.io.bags.file import ROS1, SUFFIXES, require_rosbags
 from factorgraph_loc.io.bags.messages import DEFINITIONS, INITIAL_POSE, LANDMARK, PIXEL, READ, ROUND
 from factorgraph_loc.io.bags.poses import POINT
-from factorgraph_loc.io.native.native import absolute
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.model.log import Log, StartPose

@@ -8,18 +8,18 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.files.tables import NAMES, Table
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import Fields, as_number, as_text, leaves
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
 from factorgraph_loc.io.bags.rows import Rows
-from factorgraph_loc.io.native import native
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.planar import Axes, Turned
-from factorgraph_loc.sensors.camera import tables as native_camera
-from factorgraph_loc.sensors.camera.stream import SightingStream
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.sensors.camera.columns import SIGHTINGS
+from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
+from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
@@ -93,14 +93,14 @@ class Landmarks:
             wanted = "xyz" if self._places else ("range", "bearing")
             self._rows.append(item, t_ns, tuple(as_number(told.get(name, np.nan)) for name in wanted))
 
-    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
+    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> Stream:
         """Ranges along the floor and bearings, in the robot's frame where ``frames`` say where the sensor sits there."""
         source, rows = self._rows.source, self._rows.rows
         ranges, bearings = self._polar(frames, base) if self._places else self._rows.values.T
-        table = Table(
+        table = TableRows(
             Path(source), rows, self._rows.t_ns, {"range": ranges, "bearing": bearings}, {"landmark": self._names}
         )
-        return native.make_sightings(table, t0_ns, warnings)
+        return stream_of(BEARING_RANGE, table, t0_ns, warnings)
 
     def _polar(self, frames: StaticFrames, base: str) -> tuple[Array, Array]:
         places = self._rows.values
@@ -150,15 +150,15 @@ class PixelsOfPoints:
             self._names.append(_name(self._rows.source, told["landmark"], item.row))
             self._rows.append(item, t_ns, (as_number(told["u"]), as_number(told["v"])))
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> SightingStream:
+    def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
         u, v = self._rows.values.T
         source = Path(self._rows.source)
-        table = Table(source, self._rows.rows, self._rows.t_ns, {"u": u, "v": v}, {"landmark": self._names})
-        return native_camera.make_pixels(table, t0_ns, warnings)
+        table = TableRows(source, self._rows.rows, self._rows.t_ns, {"u": u, "v": v}, {"landmark": self._names})
+        return stream_of(SIGHTINGS, table, t0_ns, warnings)
 
 
 def _name(source: str, value: Any, row: int) -> str:
     text = as_text(value)
     if not text:
-        raise bad_field(source, "landmark", text, NAMES["landmark"], row=row)
+        raise bad_field(source, "landmark", text, BEARING_RANGE["landmark"].doc, row=row)
     return text

@@ -9,13 +9,14 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.column_mapping import SECONDS, EpcCase, in_case
-from factorgraph_loc.files.columns import LATEST, RFID
+from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.files.tables import NAMES, Table
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import LIST, Fields, as_nanoseconds, as_number, as_text
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.sensors.rfid import tables as native_rfid
+from factorgraph_loc.sensors.rfid.columns import RFID
 
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
 SIGNALS = {name: RFID[name].units for name in ("rssi", "phase", "frequency")}
@@ -101,9 +102,9 @@ class Reads:
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, self._end_ns))
         return native_rfid.Rounds(table.t_ns, number, table.names["epc"], signals, end_ns, self._round_antenna)
 
-    def _table(self) -> Table:
+    def _table(self) -> TableRows:
         signals = np.array(self._signals, dtype=float).reshape(-1, len(SIGNALS))
-        return Table(
+        return TableRows(
             path=Path(self._source),  # only named in messages
             rows=np.array(self._rows, dtype=np.int64),
             t_ns=np.array(self._t_ns, dtype=np.int64),
@@ -136,5 +137,5 @@ class Reads:
     def _name(self, field: ReadField, value: Any, row: int) -> str:
         text = as_text(value)
         if not text:
-            raise bad_field(self._source, field, text, NAMES[field], row=row)
+            raise bad_field(self._source, field, text, RFID[field].doc, row=row)
         return text

@@ -9,45 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.columns import (
-    AGE,
-    BEARING_RANGE,
-    IMU,
-    INCREMENTS,
-    MAX_SPAN,
-    MEASURED_RANGE,
-    POSES,
-    RFID,
-    SIGHTINGS,
-    TWIST,
-    VELOCITIES,
-    Column,
-)
+from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.camera.stream import RightSightingStream, SightingStream
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
-from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.twist.stream import TwistStream
+from factorgraph_loc.sensors.registry import channels
+from factorgraph_loc.sensors.tables import columns_of
 from factors.se2 import Array
 
 ROUNDING = 1e-9  # as a share: of a value that was multiplied with its unit
-COLUMNS: dict[type, tuple[Column, ...]] = {
-    VelocityStream: VELOCITIES.columns[1:],
-    IncrementStream: INCREMENTS.columns[1:],
-    YawRateStream: IMU.columns[1:],
-    TwistStream: TWIST.columns[1:],
-    BearingRangeStream: (MEASURED_RANGE, BEARING_RANGE["bearing"]),
-    RfidStream: (AGE, RFID["rssi"], RFID["phase"], RFID["frequency"]),
-    SightingStream: SIGHTINGS.columns[2:],
-    RightSightingStream: SIGHTINGS.columns[2:],
-}
 
 
 def require_bounds(log: Log) -> None:
     """InputError at the first value of a log that lies outside its column's bounds, with the time."""
     for name, stream in log.streams.items():
-        for column in COLUMNS.get(type(stream), ()):
+        for column in columns_of(channels()[name], stream) if name in channels() else ():
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
     if log.reference is not None:
         known = ("x", "y", "heading") if log.reference.has_heading else ("x", "y")

@@ -13,7 +13,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.images import size_of_file
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
-from factorgraph_loc.files.tables import Table
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.readers.space_poses import later, read_kitti, read_times
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -45,7 +45,7 @@ def read(path: Path | None, options: Options) -> Log:
     rows = np.arange(1, len(t_ns) + 1, dtype=np.int64)
     files = {"file": [f"{i:06d}.png" for i in range(len(t_ns))]}
     t0_ns = int(t_ns[0])
-    stream = make_images(Table(times, rows, t_ns, {}, files), t0_ns, warnings, images)
+    stream = make_images(TableRows(times, rows, t_ns, {}, files), t0_ns, warnings, images)
     if not len(stream.t):
         raise InputError(f"{images}: holds none of the {len(t_ns)} images of times.txt, 000000.png and on")
     _, poses_ns, poses = read_kitti(poses_file, times)

@@ -1,5 +1,6 @@
 """A folder of tables that other programs wrote, each by a mapping of its columns: what a manifest says in place of a program."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +9,9 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.files.columns import IMU
-from factorgraph_loc.files.models import FileModel, inside
-from factorgraph_loc.files.tables import COLUMNS, NAMES, Table
+from factorgraph_loc.files.columns import Table
+from factorgraph_loc.files.models import FileModel, add_fields, inside
+from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.native import native
 from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
 from factorgraph_loc.io.readers.mapped_poses import (
@@ -21,22 +22,18 @@ from factorgraph_loc.io.readers.mapped_poses import (
     read_odometry,
     read_reference,
 )
-from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories, texts_of
+from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.tables import make_images
-from factorgraph_loc.sensors.rfid.tables import Rounds, read_rounds
+from factorgraph_loc.sensors.odometry.columns import IMU
+from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, Rounds, read_rounds
+from factorgraph_loc.sensors.tables import Reading, native_tables
 from factors.se2 import Array
 
 RATES = ("wx", "wy", "wz")
-SHAPES: dict[str, tuple[tuple[str, ...], ...]] = {
-    "imu": (("t", "w"), ("t", *RATES)),
-    "bearing_range": (("t", "landmark", "range"), ("t", "landmark", "bearing"), ("t", "landmark", "range", "bearing")),
-    "camera": (("t", "file"),),
-    "sightings": (("t", "landmark", "u", "v"),),
-}
 RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which not all are needed
 
 
@@ -62,18 +59,22 @@ class InventoryFile(SensorFile):
 
 
 class Options(FileModel):
-    """Which file below the folder is which sensor, and the reference. The folder is the manifest's ``path``. ``readers``: files of
-    several RFID readers by any names, in place of ``rfid``."""
+    """Which file below the folder is which table of a sensor, by its name, and which is the reference. The folder is the
+    manifest's ``path``. ``readers``: files of several RFID readers by any names, in place of ``rfid``."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None
     rfid: RfidFile | None = None
     readers: dict[str, RfidFile] = Field(default_factory=dict)
     inventories: InventoryFile | None = None
-    bearing_range: SensorFile | None = None
     camera: ImageFile | None = None
-    sightings: SensorFile | None = None
     reference: ReferenceFile | None = None
+
+
+OTHERS = [
+    name for name in native_tables() if name not in Options.model_fields
+]  # whose columns need no more than a mapping
+add_fields(Options, dict.fromkeys(OTHERS, (SensorFile | None, None)), after="camera")
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -86,19 +87,18 @@ def read(path: Path | None, options: Options) -> Log:
     odometry_path = inside(path, options.odometry.file, path)
     odometry_t_ns, moves, increments = read_odometry(odometry_path, options.odometry, warnings)
     tables = {
-        sensor: _table(inside(path, mapping.file, path), sensor, mapping, warnings)
-        for sensor in SHAPES
-        if (mapping := getattr(options, sensor)) is not None
+        name: _table(inside(path, mapping.file, path), native_tables()[name][1][0], mapping, warnings)
+        for name in ("imu", "camera", *OTHERS)
+        if (mapping := getattr(options, name)) is not None
     }
     rounds = _rounds(path, options, warnings)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
     streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
-    for sensor, table in tables.items():
-        if sensor == "camera" and options.camera is not None:
-            streams[sensor] = make_images(table, t0_ns, warnings, inside(path, options.camera.folder, path))
-        else:
-            streams[sensor] = native.make_stream(sensor, table, t0_ns, warnings)
+    if options.camera is not None:
+        folder = inside(path, options.camera.folder, path)
+        streams["camera"] = make_images(tables.pop("camera"), t0_ns, warnings, folder)
+    streams |= native.streams_of(tables, Reading(DEFAULT_RIG, t0_ns, warnings))
     if rounds:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
@@ -122,20 +122,29 @@ def read(path: Path | None, options: Options) -> Log:
     )
 
 
-def _table(path: Path, sensor: str, mapping: SensorFile, warnings: list[str]) -> Table:
-    """A file as the table of that sensor in the native format."""
-    mapped = read_mapped(path, mapping, SHAPES[sensor])
+def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str]) -> TableRows:
+    """A file as a table of the native format."""
+    shapes, columns = _shapes(table), {column.name: column for column in table.columns}
+    if isinstance(mapping, ImuFile):
+        shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
+    mapped = read_mapped(path, mapping, shapes)
     if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects without the columns of {sensor} are left out")
-    columns = {**COLUMNS[sensor], **dict.fromkeys(RATES, RATE)}
-    numbered = [name for name in mapped.fields if name != "t" and columns[name].kind == "number"]
-    numbers = {name: mapped.numbers(name, columns[name]) for name in numbered}
-    if sensor == "bearing_range":
-        numbers = {name: numbers.get(name, np.full(len(mapped.rows), np.nan)) for name in ("range", "bearing")}
+        warnings.append(f"{path}: {mapped.passed} objects without the columns of {table.name} are left out")
+    known = [columns[name] for name in mapped.fields if name != "t"]
+    names = {column.name: mapped.names(column) for column in known if column.kind in NAMES}
+    unknown = {column.name: np.full(len(mapped.rows), np.nan) for column in table.columns if column.may_lack}
+    numbers = unknown | {column.name: mapped.numbers(column.name, column) for column in known if column.kind in NUMBERS}
     if isinstance(mapping, ImuFile):
         numbers = {"w": _about_z(mapped, mapping, numbers)}
-    names = {name: texts_of(mapped, name) for name in mapped.fields if name in NAMES}
-    return Table(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+    return TableRows(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+
+
+def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:
+    """The fields that may be mapped: all columns, of those that may lack one or several."""
+    needed = ("t", *(column.name for column in table.columns[1:] if not column.may_lack))
+    others = [column.name for column in table.columns if column.may_lack]
+    some = (names for count in range(1, len(others) + 1) for names in itertools.combinations(others, count))
+    return tuple((*needed, *names) for names in some) or (needed,)
 
 
 def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Array:
@@ -170,4 +179,4 @@ def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | Non
         raise InputError(
             f"{folder}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
         )
-    return read_rounds(reads, inventories, gaps.pop() if gaps else native.ROUND_GAP, warnings)
+    return read_rounds(reads, inventories, gaps.pop() if gaps else ROUND_GAP, warnings)

@@ -9,12 +9,13 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.files.columns import INCREMENTS, LENGTH, VELOCITIES, WAYS
+from factorgraph_loc.files.columns import LENGTH
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.io.readers import motions
 from factorgraph_loc.io.readers.space_poses import read_kitti
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
+from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES, WAYS
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors import se2
 from factors.se2 import Array, Integers

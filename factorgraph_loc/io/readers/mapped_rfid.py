@@ -10,9 +10,10 @@ from pydantic import Field, model_validator
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
-from factorgraph_loc.files.columns import INVENTORIES, PURE, RFID, Column
+from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, inside
-from factorgraph_loc.files.tables import NAMES, Table
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
 from factorgraph_loc.text import quoted
 from factors.se2 import Array, Integers
@@ -107,7 +108,7 @@ class RfidFile(ColumnMapping):
         return {**content, "columns": columns, "units": units}
 
 
-def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Table:
+def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> TableRows:
     """The reads of the file below ``folder``, or of all files whose names fit where it holds ``*``, as readers begin new ones."""
     if "*" not in options.file:
         return read_reads(inside(folder, options.file, folder), options, warnings)
@@ -122,10 +123,10 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
     )
 
 
-def joined(path: Path, tables: Sequence[Table]) -> Table:
+def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
     """All reads of several tables in the order of time, as of ``path``."""
     return _in_time(
-        Table(
+        TableRows(
             path,
             np.concatenate([table.rows for table in tables]),
             np.concatenate([table.t_ns for table in tables]),
@@ -135,7 +136,7 @@ def joined(path: Path, tables: Sequence[Table]) -> Table:
     )
 
 
-def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:
+def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
     """The reads as the table ``rfid`` of the native format. InputError names file, row and column of what is wrong.
 
     A row that stands for several reads gives two, the first with what was measured: when the others came is not told.
@@ -151,11 +152,11 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects that are no reads are left out")
     t_ns = mapped.stamps("t", options.clock_offset)
-    antennas = [options.antenna] * len(t_ns) if options.antenna else texts_of(mapped, "antenna")
+    antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names(RFID["antenna"])
     numbers = {name: _signal(mapped, name) for name in SIGNALS}
     if "channel" in mapped.fields:
         numbers["frequency"] = _frequencies(mapped, options.channels)
-    table = Table(
+    table = TableRows(
         path,
         mapped.rows,
         t_ns,
@@ -166,29 +167,21 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> Table:
     return _in_time(_with_last(table, mapped, options, warnings))
 
 
-def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> Table:
+def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> TableRows:
     """The rounds as the table ``inventories`` of the native format; ``antennas`` as of the reads."""
     mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
-    names = [antennas.get(name, name) for name in texts_of(mapped, "antenna")]
+    names = [antennas.get(name, name) for name in mapped.names(RFID["antenna"])]
     duration = mapped.numbers("duration", INVENTORIES["duration"])
-    return Table(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
+    return TableRows(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
 
 
 def _signal(mapped: Mapped, name: str) -> Array:
     return mapped.numbers(name, RFID[name]) if name in mapped.fields else np.full(len(mapped.rows), np.nan)
 
 
-def texts_of(mapped: Mapped, field: str) -> list[str]:
-    """The names (N) in a column; InputError where one is missing."""
-    for row, text in zip(mapped.cells.rows, mapped.texts(field), strict=True):
-        if not text:
-            raise bad_field(mapped.path, mapped.mapping.columns[field], text, NAMES[field], row=row)
-    return list(mapped.texts(field))
-
-
 def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
     """EPCs as the map writes them: without the marks of Python's bytes, which some versions of sllurp leave."""
-    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts_of(mapped, "epc")]
+    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in mapped.names(RFID["epc"])]
     return in_case(plain, case)
 
 
@@ -208,7 +201,7 @@ def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) 
     return np.asarray(table[np.where(np.isnan(number), len(table), number).astype(np.int64) - 1])
 
 
-def _with_last(table: Table, mapped: Mapped, options: RfidFile, warnings: list[str]) -> Table:
+def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: list[str]) -> TableRows:
     """With a second read, of which only the time is known, for each row that stands for more than one."""
     if "last" not in mapped.fields:
         if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
@@ -231,10 +224,10 @@ def _with_last(table: Table, mapped: Mapped, options: RfidFile, warnings: list[s
     return _taken(table, np.concatenate((np.arange(len(last_ns)), np.flatnonzero(several))), last_ns)
 
 
-def _taken(table: Table, order: Integers, last_ns: Integers) -> Table:
+def _taken(table: TableRows, order: Integers, last_ns: Integers) -> TableRows:
     """The rows ``order`` (M,), the later ones of which are the last reads of rows that came before."""
     repeated = np.arange(len(order)) >= len(table.rows)
-    return Table(
+    return TableRows(
         table.path,
         table.rows[order],
         np.where(repeated, last_ns[order], table.t_ns[order]),
@@ -243,10 +236,10 @@ def _taken(table: Table, order: Integers, last_ns: Integers) -> Table:
     )
 
 
-def _in_time(table: Table) -> Table:
+def _in_time(table: TableRows) -> TableRows:
     """In the order of time: readers report in batches, in any order."""
     order = np.argsort(table.t_ns, kind="stable")
-    return Table(
+    return TableRows(
         table.path,
         table.rows[order],
         table.t_ns[order],

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.columns import TAGS, require_span
+from factorgraph_loc.files.columns import require_span
 from factorgraph_loc.files.csv_cells import read_cells
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
 from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
@@ -24,6 +24,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry import simulation as simulated_odometry
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
+from factorgraph_loc.sensors.rfid.columns import TAGS
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.rounds import ends_of, make_rfid_stream, rounds_from_gaps
 from factorgraph_loc.sensors.rfid.stream import RfidStream

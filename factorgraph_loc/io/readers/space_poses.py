@@ -11,7 +11,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.tables import Table
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.readers.columns import read_columns
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -79,12 +79,12 @@ def read_poses(
     return t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, positions[keep], rotations[keep])
 
 
-def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> Table:
+def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> TableRows:
     """The stamps and names of images, as the table ``camera`` of the native format."""
     columns = {"t": "1", "file": "2"}
     told = ColumnMapping(file=path.name, columns=columns, units={"t": unit}, separator=separator, header=False)
     mapped = read_mapped(path, told, (("t", "file"),))
-    return Table(path, mapped.rows, mapped.stamps("t"), {}, {"file": list(mapped.texts("file"))})
+    return TableRows(path, mapped.rows, mapped.stamps("t"), {}, {"file": list(mapped.texts("file"))})
 
 
 def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:

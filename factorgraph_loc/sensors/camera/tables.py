@@ -1,26 +1,25 @@
-"""Images and identified pixels in the native format: ``camera.csv`` with the folder ``camera``, and ``sightings.csv``.
+"""Images in the native format: ``camera.csv`` with the folder ``camera``.
 
 Images are not opened here: whether they can be decoded, and have the size that the camera was calibrated for, is found out
 where their features are looked for (:mod:`factorgraph_loc.sensors.camera.frontend`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.bounded import NoFileNameError, copy_file
-from factorgraph_loc.files.columns import SIGHTINGS
 from factorgraph_loc.files.models import inside
-from factorgraph_loc.files.tables import Table
-from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 
-IMAGES = ("t_ns", "file")
-PIXELS = ("t_ns", "landmark", "u", "v")
 FOLDER = "camera"
 
 
-def make_images(table: Table, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
+def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
     """The images that there are, in order of arrival; of several at one stamp the last. They lie below ``folder``, which was
     checked itself, by default that of the native format.
 
@@ -43,14 +42,18 @@ def make_images(table: Table, t0_ns: int, warnings: list[str], folder: Path | No
     return ImageStream(t, [path for path in (paths[i] for i in keep) if path is not None])
 
 
-def make_pixels(table: Table, t0_ns: int, warnings: list[str]) -> SightingStream:
-    """Identified pixels in order of arrival; of one point at one stamp the last."""
-    for field in ("u", "v"):
-        SIGHTINGS[field].require(table.path, table.rows, table.numbers[field])
-    names = table.names["landmark"]
-    keep = checks.sightings_in_order(table.path, table.rows, table.t_ns, names, warnings)
-    t = checks.seconds(table.t_ns[keep], t0_ns)
-    return SightingStream(t, [names[i] for i in keep], table.numbers["u"][keep], table.numbers["v"][keep])
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
+    """The images of a log's folder."""
+    return make_images(rows["camera"], reading.t0_ns, reading.warnings)
+
+
+def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
+    """The rows of images, which are copied into the folder; InputError for features, which cannot be written."""
+    if not isinstance(stream, ImageStream):
+        raise InputError(f"{writing.log}: camera holds features, expected the images in which they were found")
+    return {
+        "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
+    }
 
 
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:

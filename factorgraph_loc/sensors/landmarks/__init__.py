@@ -10,6 +10,7 @@ SENSOR = SensorType(
             "bearing_range",
             streams=("factorgraph_loc.sensors.landmarks.stream:BearingRangeStream",),
             measurements=("factorgraph_loc.sensors.landmarks.measurement:BearingRange",),
+            tables=("factorgraph_loc.sensors.landmarks.columns:BEARING_RANGE",),
             section="bearing_range",
         ),
     ),

@@ -4,15 +4,15 @@ A read belongs to the round of its antenna that holds its stamp, or to the one t
 are found from the gaps between reads; then a round that read nothing is not known of.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.columns import RFID
-from factorgraph_loc.files.tables import Table
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.sensors.rfid.columns import RFID
 from factorgraph_loc.sensors.rfid.rounds import (
     OUTSIDE,
     ends_of,
@@ -20,16 +20,13 @@ from factorgraph_loc.sensors.rfid.rounds import (
     rounds_from_gaps,
     rounds_from_inventories,
 )
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factors.se2 import Array, Integers
 
-_READ = ("t_ns", "antenna", "epc")
-_SIGNALS = (("rssi", "phase", "frequency"), ("rssi",), ())  # what readers tell of a read
-READS = tuple((*_READ, *signals, *told) for signals in _SIGNALS for told in (("inventory",), ()))
-INVENTORIES = ("t_ns", "antenna", "duration")
-SIGNALS = _SIGNALS[0]
-
-Columns = Mapping[str, Array | Integers | Sequence[str]]
+SIGNALS = ("rssi", "phase", "frequency")  # what readers tell of a read
+ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,20 @@ class Rounds:
         return make_rfid_stream(self.t_ns, self.number, self.epc, self.columns, self.end_ns, self.antenna, t0_ns)
 
 
-def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warnings: list[str]) -> Rounds:
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
+    """The stream of reads in the rounds of inventories, or in those that gaps between reads tell apart."""
+    settings = reading.rig.find(RfidSettings)
+    gap = ROUND_GAP if settings is None else settings.round_gap
+    return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
+
+
+def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
+    """The columns of both tables."""
+    reads, inventories = tables_of(stream, writing.t0_ns)
+    return {"rfid": reads, "inventories": inventories}
+
+
+def read_rounds(reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[str]) -> Rounds:
     """The reads in their rounds; ``gap`` [s] between rounds where there are no ``inventories``.
 
     InputError names file, row and field of what is wrong; reads outside every inventory are left out, with a warning.
@@ -67,7 +77,7 @@ def read_rounds(reads: Table | None, inventories: Table | None, gap: float, warn
     return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
 
 
-def _from_inventories(reads: Table | None, inventories: Table, warnings: list[str]) -> Rounds:
+def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[str]) -> Rounds:
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
     # a reader's clock that jumps is a fault of the recording: what it stamped in the past is for the estimators to drop
@@ -87,7 +97,7 @@ def _from_inventories(reads: Table | None, inventories: Table, warnings: list[st
     return _rounds(reads, keep, number[keep], end_ns, antenna)
 
 
-def _told(reads: Table, end_ns: Integers, antenna: list[str]) -> Integers:
+def _told(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
     """The rounds (N,) that the reads themselves name, by their places in the other table, from 1."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
@@ -104,14 +114,14 @@ def _told(reads: Table, end_ns: Integers, antenna: list[str]) -> Integers:
     return number
 
 
-def _rounds(reads: Table, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
+def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
     return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
-def check_reads(reads: Table) -> None:
+def check_reads(reads: TableRows) -> None:
     """InputError for what no radio measures, as in another unit."""
     for name in SIGNALS:
         if name in reads.numbers:

@@ -10,6 +10,7 @@ SENSOR = SensorType(
             "twist",
             streams=("factorgraph_loc.sensors.twist.stream:TwistStream",),
             measurements=("factorgraph_loc.sensors.twist.measurement:Twist",),
+            described=("factorgraph_loc.sensors.twist.columns:TWIST",),
             section="twist",
             motion="space",
         ),

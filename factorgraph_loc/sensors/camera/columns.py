@@ -1,0 +1,33 @@
+"""The tables of cameras."""
+
+from dataclasses import replace
+
+from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, number, within
+
+CAMERA = Table("camera", (STAMP, named("file", "the name of an image", "file")), "one each")
+SIGHTINGS = Table(
+    "sightings",
+    (
+        STAMP,
+        named("landmark", "the name of a landmark", field="point"),
+        within("u", PIXELS, LARGEST_PIXEL, "to the right; beside the image too"),
+        within("v", PIXELS, LARGEST_PIXEL, "down"),
+    ),
+    "one measurement",
+    stream="factorgraph_loc.sensors.camera.stream:SightingStream",
+)
+SIGHTINGS_RIGHT = replace(
+    SIGHTINGS, name="sightings_right", stream="factorgraph_loc.sensors.camera.stream:RightSightingStream"
+)
+# of images, as a program hands them over
+FEATURES = Table(
+    "features",
+    (
+        STAMP,
+        within("pixels", PIXELS, LARGEST_PIXEL, "where it was found"),
+        number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "how large it is"),
+        within("descriptors", PURE, 1e6, "what it looks like"),
+        Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number that stays with what is followed"),
+    ),
+    "one measurement",
+)

@@ -1,0 +1,52 @@
+"""The tables of wheel odometry and gyro."""
+
+from factorgraph_loc.files.columns import (
+    ANGLE,
+    FASTEST,
+    FASTEST_TURN,
+    LENGTH,
+    LONGEST_WAY,
+    MOST_TURNED,
+    RATE,
+    SPEED,
+    STAMP,
+    Table,
+    within,
+)
+
+VELOCITIES = Table(
+    "odometry",
+    (
+        STAMP,
+        within("v", SPEED, FASTEST, "forward speed, held until the next row"),
+        within("w", RATE, FASTEST_TURN, "turn rate, held until the next row"),
+    ),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.stream:VelocityStream",
+)
+INCREMENTS = Table(
+    "odometry",
+    (
+        STAMP,
+        within("dx", LENGTH, LONGEST_WAY, "way ahead since the row before"),
+        within("dy", LENGTH, LONGEST_WAY, "way to the left since the row before"),
+        within("dtheta", ANGLE, MOST_TURNED, "turn since the row before"),
+    ),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.stream:IncrementStream",
+)
+IMU = Table(
+    "imu",
+    (STAMP, within("w", RATE, FASTEST_TURN, "turn rate of a gyro")),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.stream:YawRateStream",
+)
+# of what counters of wheels told; made into increments
+WAYS = Table(
+    "odometry",
+    (
+        STAMP,
+        *(within(side, LENGTH, 1e9, "way of that wheel so far; counters hold 32 bits") for side in ("left", "right")),
+    ),
+    "one each",
+)

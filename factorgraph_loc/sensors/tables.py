@@ -1,0 +1,154 @@
+"""From tables to streams and back, by the descriptions of their columns.
+
+A sensor whose stream has the columns as its fields needs no more than their description, a
+:class:`~factorgraph_loc.files.columns.Table`; others say in their package how rows become a stream, the ``assemble`` of a channel,
+and a stream becomes rows, its ``disassemble``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.columns import STAMP, Column, Table
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.registry import Channel, channels, sensors
+from factors.se2 import Array, Integers
+
+Columns = Mapping[str, Array | Integers | Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What rows are made into a stream with: the ``rig``, the absolute time of t = 0, and where warnings go."""
+
+    rig: Rig
+    t0_ns: int
+    warnings: list[str]
+
+
+@dataclass(frozen=True)
+class Writing:
+    """What a stream is made into rows with: the name of its log, the absolute time of t = 0, and the ``folder`` of the tables."""
+
+    log: str
+    t0_ns: int
+    folder: Path
+
+
+@cache
+def tables_of(channel: Channel) -> tuple[Table, ...]:
+    """The tables in which a log keeps a channel; several of one name may stand for one another."""
+    return tuple(load(place) for place in channel.tables)
+
+
+@cache
+def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
+    """The channel and the descriptions of each table of a log, by its name."""
+    return {
+        table.name: (channel, tuple(other for other in tables_of(channel) if other.name == table.name))
+        for channel in channels().values()
+        for table in tables_of(channel)
+    }
+
+
+def all_tables() -> Iterator[Table]:
+    """The descriptions of all tables of all sensors."""
+    for sensor in sensors().values():
+        for channel in sensor.channels:
+            yield from (load(place) for place in (*channel.tables, *channel.described))
+        yield from (load(layer.table) for layer in sensor.layers.values() if layer.table)
+
+
+def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:
+    """The stream of a channel from the ``rows`` of its tables by their names; what is wrong is an InputError or a warning."""
+    if channel.assemble:
+        made: Stream = load(channel.assemble)(rows, reading)
+        return made
+    ((name, only),) = rows.items()
+    table = next(
+        t for t in tables_of(channel) if t.name == name and {*only.numbers, *only.names} >= set(t.shapes[0][1:])
+    )
+    return stream_of(table, only, reading.t0_ns, reading.warnings)
+
+
+def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
+    """Rows as the stream of their table.
+
+    Rows of one stamp that are one measurement together keep the last of each name, others the last of each stamp. InputError names
+    file, row and column of what lies outside its bounds, stamps that go back, and rows in which nothing was measured.
+    """
+    values: dict[str, Any] = dict(rows.names)
+    measured = [column for column in table.columns if column.name in rows.numbers]
+    for column in measured:
+        column.require(rows.path, rows.rows, rows.numbers[column.name])
+    if measured and len(nothing := np.flatnonzero(_all_empty([rows.numbers[column.name] for column in measured]))):
+        expected = ", ".join(f"a {column.name}" for column in measured) + " or both" * (len(measured) == 2)
+        raise bad_field(rows.path, "row", "", expected, row=int(rows.rows[nothing[0]]))
+    for column in measured:
+        values[column.name] = _without_small(column, rows, warnings)
+    if table.rows_of_one_stamp == "one each":
+        keep = checks.in_order(rows.path, rows.rows, rows.t_ns, warnings)
+    else:
+        names = next(iter(rows.names.values()), None) or [str(row) for row in rows.rows]
+        keep = checks.sightings_in_order(rows.path, rows.rows, rows.t_ns, names, warnings)
+        if measured:
+            keep = keep[~_all_empty([values[column.name][keep] for column in measured])]
+    kept = {
+        column.field or column.name: values[column.name][keep]
+        if isinstance(values[column.name], np.ndarray)
+        else [values[column.name][i] for i in keep]
+        for column in table.columns
+        if column.name in values
+    }
+    made: Stream = load(table.stream)(t=checks.seconds(rows.t_ns[keep], t0_ns), **kept)
+    return made
+
+
+def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
+    """In which rows (N,) no column has a number."""
+    return np.asarray(np.isnan(columns).all(axis=0))
+
+
+def _without_small(column: Column, rows: TableRows, warnings: list[str]) -> Array:
+    """The numbers (N,) of a column without those that it leaves out."""
+    values = rows.numbers[column.name]
+    small = np.flatnonzero(values < column.left_out_below)
+    if not len(small):
+        return values
+    first = f"{rows.path}:{int(rows.rows[small[0]])}: {column.name} is {values[small[0]]:g}"
+    warnings.append(f"{first}: {len(small)} {column.name}s that are not above 0 are left out")
+    return np.where(values >= column.left_out_below, values, np.nan)
+
+
+def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
+    """The columns of a stream's tables by their names; files that a table names are copied into the folder. InputError where a
+    stream has none."""
+    if channel.disassemble:
+        made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
+        return made
+    for table in tables_of(channel):
+        if table.stream and isinstance(stream, load(table.stream)):
+            fields = {c.name: getattr(stream, c.field or c.name) for c in table.columns if c is not STAMP}
+            return {table.name: {STAMP.name: checks.absolute(stream.t, writing.t0_ns), **fields}}
+    raise InputError(
+        f"{writing.log}: {channel.name} has no table in this format, expected the log of a robot on a floor"
+    )
+
+
+def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
+    """The bounds of a stream's numbers, by the names of its fields."""
+    for table in (*tables_of(channel), *(load(place) for place in channel.described)):
+        if table.stream == f"{type(stream).__module__}:{type(stream).__qualname__}":
+            yield from (column.measured for column in table.columns if column.kind == "number")
