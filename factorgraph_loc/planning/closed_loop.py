@@ -30,9 +30,9 @@ from factorgraph_loc.sensors.odometry.simulation import RATE
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.simulation.chance import generator
 from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.simulation.simulate import generators
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.text import quoted
 from factors import se2
@@ -74,7 +74,7 @@ def run_active(
     chooser = make_policy(policy)
 
     def of_world() -> np.random.Generator:
-        return generators(seed if simulation.world_seed is None else simulation.world_seed)[0]
+        return generator(seed if simulation.world_seed is None else simulation.world_seed, "world")
 
     world = make_world(simulation.world, of_world())
     space = free_space(world, settings.clearance)

@@ -60,18 +60,26 @@ class SensorType:
     together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
     diagnostics)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in the map
     and the words for that nothing of it was found, or None.
+
+    Of simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
+    :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:
+    ``(settings)``, how often per second a drive looks for all things of a kind, by a plural for these; ValueError where the
+    settings do not fit together.
     """
 
     name: str
     channels: tuple[Channel, ...]
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
+    simulation: Mapping[str, Section] = field(default_factory=dict)
     summarize: Place = ""
     draw: Place = ""
     check: Place = ""
     prepare: Place = ""
     doubts: Place = ""
     findable: Place = ""
+    simulate: Place = ""
+    looks: Place = ""
 
 
 def sensors() -> Mapping[str, SensorType]:

@@ -14,11 +14,13 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.simulated import times as times_of
+from factorgraph_loc.simulation.chance import generator
 from factorgraph_loc.simulation.plans import make_plan
 from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.simulation.simulate import generators, ticks, with_sensors
+from factorgraph_loc.simulation.simulate import with_sensors
 from factorgraph_loc.simulation.trajectories import drive
 from factorgraph_loc.simulation.worlds import make_world
 from factors import se2
@@ -79,7 +81,7 @@ class Film:
         return np.asarray(change / (b - a))
 
     def _gain(self, t: float) -> float:
-        phases = generators(self.seed)[11].uniform(0.0, 2.0 * np.pi, len(PERIODS))
+        phases = generator(self.seed, "exposure").uniform(0.0, 2.0 * np.pi, len(PERIODS))
         wave = sum(math.sin(2.0 * math.pi * t / period + phase) for period, phase in zip(PERIODS, phases, strict=True))
         return math.exp(self.renderer.settings.gain_drift * wave)
 
@@ -93,12 +95,11 @@ def film(settings: SimulationSettings, seed: int) -> Film:
     if camera is None:
         raise InputError(f"rig {settings.rig.name}: has no camera, expected one to take images with")
     world_seed = seed if settings.world_seed is None else settings.world_seed
-    of_world = generators(world_seed)
-    world = make_world(settings.world, of_world[0])
-    plan = make_plan(settings.world, generators(world_seed)[0])
-    scene = make_scene(plan, list(world.tags.values()), of_world[10])
-    truth = drive(world, settings.drive, generators(seed)[1])
-    times = ticks(settings.images.rate, truth)
+    world = make_world(settings.world, generator(world_seed, "world"))
+    plan = make_plan(settings.world, generator(world_seed, "world"))
+    scene = make_scene(plan, list(world.tags.values()), generator(world_seed, "look"))
+    truth = drive(world, settings.drive, generator(seed, "drive"))
+    times = times_of(settings.images.rate, truth)
     return Film(Renderer(scene, camera.model(), settings.images), truth, times, times - camera.time_offset, seed)
 
 
@@ -117,7 +118,7 @@ def with_images(
     told how many images there are, of how many. InputError as of :func:`film`.
     """
     assert log.reference is not None, "a simulated log has one"
-    times = ticks(settings.images.rate, log.reference)
+    times = times_of(settings.images.rate, log.reference)
     count = len(times)
     if workers == 1 or count <= FEW:
         _write(settings, seed, folder, range(count), lambda done: tell(done, count))

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import FileModel, inside, nearest, parse_model, read_toml
+from factorgraph_loc.files.models import FileModel, add_fields, inside, nearest, parse_model, read_toml
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.simulation_units import Hertz
-from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
-from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
-from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings, PhaseSettings, RssiSettings
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.registry import functions, sensors
+from factorgraph_loc.text import quoted
 
 MOST_TAGS = 10_000
 MOST_LOOKS = 50_000_000  # of a kind of sensor at tags, landmarks or points: all are in memory at once
@@ -29,7 +28,7 @@ class WorldSettings(FileModel):
 
     ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
     ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
-    ``points``: named points on walls and furniture that a camera may see (:class:`PixelSettings`).
+    ``points``: named points on walls and furniture that a camera may see.
     """
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
@@ -81,50 +80,48 @@ class ImageSettings(FileModel):
 
 
 class SimulationSettings(FileModel):
-    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rssi``, ``phase``: if given, reads have
-    one. ``rig``: what estimators are told, and what reads and sightings are drawn from. ``world_seed``: of the world, its look and
-    its survey, if several drives are to go through one world; else the seed of the log is theirs too."""
+    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: what estimators are told, and what
+    reads and sightings are drawn from. ``world_seed``: of the world, its look and its survey, if several drives are to go through
+    one world; else the seed of the log is theirs too. Other sections are those that sensors register: ``sightings``, ``rssi`` and
+    ``phase``, which reads have if they are given, ``faults`` of them, ``pixels``."""
 
     name: str = "office"
     world: WorldSettings
     world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
-    rssi: RssiSettings | None = None
-    phase: PhaseSettings | None = None
-    sightings: SightingSettings = SightingSettings()
-    pixels: PixelSettings = PixelSettings()
     images: ImageSettings = ImageSettings()
-    faults: FaultSettings = FaultSettings()
     rig: Rig
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **values: Any) -> None: ...
+        def __getattr__(self, section: str) -> Any: ...
 
     @model_validator(mode="after")
     def _fits(self) -> SimulationSettings:
-        if self.rig.rfid is None:
-            raise ValueError("the rig has no rfid, expected antennas")
-        if self.world.landmarks and self.rig.bearing_range is None:
-            raise ValueError("the world has landmarks, expected a rig with bearing_range")
-        if self.world.points and self.rig.camera is None:
-            raise ValueError("the world has points, expected a rig with a camera")
-        stop = self.faults.antenna_stop
-        names = list(self.rig.rfid.all_antennas())
-        if stop is not None and stop.antenna not in names:
-            raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
         for what, looks in self.looks().items():
             if looks > MOST_LOOKS:
                 raise ValueError(f"{what} are looked for {looks:,.0f} times in all, expected at most {MOST_LOOKS:,}")
         return self
 
     def looks(self) -> dict[str, float]:
-        """How often a drive looks for each of its tags, landmarks and points, added up over all that there are of a kind."""
-        assert self.rig.rfid is not None
-        rounds = self.rounds_per_second * len(self.rig.rfid.all_antennas())
-        per_second = {
-            "tags": rounds * self.world.tag_count(),
-            "landmarks": self.sightings.rate * self.world.landmarks,
-            "points": self.pixels.rate * self.world.points,
-        }
+        """How often a drive looks for each of its tags, landmarks and points, added up over all that there are of a kind.
+        ValueError where the settings do not fit together."""
+        per_second = {what: often for _, looks in functions("looks") for what, often in looks(self).items()}
         return {what: self.drive.duration * often for what, often in per_second.items()}
+
+
+def _add_sections() -> None:
+    added: dict[str, tuple[Any, Any]] = {}
+    for sensor in sensors().values():
+        for name, section in sensor.simulation.items():
+            kind = load(section.kind)
+            added[name] = (kind, kind()) if section.always else (kind | None, None)
+    add_fields(SimulationSettings, added, after="rounds_per_second")
+
+
+_add_sections()
 
 
 # eight antennas at the tags' height; the odometry's noise is that of wheel_odometry

@@ -46,4 +46,9 @@ SENSOR = SensorType(
     doubts="factorgraph_loc.sensors.camera.describe:doubts",
     findable="factorgraph_loc.sensors.camera.describe:findable",
     draw="factorgraph_loc.sensors.camera.draw:draw",
+    simulation={
+        "pixels": Section("factorgraph_loc.sensors.camera.simulation_settings:PixelSettings", always=True),
+    },
+    simulate="factorgraph_loc.sensors.camera.simulation:simulate",
+    looks="factorgraph_loc.sensors.camera.simulation:looks",
 )

@@ -1,6 +1,8 @@
 """Pixels of named points in sight, drawn from the camera's model without any image."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -8,12 +10,30 @@ from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
 from factorgraph_loc.sensors.camera.stream import SightingStream
+from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 NEAR = 0.3  # m of depth, below which no point is recognized
 OBLIQUE = math.radians(75.0)  # from a surface's normal, beyond which nothing on it is recognized
+
+
+def simulate(ride: Ride) -> Simulated:
+    """The pixels that the camera of a simulated drive identifies, in a world with points."""
+    if ride.world.points is None:
+        return Simulated()
+    settings, camera = ride.settings.pixels, ride.rig.camera
+    times = ride.times(settings.rate)
+    seen = pixel_stream(camera.model(), ride.world, times, ride.truth.at(times), settings, ride.rng("points"))
+    return Simulated({"sightings": replace(seen, t=seen.t - camera.time_offset)})
+
+
+def looks(settings: Any) -> dict[str, float]:
+    """How often per second a simulated drive looks for all points; ValueError without a camera for them."""
+    if settings.world.points and settings.rig.camera is None:
+        raise ValueError("the world has points, expected a rig with a camera")
+    return {"points": settings.pixels.rate * settings.world.points}
 
 
 def pixel_stream(

@@ -20,4 +20,9 @@ SENSOR = SensorType(
     check="factorgraph_loc.sensors.landmarks.describe:check",
     findable="factorgraph_loc.sensors.landmarks.describe:findable",
     draw="factorgraph_loc.sensors.landmarks.draw:draw",
+    simulation={
+        "sightings": Section("factorgraph_loc.sensors.landmarks.simulation_settings:SightingSettings", always=True),
+    },
+    simulate="factorgraph_loc.sensors.landmarks.simulation:simulate",
+    looks="factorgraph_loc.sensors.landmarks.simulation:looks",
 )

@@ -1,5 +1,7 @@
 """Range and bearing of landmarks in sight, drawn from the model of a rig."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,10 +9,29 @@ from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.landmarks.model import BearingRangeModel
 from factors.se2 import Array
+
+
+def simulate(ride: Ride) -> Simulated:
+    """The sightings of a simulated drive through a world with landmarks."""
+    if not ride.world.landmarks:
+        return Simulated()
+    settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
+    model, poses = ride.rig.bearing_range.model(), ride.truth.at(times)
+    return Simulated(
+        {"bearing_range": sighting_stream(model, ride.world, times, poses, settings, ride.rng("landmarks"))}
+    )
+
+
+def looks(settings: Any) -> dict[str, float]:
+    """How often per second a simulated drive looks for all landmarks; ValueError without a sensor for them."""
+    if settings.world.landmarks and settings.rig.bearing_range is None:
+        raise ValueError("the world has landmarks, expected a rig with bearing_range")
+    return {"landmarks": settings.sightings.rate * settings.world.landmarks}
 
 
 def sighting_stream(

@@ -39,4 +39,5 @@ SENSOR = SensorType(
         "imu": Section("factorgraph_loc.sensors.odometry.settings:ImuSettings"),
     },
     summarize="factorgraph_loc.sensors.odometry.summary:summarize",
+    simulate="factorgraph_loc.sensors.odometry.simulation:simulate",
 )

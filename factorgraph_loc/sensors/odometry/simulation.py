@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_loc.model.ticks import TICK_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors import se2
 from factors.se2 import Array
 
@@ -23,6 +24,11 @@ DESCRIPTION = (
     "simulated at 10 Hz from increments of the reference: scale errors of distance and rotation 2 %, heading drift 1 deg/m, "
     "noise per sqrt(m) 0.01 m along, 0.005 m across, 1.5 deg in heading"
 )
+
+
+def simulate(ride: Ride) -> Simulated:
+    """The wheels of a simulated drive."""
+    return Simulated({"odometry": wheel_odometry(ride.truth, int(ride.rng("odometry").integers(2**32)))})
 
 
 def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:

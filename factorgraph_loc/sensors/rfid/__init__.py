@@ -32,4 +32,11 @@ SENSOR = SensorType(
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
     findable="factorgraph_loc.sensors.rfid.describe:findable",
     draw="factorgraph_loc.sensors.rfid.draw:draw",
+    simulation={
+        "rssi": Section("factorgraph_loc.sensors.rfid.simulation_settings:RssiSettings"),
+        "phase": Section("factorgraph_loc.sensors.rfid.simulation_settings:PhaseSettings"),
+        "faults": Section("factorgraph_loc.sensors.rfid.simulation_settings:FaultSettings", always=True),
+    },
+    simulate="factorgraph_loc.sensors.rfid.simulated_drive:simulate",
+    looks="factorgraph_loc.sensors.rfid.simulated_drive:looks",
 )

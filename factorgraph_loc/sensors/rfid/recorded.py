@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors import se2
 from factors.rfid.detection import TagArray
@@ -39,6 +40,10 @@ class RecordedLooks:
     read: Array
     reach: float
     tree: cKDTree
+
+    def carried_by(self, rig: Rig) -> Rig:
+        """A rig with the recorded antennas, in a world that was surveyed without error."""
+        return rig.model_copy(update={"rfid": self.rfid, "survey": SurveySettings()})
 
     def outcomes(self, tags: TagArray, poses: Array, rng: np.random.Generator) -> Array:
         """What a round of each antenna at poses (N, 3) reads of each tag: 0 or 1, (N, A, T).
