@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence as Several
+from pathlib import Path
 
 import numpy as np
 
 from factorgraph_loc.evaluation.features.repeatability import OVERLAP_ERROR, SCALE_RATIO, common, overlaps
 from factorgraph_loc.evaluation.features.sequences import Sequence
+from factorgraph_loc.files.models import replacing
 from factorgraph_loc.vision.colour import Float
-from factorgraph_loc.vision.colour_features import ColourExtractor
-from factorgraph_loc.vision.descriptor import values
-from factorgraph_loc.vision.weights import Weights, learn
+from factorgraph_loc.vision.colour_features import ColourExtractor, Weights
+from factorgraph_loc.vision.descriptor import OWN_SCALE, VALUES, values
+from factors.se2 import Array
 
 COUNT = 1000  # points of an image
+SHARE = 0.04  # of the mean variance, that is added to all: what few pairs say of a direction is not certain
 
 
 def learn_weights(sequences: Several[Sequence]) -> Weights:
@@ -43,3 +46,20 @@ def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
         same = pairs.best((pairs.error < OVERLAP_ERROR) & alike)
         matched.append((first_values[rows[same.first]], second_values[columns[same.second]]))
     return matched
+
+
+def learn(first: Float, second: Float) -> Weights:
+    """Weights from the values (N, 35) of N points in one image and (N, 35) of the same points in another."""
+    used = np.delete(np.arange(VALUES), OWN_SCALE)
+    half = (first[:, used].astype(float) - second[:, used]) / np.sqrt(2.0)
+    within = half.T @ half / len(half)
+    within += SHARE * np.trace(within) / len(within) * np.eye(len(within))
+    variances, directions = np.linalg.eigh(within)
+    whitening: Array = np.zeros((VALUES, VALUES))
+    whitening[np.ix_(used, used)] = (directions / np.sqrt(variances)) @ directions.T
+    return Weights(np.vstack([first, second]).mean(axis=0).astype(np.float32), whitening.astype(np.float32))
+
+
+def save(weights: Weights, path: Path) -> None:
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, mean=weights.mean, map=weights.map)

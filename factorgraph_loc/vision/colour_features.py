@@ -1,13 +1,47 @@
 """The paper's colour features behind the interface that all features share."""
 
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.vision import descriptor, detector, weights
+from factorgraph_loc.vision import descriptor, detector
 from factorgraph_loc.vision.colour import Float, colour_channels
 from factorgraph_loc.vision.images import as_image, as_mask, is_blank
 from factorgraph_loc.vision.keypoints import Descriptors, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """How much each of the 35 values of a colour feature counts: a linear map, learnt where the same points are seen twice.
+
+    ``map`` (35, 35) takes the values, less their ``mean`` (35,), to a space where those of one point, seen in two images, differ
+    by as much in all directions: Euclidean distance there is Mahalanobis distance of the values (within-class whitening,
+    Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
+    """
+
+    mean: Float
+    map: Float
+
+    def __call__(self, values: Float) -> Float:
+        """Descriptors (N, 35), of length one, of ``values`` (N, 35)."""
+        mapped = (values - self.mean) @ self.map
+        length = np.linalg.norm(mapped, axis=1, keepdims=True)
+        return np.asarray(mapped / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)
+
+
+@cache
+def shipped_weights() -> Weights:
+    """The weights that come with the package, learnt by ``scripts/learn_feature_weights`` on the sequences bark and graf of
+    Mikolajczyk et al., IJCV 65, 2005."""
+    with (
+        resources.files("factorgraph_loc.vision").joinpath("weights.npz").open("rb") as file,
+        np.load(file, allow_pickle=False) as stored,
+    ):
+        return Weights(stored["mean"], stored["map"])
 
 
 class ColourExtractor:
@@ -32,11 +66,11 @@ class ColourExtractor:
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
         """Those of ``keypoints`` that are in the image, and their descriptors; a point without direction gets one."""
         kept, found = self.record(image, keypoints)
-        return kept, weights.shipped()(descriptor.values(found))
+        return kept, shipped_weights()(descriptor.values(found))
 
     def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
         space, keypoints = self._found(image, mask)
-        return keypoints, weights.shipped()(descriptor.values(self._records(space, keypoints)))
+        return keypoints, shipped_weights()(descriptor.values(self._records(space, keypoints)))
 
     def record(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.void]]:
         """What :meth:`compute` describes, with the raw values, :data:`~factorgraph_loc.vision.descriptor.RECORD`

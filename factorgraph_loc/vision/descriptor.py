@@ -26,6 +26,7 @@ RECORD = np.dtype(
     ]
 )
 VALUES = 35  # of the distance: all but the position
+OWN_SCALE = 20  # which of them is the point's own scale: it has no weight, as a zoom changes it
 
 # in units of a point's scale; the patch cuts the coarsest of the filters short
 SIDE = 24

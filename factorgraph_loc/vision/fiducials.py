@@ -1,8 +1,11 @@
 """Fiducial markers in images, found by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
 fiducial markers under occlusion", Pattern Recognition 2014; for AprilTags their dictionaries, Olson, ICRA 2011).
 
-Each corner of a marker is a point with a name, so that nothing but the reprojection of points is needed to use it. Where exactly
-it is, is found by :mod:`factorgraph_loc.vision.marker_corners`.
+Each corner of a marker is a point with a name, so that nothing but the reprojection of points is needed to use it. It is where
+lines through the edges meet. Looked for at the corner itself (OpenCV's ``cornerSubPix``), blur draws a corner into the square, and
+the marker seems smaller and farther than it is. Across an edge, blur moves as much of the white inwards as of the black outwards,
+so that an edge is where the white ends if what is grey is counted by its share (Tabatabai, Mitchell, "Edge location to subpixel
+values in digital imagery", PAMI 1984, for moments).
 """
 
 from collections import Counter
@@ -12,8 +15,82 @@ import numpy as np
 
 from factorgraph_loc.maps.markers import MarkerFamily
 from factorgraph_loc.vision.images import Image
-from factorgraph_loc.vision.marker_corners import refined_corners
 from factors.se2 import Array
+
+REACH = 3.0  # px to both sides of an edge
+MIN_REACH = 1.5  # px: with less, the greys of an edge are not all seen
+STEP = 0.25  # px between samples across an edge
+INSIDE = (0.12, 0.88)  # of an edge: its ends belong to two
+FARTHEST = 3.0  # px that a corner may move in one pass
+PASSES = 3  # the later ones look along better lines
+MIN_CONTRAST = 20.0  # grey levels
+
+
+def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
+    """The corners (4, 2) [px] of a marker that has ``bits`` along a side, its black border included; as they are given where
+    edges are blurred, covered or short."""
+    for _ in range(PASSES):
+        corners = _met(grey, corners, bits)
+    return corners
+
+
+def _met(grey: Image, corners: Array, bits: int) -> Array:
+    """Where the lines meet that are found near the sides of the square of ``corners``."""
+    middle = corners.mean(axis=0)
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not through the black border
+    if reach < MIN_REACH:
+        return corners
+    lines = [_line(grey, corners[i], corners[(i + 1) % 4], middle, reach) for i in range(4)]
+    out = corners.copy()
+    for i in range(4):
+        first, second = lines[i - 1], lines[i]
+        if first is None or second is None:
+            continue
+        (normal1, offset1), (normal2, offset2) = first, second
+        system = np.stack((normal1, normal2))
+        if abs(np.linalg.det(system)) < 0.1:
+            continue
+        met = np.linalg.solve(system, np.array((offset1, offset2)))
+        if np.linalg.norm(met - corners[i]) <= FARTHEST:
+            out[i] = met
+    return out
+
+
+def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) -> tuple[Array, float] | None:
+    """The line n.p = c along an edge, by its normal (2,) and c [px]; None if the edge cannot be seen."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    normal = np.array((-along[1], along[0])) / length
+    normal = normal if normal @ (middle - start) > 0.0 else -normal  # from white to black
+    shares = np.linspace(*INSIDE, int(np.clip(length, 8, 60)))
+    across = np.arange(-reach, reach + STEP / 2, STEP)
+    places = start + shares[:, None] * along
+    samples = (places[:, None] + across[:, None] * normal).astype(np.float32)
+    # what lies beyond the image is no edge: its border goes on
+    values = cv2.remap(
+        grey, samples[:, :, 0], samples[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(float)
+    white, black = values[:, :2].mean(axis=1), values[:, -2:].mean(axis=1)
+    contrast = white - black
+    if np.median(contrast) < MIN_CONTRAST:
+        return None
+    use = contrast > 0.7 * np.median(contrast)
+    share = np.clip((values[use] - black[use, None]) / contrast[use, None], 0.0, 1.0)
+    weights = np.full(len(across), STEP)
+    weights[[0, -1]] = STEP / 2.0
+    shift = across[0] + share @ weights
+    points = places[use] + shift[:, None] * normal
+    for _ in range(2):  # without what does not lie on the line, a shadow or something before the marker
+        centre = points.mean(axis=0)
+        direction = np.linalg.svd(points - centre, full_matrices=False)[2][0]
+        found = np.array((-direction[1], direction[0]))
+        off = np.abs((points - centre) @ found)
+        keep = off <= max(3.0 * float(np.median(off)), 0.1)
+        if np.count_nonzero(keep) < 4:
+            return None
+        points = points[keep]
+    return found, float(found @ centre)
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:

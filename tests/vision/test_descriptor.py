@@ -5,9 +5,8 @@ import pytest
 
 from factorgraph_loc.vision import descriptor
 from factorgraph_loc.vision.colour_features import ColourExtractor
-from factorgraph_loc.vision.descriptor import LOG_SCALES, RECORD, VALUES, values
+from factorgraph_loc.vision.descriptor import LOG_SCALES, OWN_SCALE, RECORD, VALUES, values
 from factorgraph_loc.vision.keypoints import Keypoints
-from factorgraph_loc.vision.weights import OWN_SCALE
 
 
 def at(x: float, y: float, sigma: float, angle: float = 0.0) -> Keypoints:

@@ -44,7 +44,6 @@ FEATURE_CODE = (
     "keypoints.py",
     "scale_space.py",
     "weights.npz",
-    "weights.py",
 )
 TRACK_CODE = ("matching.py", "tracks.py")
 PART = 8  # images that a process is given at a time

@@ -17,7 +17,7 @@ from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.fiducials import find_markers
 from factorgraph_loc.vision.images import read_image
 
-CODE = ("fiducials.py", "marker_corners.py", "images.py")  # what is found depends on
+CODE = ("fiducials.py", "images.py")  # what is found depends on
 Marked = list[tuple[int, list[list[float]]]]  # numbers of markers, and the pixels of their corners
 
 
