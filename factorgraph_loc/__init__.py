@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.io.readers.load import load, read_log
     from factorgraph_loc.io.write import write_log
     from factorgraph_loc.live.localizer import Localizer
-    from factorgraph_loc.live.pushed import RfidRead
     from factorgraph_loc.maps.points import PointMap
     from factorgraph_loc.model.belief import PoseEstimate
     from factorgraph_loc.model.log import Log, StartPose
@@ -58,6 +57,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
     from factorgraph_loc.sensors.rfid.map import Tag
     from factorgraph_loc.sensors.rfid.measurement import RfidScan
+    from factorgraph_loc.sensors.rfid.pushed import RfidRead
     from factorgraph_loc.sensors.rfid.stream import RfidStream
     from factorgraph_loc.sensors.twist.measurement import Twist
     from factorgraph_loc.sensors.twist.stream import TwistStream
@@ -140,7 +140,7 @@ _MODULES = {
     "io.readers.load": ("load", "read_log"),
     "io.write": ("write_log",),
     "live.localizer": ("Localizer",),
-    "live.pushed": ("RfidRead",),
+    "sensors.rfid.pushed": ("RfidRead",),
     "maps.points": ("PointMap",),
     "model.belief": ("PoseEstimate",),
     "model.log": ("Log", "StartPose"),

@@ -31,7 +31,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
         "factorgraph_loc.vision.frame",
     ),
     "factorgraph_loc.points": ("factorgraph_loc.maps.points",),
-    "factorgraph_loc.pushed": ("factorgraph_loc.live.pushed",),
+    "factorgraph_loc.pushed": ("factorgraph_loc.sensors.pushed", "factorgraph_loc.sensors.rfid.pushed"),
     "factorgraph_loc.readers": (
         "factorgraph_loc.io.readers",
         "factorgraph_loc.io.native.native",

@@ -12,25 +12,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorgraph_loc.errors import InputError, RunFailedError, bad_field
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.files.values import seconds_of
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import Estimator, ForgettingEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_trajectory
-from factorgraph_loc.live.pushed import RfidRead, checked, scan_of, seconds_of, sensor_of
 from factorgraph_loc.live.start import prior_of, require_options, usable_sensors
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt
-from factorgraph_loc.model.measurement import Exteroceptive, Odometry, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.ticks import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.camera.prepare import frontend_of
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
-from factorgraph_loc.text import plain
-from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.sensors.pushed import checked
+from factorgraph_loc.sensors.registry import channels
+from factorgraph_loc.sensors.rfid.pushed import RfidRead, scan_of
 
 if TYPE_CHECKING:
     from factorgraph_loc.sensors.camera.live import LiveFrontend
@@ -109,7 +110,7 @@ class Localizer:
         with self._lock:
             self._begin_anew(new, start, guard)
 
-    def push(self, measurement: Odometry | Exteroceptive) -> None:
+    def push(self, measurement: Measurement) -> None:
         """Take a measurement, in the order of arrival: one that is late goes in at its time if it is late by at most the
         estimator's ``max_delay``, else it is counted and dropped.
 
@@ -204,9 +205,12 @@ class Localizer:
         self._prior = prior  # its time is NaN until the first measurement tells it
         # from the first measurement on, or from the prior's time
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
-        self._newest = self._newest_increment = self._tidied = -math.inf
+        self._newest = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # nothing has changed since
-        self._widths: dict[str, int] = {}  # of descriptors, by their feature
+        known = channels()
+        self._sequences: dict[str, Any] = {
+            name: load(known[name].sequence)(self._rig, self._world) for name in self._sensors if known[name].sequence
+        }
 
     def _require_whole(self) -> None:
         if self._failure is not None:
@@ -218,16 +222,13 @@ class Localizer:
             raise InputError(f"{what} came before initialize(), expected that first")
         return self._estimator
 
-    def _take(self, m: Odometry | Exteroceptive) -> None:
+    def _take(self, m: Measurement) -> None:
         estimator = self._begun(f"{type(m).__name__} at {m.t:.3f} s")
-        sensor = sensor_of(m)
-        if sensor not in self._sensors:
-            estimator.diagnostics.ignore(f"{sensor} is not among the sensors")
+        if m.sensor not in self._sensors:
+            estimator.diagnostics.ignore(f"{m.sensor} is not among the sensors")
             return
-        m = replace(m, t=m.t + self._rig.time_offset(sensor))
+        m = _moved(m, self._rig.time_offset(m.sensor))
         self._check_stamp(m)
-        if isinstance(m, CameraFrame) and len(m.pixels):
-            self._check_width(m)
         self._newest, self._last = max(self._newest, m.t), None
         try:
             self._feed(estimator, m)
@@ -239,7 +240,7 @@ class Localizer:
             raise
         self._tidy(estimator)
 
-    def _feed(self, estimator: Estimator, m: Odometry | Exteroceptive) -> None:
+    def _feed(self, estimator: Estimator, m: Measurement) -> None:
         if self._ticks is None:
             self._ticks = Ticks(m.t)
             if self._prior is not None:
@@ -249,34 +250,20 @@ class Localizer:
         # as in a run of a log: a tick comes after all that was measured by then
         for t in self._ticks.before(m.t):
             self._guard.process(estimator, Tick(t))
-        if not isinstance(m, Odometry) and not self._is_under_way(m.t):
+        if not m.is_motion and not self._is_under_way(m.t):
             estimator.diagnostics.ignore("before the start")
             return
         self._guard.process(estimator, m)
 
-    def _check_stamp(self, m: Odometry | Exteroceptive) -> None:
+    def _check_stamp(self, m: Measurement) -> None:
         where = f"{type(m).__name__} at {m.t:.3f} s"
         if math.isfinite(self._newest) and m.t > self._newest + AHEAD:
             raise InputError(
                 f"{where}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
                 f"after a pause"
             )
-        if isinstance(m, IncrementOdometry):
-            if m.t < self._newest_increment:
-                raise InputError(
-                    f"{where}: follows one at {self._newest_increment:.3f} s, expected increments in order of time"
-                )
-            self._newest_increment = m.t
-
-    def _check_width(self, m: CameraFrame) -> None:
-        """InputError if descriptors are of another length than the map's, or those that came first."""
-        width = m.descriptors.shape[1]
-        points = self._world.points
-        if points is not None and points.feature == m.feature:
-            self._widths[m.feature] = points.descriptors.shape[1]
-        if width != self._widths.setdefault(m.feature, width) or not width:
-            expected = f"{self._widths[m.feature]} numbers each, as those of {plain(m.feature)} before"
-            raise bad_field(f"CameraFrame at {m.t:.3f} s", "length of descriptors", width, expected)
+        if m.sensor in self._sequences:
+            self._sequences[m.sensor].require(m, where)
 
     def _is_under_way(self, t: float) -> bool:
         """Whether there is something to tell of ``t``: it is not before the start, nor before the first measurement."""
@@ -307,3 +294,9 @@ class Localizer:
         if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)
         estimator.diagnostics.keep_last(ROWS_KEPT)
+
+
+def _moved(m: Measurement, offset: float) -> Measurement:
+    """The same measurement by the clock that all sensors share."""
+    moved: Measurement = replace(m, t=m.t + offset)  # type: ignore[type-var]
+    return moved

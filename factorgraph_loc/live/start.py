@@ -11,11 +11,12 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.experiments.preparation import lacking_section
 from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.models import FARTHEST, nearest
-from factorgraph_loc.live.pushed import ALL_SENSORS, numbers, seconds_of
+from factorgraph_loc.files.models import FARTHEST
+from factorgraph_loc.files.values import numbers, seconds_of
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.registry import sensor_of
 from factorgraph_loc.text import quoted
 
 # m and rad, as a covariance has them; wider than either no place is known, and narrower none is measured
@@ -47,8 +48,7 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
     if isinstance(asked, str) or not isinstance(asked, Sequence):
         raise bad_field("Localizer()", "sensors", asked, "names of sensors")
     for name in asked:
-        if not isinstance(name, str) or name not in ALL_SENSORS:
-            raise InputError(f"no sensor is called {quoted(name)}{nearest(str(name), list(ALL_SENSORS))}")
+        sensor_of(name if isinstance(name, str) else quoted(name))
     return tuple(name for name in asked if not lacking_section(rig, name))
 
 

@@ -31,7 +31,9 @@ class Channel:
     ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of those in which a log keeps it; ``described``: of
     further ones, such as what its measurements hold where that is not what the tables do. Where a stream's fields are no columns:
     ``assemble``: ``(rows by table, reading) -> stream``, ``disassemble``: ``(stream, writing) -> columns by table``, see
-    :mod:`factorgraph_loc.sensors.tables`.
+    :mod:`factorgraph_loc.sensors.tables`. Of measurements that a program pushes, where their fields are no columns: ``check``:
+    ``(measurement, where) -> fields``, checked; ``sequence``: a class, made of (rig, world), whose ``require(measurement, where)``
+    raises InputError for one that does not go with those before it.
     """
 
     name: str
@@ -46,6 +48,8 @@ class Channel:
     described: tuple[Place, ...] = ()
     assemble: Place = ""
     disassemble: Place = ""
+    check: Place = ""
+    sequence: Place = ""
 
 
 @dataclass(frozen=True)

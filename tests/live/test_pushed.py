@@ -19,7 +19,7 @@ from factorgraph_loc import (
     Twist,
     VelocityOdometry,
 )
-from factorgraph_loc.live.pushed import scan_of
+from factorgraph_loc.sensors.rfid.pushed import scan_of
 
 
 @pytest.fixture(scope="module")

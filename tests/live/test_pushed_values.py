@@ -25,8 +25,15 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.live.pushed import COLUMNS, checked, scan_of
 from factorgraph_loc.live.start import prior_of
+from factorgraph_loc.sensors.camera.columns import FEATURES
+from factorgraph_loc.sensors.camera.pushed import PIXELS
+from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.columns import IMU, INCREMENTS, VELOCITIES
+from factorgraph_loc.sensors.pushed import checked
+from factorgraph_loc.sensors.rfid.columns import READS
+from factorgraph_loc.sensors.rfid.pushed import scan_of
+from factorgraph_loc.sensors.twist.columns import TWIST
 
 ONE = np.ones(1)
 SOUND = [
@@ -40,6 +47,17 @@ SOUND = [
     CameraFrame(1.0, "orb", np.ones((1, 2)), ONE, np.zeros((1, 32), dtype=np.uint8), np.zeros(1, dtype=np.int64)),
     CameraFrame(1.0, "sift", np.ones((1, 2)), ONE, np.ones((1, 128), dtype=np.float32), np.zeros(1, dtype=np.int64)),
 ]
+COLUMNS = {
+    VelocityOdometry: VELOCITIES.columns[1:],
+    IncrementOdometry: INCREMENTS.columns[1:],
+    YawRate: IMU.columns[1:],
+    Twist: TWIST.columns[1:],
+    BearingRange: [column.measured for column in BEARING_RANGE.columns[2:]],
+    RfidScan: READS.columns,
+    PixelSightings: [PIXELS],
+    CameraFrame: [FEATURES["pixels"], FEATURES["sizes"]],
+}
+COLUMNS = {kind: {column.name: column for column in columns} for kind, columns in COLUMNS.items()}
 
 
 class Odd:

@@ -22,6 +22,7 @@ SENSOR = SensorType(
             ),
             described=("factorgraph_loc.sensors.odometry.columns:WAYS",),
             assemble="factorgraph_loc.sensors.odometry.tables:assemble",
+            sequence="factorgraph_loc.sensors.odometry.pushed:Increments",
             section="odometry",
             motion="floor",
         ),

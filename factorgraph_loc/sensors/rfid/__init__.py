@@ -17,6 +17,7 @@ SENSOR = SensorType(
             described=("factorgraph_loc.sensors.rfid.columns:READS",),
             assemble="factorgraph_loc.sensors.rfid.tables:assemble",
             disassemble="factorgraph_loc.sensors.rfid.tables:disassemble",
+            check="factorgraph_loc.sensors.rfid.pushed:check",
             section="rfid",
             rows="reads of tags",
         ),

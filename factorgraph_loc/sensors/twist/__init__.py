@@ -11,6 +11,7 @@ SENSOR = SensorType(
             streams=("factorgraph_loc.sensors.twist.stream:TwistStream",),
             measurements=("factorgraph_loc.sensors.twist.measurement:Twist",),
             described=("factorgraph_loc.sensors.twist.columns:TWIST",),
+            check="factorgraph_loc.sensors.twist.pushed:check",
             section="twist",
             motion="space",
         ),

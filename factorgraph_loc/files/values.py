@@ -1,0 +1,90 @@
+"""Values that a program hands over: numbers, names and times, checked and copied, so that it may use its arrays again."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.columns import SECONDS, Column
+from factors.se2 import Array
+
+NUMBER = (int, float, np.integer, np.floating)
+
+
+def seconds_of(where: str, value: object, name: str = "t") -> float:
+    """A time [s]; InputError if it is none, or is further away than stamps can be."""
+    found = math.nan
+    if isinstance(value, NUMBER) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):
+            found = float(value)
+    if SECONDS.outside(np.array(found)):
+        raise bad_field(where, name, value, SECONDS.expected)
+    return found
+
+
+def numbers(where: str, field: str, value: object) -> Array:
+    """A new array of ``value``; InputError if it is not of real numbers."""
+    try:
+        found = np.array(value)
+        if found.dtype.kind == "O" and all(
+            isinstance(item, NUMBER) and not isinstance(item, bool) for item in found.flat
+        ):
+            found = found.astype(float)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, whole numbers of hundreds of digits
+        raise bad_field(where, field, value, "numbers") from None
+    if found.dtype.kind not in "iuf" and found.size:
+        raise bad_field(where, field, value, "numbers")
+    return np.asarray(found, dtype=float)
+
+
+def within(where: str, column: Column, value: object, shape: tuple[int, ...]) -> Any:
+    """Numbers of a shape within the bounds of their column: a float where the shape is ()."""
+    column, field = column.measured, column.field or column.name
+    found = numbers(where, field, value)
+    if found.shape != shape:
+        raise InputError(f"{where}: {field} has shape {found.shape}, expected {shape}")
+    if (bad := column.outside(found)).any():
+        lack = ", or NaN where not measured" if column.may_lack else ""
+        raise bad_field(where, field, float(found[bad].flat[0]), column.expected + lack)
+    return found if shape else float(found)
+
+
+def truth(where: str, field: str, value: object) -> bool:
+    """True or False; InputError if it is neither."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise bad_field(where, field, value, "True or False")
+    return bool(value)
+
+
+def names(where: str, field: str, value: object) -> tuple[str, ...]:
+    """A list of names; InputError if it is none."""
+    if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):
+        raise bad_field(where, field, value, "names")
+    return tuple(value)
+
+
+def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
+    """What a list holds; InputError if it is none."""
+    found = None
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        with contextlib.suppress(TypeError):  # an array without rows
+            found = tuple(values)
+    if found is None:
+        raise bad_field(where, field, values, "a list of them")
+    return found
+
+
+def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
+    """Whole numbers (K,) within the bounds of their column; InputError if they are not."""
+    found = numbers(where, column.name, value)
+    if found.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
+        raise bad_field(where, column.name, value, f"{count} whole numbers")
+    if (bad := column.outside(found)).any():
+        raise bad_field(where, column.name, float(found[bad][0]), column.expected)
+    return found.astype(np.int64)

@@ -1,0 +1,72 @@
+"""Measurements from a running program: checked and copied, so that whoever made them may use the arrays again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any, TypeVar
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import Table
+from factorgraph_loc.files.values import names, numbers, seconds_of, within
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.registry import Channel, channels
+from factorgraph_loc.sensors.tables import tables_of
+
+M = TypeVar("M", bound=Measurement)
+
+
+@cache
+def kinds() -> Mapping[type[Any], Channel]:
+    """The classes of measurements, and a channel that yields each."""
+    found: dict[type[Any], Channel] = {}
+    for channel in channels().values():
+        for place in channel.measurements:
+            found.setdefault(load(place), channel)
+    return found
+
+
+def channel_of(m: object) -> Channel:
+    """The channel that yields measurements of this class; InputError if it is no measurement."""
+    if type(m) not in kinds():
+        known = ", ".join(kind.__name__ for kind in kinds())
+        raise InputError(f"{type(m).__name__} is no measurement, expected one of {known}")
+    return kinds()[type(m)]
+
+
+def checked(m: M) -> M:
+    """The same measurement with arrays of its own; InputError names the first field that cannot be, its value, and what can."""
+    channel = channel_of(m)
+    t = seconds_of(type(m).__name__, m.t)
+    where = f"{type(m).__name__} at {t:.3f} s"
+    found = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
+    copy: M = replace(m, t=t, **found)  # type: ignore[type-var]
+    return copy
+
+
+def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
+    """The fields of a measurement that has those of a table: a number each, or, where several rows are one measurement, names, of
+    which each has a row, and arrays (K,)."""
+    table = _table_of(type(m), channel)
+    count: int | None = None
+    for column in table.columns[1:]:
+        if column.kind == "name":
+            yield f"{column.name}s", (found := names(where, f"{column.name}s", getattr(m, f"{column.name}s")))
+            count = len(found)
+        else:
+            value = getattr(m, column.measured.name)
+            if count is None and table.rows_of_one_stamp == "one measurement":
+                count = numbers(where, column.name, value).size
+            yield column.measured.name, within(where, column, value, () if count is None else (count,))
+
+
+@cache
+def _table_of(kind: type[Any], channel: Channel) -> Table:
+    there = {field.name for field in fields(kind)}
+    return next(
+        table
+        for table in tables_of(channel)
+        if all((f"{c.name}s" if c.kind == "name" else c.measured.name) in there for c in table.columns[1:])
+    )

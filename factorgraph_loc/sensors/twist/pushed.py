@@ -1,0 +1,12 @@
+"""Motion in space that a program hands over."""
+
+from typing import Any
+
+from factorgraph_loc.files.values import within
+from factorgraph_loc.sensors.twist.columns import TWIST
+from factorgraph_loc.sensors.twist.measurement import Twist
+
+
+def check(m: Twist, where: str) -> dict[str, Any]:
+    """The fields of a measurement, of three axes each; InputError names the first that cannot be."""
+    return {name: within(where, TWIST[name], getattr(m, name), (3,)) for name in ("v", "w")}
