@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -27,16 +26,13 @@ from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.odometry.simulation import RATE
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.simulation.chance import generator
 from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.text import quoted
 from factors import se2
-from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
@@ -61,12 +57,7 @@ def run_active(
     that the estimator failed, when, and by what.
     """
     settings = settings or ActiveSettings()
-    if simulation.faults != FaultSettings():
-        raise InputError(f"{simulation.name}: has faults, expected none: they are not part of active runs")
-    for name, rate in (
-        ("rounds_per_second", simulation.rounds_per_second),
-        ("sightings.rate", simulation.sightings.rate),
-    ):
+    for name, rate in _rates(simulation):
         if rate > RATE:
             raise InputError(
                 f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
@@ -81,8 +72,7 @@ def run_active(
     of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
     start = _start(make_plan(simulation.world, of_world()), world, space, settings, of_start)
     robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
-    sensors = ("odometry", "rfid", *(("bearing_range",) if world.landmarks else ()))
-    setup = model_setup.Setup(simulation.rig, world, sensors, of_estimator)
+    setup = model_setup.Setup(simulation.rig, world, robot.channels, of_estimator)
     guard = Guard(f"{estimator} on {simulation.name}")
     with guard:
         made = _estimator(estimator, setup, settings)
@@ -129,23 +119,12 @@ class _Loop:
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
         self._looked_at = -math.inf  # metres driven when the particles were last told of the walls
         self._turned_at = -math.inf  # metres driven when the robot last turned around
-        self._rounds_per_metre = simulation.rounds_per_second / settings.speed
-        # the simulated robot has no camera
-        self._sensors = replace(
-            Sensors.of(setup.world, setup.rig),
-            camera=None,
-            rounds_per_metre=self._rounds_per_metre,
-            metres_per_radian=settings.speed / settings.turn_rate,
-            looks_per_metre=simulation.sightings.rate / settings.speed,
-            sightings=simulation.sightings,
+        self._sensors = Sensors.of(
+            setup.world, setup.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
         )
-        tags = tag_map(setup.world, setup.rig.survey).tags
-        assert setup.rig.rfid is not None, "the settings have been checked"
         # where a robot is nearest to each tag
-        nearest_cells = cKDTree(space.centres).query(tags.points[:, :2])[1]
+        nearest_cells = cKDTree(space.centres).query(self._sensors.goals)[1]
         self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, SPREAD_OVER), PLACES))
-        tells = len(tags.points) > 0 or self._sensors.bearing_range is not None
-        self._likelihood = RfidLikelihood(setup.rig.rfid.model(), tags) if tells else None
 
     def run(self) -> bool:
         """Whether the robot found out where it is."""
@@ -177,7 +156,7 @@ class _Loop:
                 self._feed(Tick(self._robot.t))
                 with self._guard.telling(f"the walls at {self._robot.t:.3f} s"):
                     self._estimator.see(self._robot.proximity, self._robot.look())
-            if isinstance(report, RfidScan) and self._is_sure():
+            if report.sensor in self._robot.decisive and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
                     return True
@@ -214,16 +193,13 @@ class _Loop:
         situation = Situation(
             particles,
             weights,
-            self._likelihood,
+            self._sensors,
             self._space,
             paths,
             free,
             self._settings,
             self._rng,
             modes,
-            self._sensors,
-            self._rounds_per_metre,
-            self._rounds_per_metre * self._settings.speed / self._settings.turn_rate,
         )
         choice = self._policy.choose(situation)
         elapsed = 1e3 * (perf_counter() - started)
@@ -259,6 +235,14 @@ class _Loop:
 
     def _in_world(self, path: Path) -> Array:
         return np.asarray(se2.compose(self._robot.pose, path.poses))
+
+
+def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
+    """How often per second the sensors of the robot measure, by the settings that say so."""
+    yield "rounds_per_second", simulation.rounds_per_second
+    for sensor in sensors().values():
+        for section in sensor.simulation if sensor.on_robot else ():
+            yield f"{section}.rate", getattr(getattr(simulation, section), "rate", 0.0)
 
 
 def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) -> Estimator:

@@ -10,19 +10,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.planning.information import FINEST, POSITION, gaussian_entropy
 from factorgraph_loc.planning.paths import Path
 from factorgraph_loc.planning.sensors import SPEED, Sensors
-from factorgraph_loc.sensors.landmarks.simulation import in_sight
 from factors import se2
-from factors.camera import model as reprojection
-from factors.camera.model import CameraModel
-from factors.landmarks import model as bearing_range
-from factors.landmarks.model import BearingRangeModel
 from factors.motion import ChainState, propagate
 from factors.odometry import model as odometry
-from factors.rfid.detection import Looks
 from factors.se2 import Array
 
 
@@ -59,42 +52,6 @@ def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:
     """Fisher's information (N, 3, 3) on the body-frame perturbation of poses (N, 3), from all sensors, of ``ways`` (N,) metres that
     are driven about each, or of turns that take as long."""
     out = np.zeros((len(poses), 3, 3))
-    if sensors.rfid is not None:
-        count = len(sensors.rfid.model.antennas)
-        hits = np.zeros((count, len(sensors.rfid.tags.points)), dtype=np.int64)
-        one_round = Looks(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
-        # in proportion to the rounds, whatever was read in them
-        found = sensors.rfid.score(poses, one_round).information
-        out += (sensors.rounds_per_metre * ways)[:, None, None] * found
-    looks = (sensors.looks_per_metre * ways)[:, None, None]
-    if sensors.bearing_range is not None:
-        out += looks * _of_landmarks(sensors.bearing_range, poses, sensors)
-    if sensors.camera is not None:
-        out += looks * np.array([_of_points(sensors.camera, pose, sensors) for pose in poses]).reshape(-1, 3, 3)
+    for forecast in sensors.forecasts:
+        out += forecast.information(poses, ways)
     return out
-
-
-def _of_landmarks(model: BearingRangeModel, poses: Array, sensors: Sensors) -> Array:
-    """Information (N, 3, 3) of one look at the landmarks in sight from each pose (N, 3)."""
-    points = sensors.world.positions()
-    n, k = in_sight(model, sensors.world, poses, sensors.sightings)
-    by_pose, _, _ = bearing_range.jacobians(model, poses[n], points[k])
-    ranges, _ = bearing_range.predict(model, poses[n], points[k])
-    whitened = by_pose / bearing_range.sigmas(model, ranges)[:, :, None]
-    out = np.zeros((len(poses), 3, 3))
-    np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
-    return out
-
-
-def _of_points(model: CameraModel, pose: Array, sensors: Sensors) -> Array:
-    """Information (3, 3) of one image of the points in sight from a pose (3,)."""
-    assert sensors.world.points is not None, "a camera has points to look at"
-    points = sensors.world.points.positions
-    pixels, depth = reprojection.predict(model, pose, points)
-    near = np.flatnonzero((depth > 0.0) & (depth <= sensors.max_depth) & model.contains(pixels))
-    eye, _ = reprojection.camera_pose(model, pose)
-    seen = near[~crosses(sensors.world, np.broadcast_to(eye[:2], (len(near), 2)), points[near, :2])]
-    _, by_pose, _, _ = reprojection.linearize(model, pose, points[seen])
-    share = min(1.0, sensors.max_points / max(len(seen), 1))
-    weight = share * model.tempering / model.sigma**2
-    return np.asarray(weight * np.einsum("kia,kib->ab", by_pose, by_pose))

@@ -11,7 +11,6 @@ while it has several.
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +19,12 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.fusion.cloud import pose_moments, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.planning.paths import Path, free_steps
-from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
-from factorgraph_loc.sensors.landmarks import forecast as expected_sightings
+from factorgraph_loc.planning.sensors import Sensors
+from factorgraph_loc.sensors.forecast import Array32, Places
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
-from factorgraph_loc.sensors.rfid.forecast import Places, ScanTables
 from factorgraph_loc.text import quoted
 from factors.odometry.model import OdometryModel
-from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
-
-Array32 = NDArray[np.float32]
 
 DIMS = ("x", "y", "heading")
 POSITION = ("x", "y")
@@ -77,7 +72,7 @@ def has_several_modes(poses: Array, weights: Array) -> bool:
 
 
 def expected_gain(
-    likelihood: RfidLikelihood,
+    sensors: Sensors,
     particles: Array,
     weights: Array,
     paths: Sequence[Path],
@@ -85,27 +80,20 @@ def expected_gain(
     *,
     dims: Sequence[str] = POSITION,
     space: FreeSpace | None = None,
-    sensors: Sensors | None = None,
     places: NDArray[np.int64] | None = None,
     noise: OdometryModel | None = None,
     samples: int = SAMPLES,
     scans: int = SCANS,
-    rounds_per_metre: float = ROUNDS_PER_METRE,
-    rounds_per_radian: float = ROUNDS_PER_RADIAN,
 ) -> Array:
     """Expected reduction of entropy (C,) [nats] on each of C paths, of a belief of particles (M, 3) in the world with weights (M,).
 
     The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
-    particle whose way leads to a wall stops there, and scans no more. ``sensors``: the landmarks of its world are seen on the way,
-    as its ``bearing_range`` tells; tags are read as ``likelihood`` tells. ``places`` (M,): which place each
-    particle stands for; then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by
-    default.
-    ``samples``: of the particles so many are weighed, and ``scans`` of those draw scans; ``rounds_per_metre``,
-    ``rounds_per_radian`` of a turn in place: inventory rounds of each antenna.
+    particle whose way leads to a wall stops there, and measures no more. ``places`` (M,): which place each particle stands for;
+    then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by default. ``samples``:
+    of the particles so many are weighed, and ``scans`` of those draw measurements of all ``sensors``.
     """
     if not paths:
         return np.empty(0)
-    tables = _tables(likelihood)
     chosen = _leading(dims)
     several = places is not None or has_several_modes(particles, weights)
     rows = rng.permutation(
@@ -117,8 +105,8 @@ def expected_gain(
     count = len(poses)
     scans = min(scans, count)
     seed = np.uint64(rng.integers(2**63))
-    passed = [path.passed(rounds_per_metre, rounds_per_radian) for path in paths]
-    stations = [_stations(rounds, LOOK * rounds_per_metre) for rounds in passed]
+    passed = [path.passed(1.0, sensors.metres_per_radian) for path in paths]
+    stations = [_stations(metres, LOOK) for metres in passed]
     normals = rng.standard_normal((max(len(s) for s in stations), count, 3))
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
     after = np.empty((len(paths), scans))
@@ -128,16 +116,10 @@ def expected_gain(
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
         expected_scans.look_poses(poses, path.poses, steps, last[c], sigmas, normals, at)
-        looks = steps[1:-1]
-        stops = np.searchsorted(looks, last[c], side="right")
-        log_weights: Array32 = np.empty((scans, count), dtype=np.float32)
-        rounds = _rounds(passed[c], len(looks))
-        expected_scans.log_weights(
-            tables, at[1:-1], rounds, stops, scans, seed, likelihood.model.tempering, log_weights
-        )
-        if sensors is not None and sensors.bearing_range is not None:
-            each = passed[c][-1] * sensors.looks_per_metre / rounds_per_metre / len(looks)
-            expected_sightings.add_log_weights(sensors, at[1:-1], each, stops[:scans], seed, log_weights)
+        stops = np.searchsorted(steps[1:-1], last[c], side="right")
+        log_weights: Array32 = np.zeros((scans, count), dtype=np.float32)
+        for forecast in sensors.forecasts:
+            forecast.add_log_weights(at[1:-1], float(passed[c][-1]), stops, seed, log_weights)
         log_weights -= log_weights.max(axis=1, keepdims=True)
         # a robot that gets to the end is there; one that is stopped is near its last look
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
@@ -146,11 +128,6 @@ def expected_gain(
             index = np.zeros_like(index)
         after[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
     return np.asarray(before - after.mean(axis=1))
-
-
-@lru_cache(maxsize=4)
-def _tables(likelihood: RfidLikelihood) -> ScanTables:
-    return expected_scans.make_tables(likelihood)
 
 
 def _columns(dims: Sequence[str]) -> list[int]:
@@ -183,18 +160,12 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
 
 
 def _stations(passed: Array, each: float) -> Places:
-    """Places among the poses of a path, by the rounds (S,) that have ``passed`` there: the start, the looks, each in the middle of
-    about ``each`` rounds, and the end."""
+    """Places among the poses of a path, by the metres (S,) that have ``passed`` there: the start, the looks, each in the middle of
+    about ``each`` metres, and the end."""
     count = min(max(1, round(passed[-1] / each)), LOOKS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
     looks = np.searchsorted(passed, middles - 1e-9)
     return np.concatenate(([0], looks, [len(passed) - 1])).astype(np.int64)
-
-
-def _rounds(passed: Array, looks: int) -> Places:
-    """Rounds (S,) of the looks: as many as there are on the way, spread over them."""
-    total = round(passed[-1])
-    return np.asarray(np.diff(np.arange(looks + 1) * total // looks), dtype=np.int64)
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:

@@ -10,7 +10,7 @@ turned around yet that turn. What leads to places far off is left to those that 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -23,11 +23,10 @@ from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.fisher import fisher_gain
 from factorgraph_loc.planning.information import expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import STEP, Path
-from factorgraph_loc.planning.sensors import ROUNDS_PER_METRE, ROUNDS_PER_RADIAN, Sensors
+from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.text import quoted
 from factors import se2
-from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation
@@ -43,23 +42,19 @@ NEAR = 3  # tags that tell a place
 
 @dataclass(frozen=True)
 class Situation:
-    """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), the map's tags by ``likelihood`` (None without
-    any), where walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees.
-    ``modes``: the places that count. ``sensors``: what is seen on a way, for the expectation in closed form;
-    ``rounds_per_metre`` and ``rounds_per_radian`` of each antenna."""
+    """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), what ``sensors`` would tell on a way, where
+    walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees. ``modes``: the
+    places that count."""
 
     particles: Array
     weights: Array
-    likelihood: RfidLikelihood | None
+    sensors: Sensors
     space: FreeSpace
     candidates: tuple[Path, ...]
     free: Array
     settings: ActiveSettings
     rng: np.random.Generator
     modes: tuple[Mode, ...] = ()
-    sensors: Sensors | None = None
-    rounds_per_metre: float = ROUNDS_PER_METRE
-    rounds_per_radian: float = ROUNDS_PER_RADIAN
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,7 @@ class Information:
 
     def choose(self, situation: Situation) -> Choice:
         s, settings = situation, situation.settings.policy
-        if s.likelihood is None or not s.candidates:
+        if not s.sensors.forecasts or not s.candidates:
             return self._otherwise.choose(s)
         values = np.full(len(s.candidates), np.nan)
         near = [i for i, p in enumerate(s.candidates) if p.kind != FAR]
@@ -116,12 +111,11 @@ class Information:
     @staticmethod
     def _near(s: Situation, paths: Sequence[Path]) -> Array:
         """Of all that the belief says."""
-        assert s.likelihood is not None, "there are tags"
         settings = s.settings.policy
-        if settings.expectation == "fisher" and s.sensors is not None and not has_several_modes(s.particles, s.weights):
+        if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
             return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
         gains = expected_gain(
-            s.likelihood,
+            s.sensors,
             s.particles,
             s.weights,
             paths,
@@ -129,40 +123,31 @@ class Information:
             dims=settings.dimensions,
             samples=settings.samples,
             space=s.space,
-            sensors=s.sensors,
-            rounds_per_metre=s.rounds_per_metre,
-            rounds_per_radian=s.rounds_per_radian,
         )
-        if s.sensors is None or len(s.modes) != 1:
+        if len(s.modes) != 1:
             return gains
         # else it would go to and fro for what the odometry takes away again
-        alone, (mode,) = Sensors(s.sensors.world, s.sensors.odometry), s.modes
+        alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
         return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
     @staticmethod
     def _far(s: Situation, paths: Sequence[Path]) -> Array:
         """Of which place it is, or, where there is but one, of where in it. Particles would spread on a long way, and run into
         walls that the robot will have turned from: it plans anew before."""
-        assert s.likelihood is not None, "there are tags"
         if len(s.modes) == 1:
-            if s.sensors is None:
-                return np.zeros(len(paths))
             (mode,) = s.modes
             return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
         # which of equal places is the heavier is the luck of the particles
         weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
         return expected_gain(
-            s.likelihood,
+            s.sensors,
             np.concatenate([s.rng.multivariate_normal(mode.pose, mode.covariance, EACH) for mode in s.modes]),
             weights / weights.sum(),
             paths,
             s.rng,
             samples=OF_MODES,
             space=s.space,
-            sensors=s.sensors,
             places=np.repeat(np.arange(len(s.modes)), EACH),
-            rounds_per_metre=s.rounds_per_metre,
-            rounds_per_radian=s.rounds_per_radian,
         )
 
 
@@ -215,12 +200,12 @@ class NearestTags:
 
     def choose(self, situation: Situation) -> Choice:
         s = situation
-        if s.likelihood is None or not len(s.likelihood.tags.points) or not s.candidates:
+        if not len(s.sensors.goals) or not s.candidates:
             return Patrol().choose(s)
         rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
         ends = np.array([p.poses[-1] for p in s.candidates])
         places = se2.compose(s.particles[rows][:, None], ends[None])[..., :2]
-        gaps = np.linalg.norm(places[:, :, None] - s.likelihood.tags.points[:, :2], axis=3)
+        gaps = np.linalg.norm(places[:, :, None] - s.sensors.goals, axis=3)
         count = min(NEAR, gaps.shape[2])
         values = -np.sort(gaps, axis=2)[..., :count].mean(axis=(0, 2))
         return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)

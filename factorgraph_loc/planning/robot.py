@@ -1,29 +1,28 @@
-"""A simulated robot that drives as it is told, by its own odometry, and hears tags and sees landmarks on the way."""
+"""A simulated robot that drives as it is told, by its own odometry, and measures on the way."""
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from factorgraph_loc.maps.free_space import FreeSpace
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.proximity import ProximitySensor
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
 from factorgraph_loc.sensors.odometry import simulation as wheels
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.simulated import LiveSensor
+from factorgraph_loc.simulation.chance import generator
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factors import se2
-from factors.landmarks.model import BearingRangeModel
-from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
-Report = IncrementOdometry | RfidScan | BearingRange
+DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")  # whose numbers stay what they are
 PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
 BETWEEN = 5  # parts of the way from one pose of a path to the next
 
@@ -32,7 +31,7 @@ class SimulatedRobot:
     """The robot at its true place; see the module.
 
     Its wheels err as :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry` says: what it is told is what they report,
-    and what it does is what differs. Steps, inventory rounds and looks draw from sequences of their own, so that
+    and what it does is what differs. Steps and each sensor draw from sequences of their own, so that
     robots of one seed have the same luck as long as they drive alike.
     """
 
@@ -45,22 +44,21 @@ class SimulatedRobot:
         settings: ActiveSettings,
         rng: np.random.Generator,
     ) -> None:
-        rig = simulation.rig
-        assert rig.rfid is not None, "the settings have been checked"
         self.pose = np.array(start, dtype=float)
         self.t = 0.0
         self.metres = 0.0
         self._settings = settings
         self._space = space
         self.proximity = ProximitySensor(space, settings.sight)
-        self._antennas = tuple(rig.rfid.all_antennas())
-        self._map = tag_map(world, rig.survey)
-        self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
-        self._round, self._rounds_per_second = 0, simulation.rounds_per_second
-        self._look, self._sightings, self._world = 0, simulation.sightings, world
-        self._landmarks = rig.bearing_range.model() if rig.bearing_range and world.landmarks else None
-        constants, self._noise, self._reads, self._lengths, self._sight = rng.spawn(5)
-        self._scale, self._drift, self._scale_of_turns = constants.normal(
+        of = partial(generator, rng.bit_generator.seed_seq, names=DRAWS)
+        made = [
+            (name, on_robot(world, simulation.rig, simulation, of(name))) for name, on_robot in functions("on_robot")
+        ]
+        self.sensors: dict[str, LiveSensor] = {name: one for name, one in made if one is not None}
+        self._order = sorted(self.sensors.values(), key=lambda one: not one.decides)
+        self._measured = [0] * len(self._order)
+        self._noise, self._lengths = of("steps"), of("lengths")
+        self._scale, self._drift, self._scale_of_turns = of("constants").normal(
             0.0, (wheels.SCALE_SIGMA, wheels.DRIFT_SIGMA, wheels.SCALE_SIGMA)
         )
         self._truth = [(0.0, *self.pose.tolist())]
@@ -70,8 +68,18 @@ class SimulatedRobot:
         rows = np.array(self._truth)
         return Trajectory(rows[:, 0], rows[:, 1:])
 
-    def begin(self) -> Iterator[Report]:
-        """What it reports before it has moved: a row of odometry without motion, a first round, and a first look at landmarks."""
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What it reports, by name."""
+        return (IncrementOdometry.sensor, *(one.channel for one in self._order))
+
+    @property
+    def decisive(self) -> tuple[str, ...]:
+        """The channels after each of whose reports it asks itself whether it knows its place."""
+        return tuple(one.channel for one in self._order if one.decides or not self._order[0].decides)
+
+    def begin(self) -> Iterator[Measurement]:
+        """What it reports before it has moved: a row of odometry without motion, and a first measurement of each sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield from self._found()
 
@@ -86,7 +94,7 @@ class SimulatedRobot:
         """Free lengths [m] (D,) all around, as its proximity sensor measures them."""
         return self.proximity.read(self.pose, self._lengths)
 
-    def drive(self, path: Array, metres: float) -> Iterator[Report]:
+    def drive(self, path: Array, metres: float) -> Iterator[Measurement]:
         """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""
         for told in self._told(path, metres):
             n1, n2, n3 = self._noise.standard_normal(3)
@@ -101,25 +109,24 @@ class SimulatedRobot:
             self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
             yield from self._passed(told)
 
-    def wait(self, seconds: float) -> Iterator[Report]:
+    def wait(self, seconds: float) -> Iterator[Measurement]:
         """Stand still."""
         for _ in range(max(1, round(seconds / PERIOD))):
             yield from self._passed(np.zeros(3))
 
-    def _passed(self, told: Array) -> Iterator[Report]:
+    def _passed(self, told: Array) -> Iterator[Measurement]:
         """The reports of one period."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(told[0]), float(told[1]), float(told[2]))
         yield from self._found()
 
-    def _found(self) -> Iterator[Report]:
+    def _found(self) -> Iterator[Measurement]:
         """What its sensors report that are due."""
-        if self.t * self._rounds_per_second >= self._round - 1e-6:
-            yield self._scan()
-        if self._landmarks is not None and self.t * self._sightings.rate >= self._look - 1e-6:
-            self._look += 1
-            yield self._sighting(self._landmarks)
+        for i, sensor in enumerate(self._order):
+            if self.t * sensor.rate >= self._measured[i] - 1e-6:
+                self._measured[i] += 1
+                yield sensor.measure(self.t, self.pose)
 
     def _told(self, path: Array, metres: float) -> Array:
         """Motions (N, 3) of one period each along a way, each in the robot's frame before it."""
@@ -134,23 +141,6 @@ class SimulatedRobot:
         times = np.append(np.arange(0.0, way.t[-1] - 1e-6, PERIOD), way.t[-1])
         at = way.at(times)
         return se2.between(at[:-1], at[1:])
-
-    def _scan(self) -> RfidScan:
-        """One round of all antennas."""
-        self._round += 1
-        chance = np.stack([self._likelihood.probabilities(self.pose[None], a)[0] for a in range(len(self._antennas))])
-        antenna, tag = np.nonzero(self._reads.random(chance.shape) < chance)
-        unknown = np.full(len(tag), np.nan)
-        names = tuple(self._map.names[i] for i in tag.tolist())
-        return RfidScan(
-            self.t, self._antennas, antenna.astype(np.int64), names, np.zeros(len(tag)), unknown, unknown, unknown
-        )
-
-    def _sighting(self, model: BearingRangeModel) -> BearingRange:
-        """One look at the landmarks."""
-        now, here = np.array((self.t,)), self.pose[None]
-        seen = sighting_stream(model, self._world, now, here, self._sightings, self._sight)
-        return BearingRange(self.t, tuple(seen.landmark), seen.range, seen.bearing)
 
     def _is_free(self, there: Array) -> bool:
         """Whether the robot may go there: to a free cell, or, where it is in none, to a cell that is no nearer to a wall."""

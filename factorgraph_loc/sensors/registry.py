@@ -68,7 +68,9 @@ class SensorType:
     Of simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:
     ``(settings)``, how often per second a drive looks for all things of a kind, by a plural for these; ValueError where the
-    settings do not fit together.
+    settings do not fit together. Of robots that choose where to drive: ``on_robot``: ``(world, rig, settings, rng) ->``
+    :class:`~factorgraph_loc.sensors.simulated.LiveSensor` or None; ``forecast``: ``(world, rig, speed, settings) ->``
+    :class:`~factorgraph_loc.sensors.forecast.Forecast` or None.
     """
 
     name: str
@@ -84,6 +86,8 @@ class SensorType:
     findable: Place = ""
     simulate: Place = ""
     looks: Place = ""
+    on_robot: Place = ""
+    forecast: Place = ""
 
 
 def sensors() -> Mapping[str, SensorType]:

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory
@@ -44,6 +45,18 @@ class Simulated:
     layers: Mapping[str, Any] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+
+class LiveSensor(Protocol):
+    """A simulated sensor of a robot that chooses where to drive: it measures ``rate`` times per second. ``decides``: whether the
+    robot asks itself after each measurement whether it knows its place by now; of one that does not it waits for another's."""
+
+    channel: str
+    rate: float
+    decides: bool
+
+    def measure(self, t: float, pose: Array) -> Measurement:
+        """What it reports at ``t`` [s] from a pose (3,)."""
 
 
 def times(rate: float, truth: Trajectory) -> Array:

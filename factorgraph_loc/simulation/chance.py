@@ -1,10 +1,11 @@
 """Generators of random numbers by the names of what is drawn, so that to change one thing leaves the others as they are."""
 
 import hashlib
+from typing import Any
 
 import numpy as np
 
-# the numbers of the first ones stay what they are: more may follow
+# of a log; the numbers of the first ones stay what they are: more may follow
 NAMES = (
     "world",
     "drive",
@@ -21,8 +22,12 @@ NAMES = (
 )
 
 
-def generator(seed: int, name: str) -> np.random.Generator:
-    """The generator of what is called ``name``, from the start; one of another package's has the number of its name's hash."""
+def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
+    """The generator of what is called ``name``, from the start: that of its number among ``names``, or of its name's hash.
+
+    ``seed``: a number, or the sequence of seeds of another generator.
+    """
     other = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
-    key = NAMES.index(name) if name in NAMES else other
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,)))
+    key = names.index(name) if name in names else other
+    parent = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
+    return np.random.default_rng(np.random.SeedSequence(parent.entropy, spawn_key=(*parent.spawn_key, key)))

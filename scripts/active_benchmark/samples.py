@@ -15,10 +15,9 @@ from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
 from factorgraph_loc.planning.information import SCANS, expected_gain, has_several_modes
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.robot import SimulatedRobot
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
-from factors.rfid.detection import RfidLikelihood
 
 SEEDS = 10  # beliefs of each world
 FIRST = 2000  # seeds that no other section uses
@@ -46,7 +45,7 @@ class Belief:
 
     particles: np.ndarray
     weights: np.ndarray
-    likelihood: RfidLikelihood
+    sensors: Sensors
     space: FreeSpace
 
 
@@ -111,7 +110,7 @@ def tried(job: tuple[str, int]) -> Outcome:
 
 def gains(belief: Belief, paths: list[Path], samples: int, scans: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng((seed, samples))
-    given = (belief.likelihood, belief.particles, belief.weights, paths, rng)
+    given = (belief.sensors, belief.particles, belief.weights, paths, rng)
     return expected_gain(*given, dims=SETTINGS.policy.dimensions, space=belief.space, samples=samples, scans=scans)
 
 
@@ -134,5 +133,5 @@ def belief_of(name: str, seed: int) -> Belief:
     assert found.particles is not None, "a particle filter has particles"
     assert found.weights is not None, "and their weights"
     assert simulation.rig.rfid is not None, "the settings have been checked"
-    likelihood = RfidLikelihood(simulation.rig.rfid.model(), tag_map(world, simulation.rig.survey).tags)
-    return Belief(found.particles, found.weights, likelihood, space)
+    sensors = Sensors.of(world, simulation.rig, simulation, only=robot.sensors)
+    return Belief(found.particles, found.weights, sensors, space)

@@ -13,6 +13,9 @@ from factorgraph_loc.planning.fisher import expected_covariance, expected_inform
 from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
+from factorgraph_loc.sensors.camera.forecast import CameraForecast
+from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
+from factorgraph_loc.sensors.landmarks.forecast import LandmarkForecast
 from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
@@ -39,7 +42,7 @@ def numerical(function, pose):
 
 
 def test_without_sensors_it_is_the_motion_model_alone():
-    found = expected_covariance(MEAN, COVARIANCE, STRAIGHT, Sensors(World(), NOISE))
+    found = expected_covariance(MEAN, COVARIANCE, STRAIGHT, Sensors(NOISE))
     start, end = (ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), ChainState(8.0, 4.0, 0.0, 0.0, 4.0, 0.0, 0.0))
     increment = relative_motion(NOISE, start, end)
     transition = se2.adjoint(se2.inverse(increment.delta))
@@ -51,7 +54,7 @@ def test_without_sensors_it_is_the_motion_model_alone():
 def test_one_look_at_a_landmark_is_one_update_of_a_kalman_filter():
     world = World(landmarks={"L": Landmark(x=4.0, y=3.0), "far": Landmark(x=40.0, y=3.0)})
     model = RIG.bearing_range.model()
-    sensors = Sensors(world, OdometryModel(), bearing_range=model, looks_per_metre=1.0 / STEP.length)
+    sensors = Sensors(OdometryModel(), (LandmarkForecast(world, model, 1.0 / STEP.length),))
     end = se2.compose(MEAN, STEP.poses[-1])
     point = world.positions()[:1]
     jacobian = numerical(lambda p: np.concatenate(bearing_range.predict(model, p, point)), end)
@@ -68,19 +71,19 @@ def test_points_in_view_of_a_camera_tell_what_their_pixels_do():
     points = np.array(((4.0, 2.2, 1.0), (4.0, 1.5, 1.4), (-4.0, 2.0, 1.0)))  # the last is behind the robot
     world = World(points=PointMap.of(["a", "b", "c"], points))
     pose = np.array((0.0, 2.0, 0.0))
-    sensors = Sensors(world, OdometryModel(), camera=model, looks_per_metre=2.0)
+    camera = CameraForecast(world, model, 2.0)
     jacobian = numerical(lambda p: reprojection.predict(model, p, points[:2])[0].ravel(), pose)
     expected = 2.0 * model.tempering * jacobian.T @ jacobian / model.sigma**2
-    np.testing.assert_allclose(expected_information(pose[None], np.ones(1), sensors)[0], expected, rtol=1e-4)
+    np.testing.assert_allclose(camera.information(pose[None], np.ones(1))[0], expected, rtol=1e-4)
     hidden = world.model_copy(update={"walls": ((2.0, -5.0, 2.0, 9.0),)})
-    assert not expected_information(pose[None], np.ones(1), replace(sensors, world=hidden)).any()
-    one_of_two = replace(sensors, max_points=1)
-    np.testing.assert_allclose(expected_information(pose[None], np.ones(1), one_of_two)[0], expected / 2.0, rtol=1e-4)
+    assert not replace(camera, world=hidden).information(pose[None], np.ones(1)).any()
+    one_of_two = replace(camera, settings=PixelSettings(max_points=1))
+    np.testing.assert_allclose(one_of_two.information(pose[None], np.ones(1))[0], expected / 2.0, rtol=1e-4)
 
 
 def test_no_landmark_is_seen_through_a_wall():
     world = World(landmarks={"L": Landmark(x=4.0, y=2.0)}, walls=((2.5, -5.0, 2.5, 9.0),))
-    sensors = Sensors(world, NOISE, bearing_range=RIG.bearing_range.model())
+    sensors = Sensors(NOISE, (LandmarkForecast(world, RIG.bearing_range.model()),))
     assert not expected_information(np.array(((1.0, 2.0, 0.0),)), np.ones(1), sensors).any()
     assert expected_information(np.array(((3.0, 2.0, 0.0),)), np.ones(1), sensors).any()
 
@@ -99,7 +102,7 @@ def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow(dims):
     rng = np.random.default_rng(0)
     particles = rng.multivariate_normal(MEAN, covariance, 2000)
     weights = np.full(2000, 1.0 / 2000)
-    drawn = expected_gain(sensors.rfid, particles, weights, paths, rng, dims=dims, noise=NOISE, samples=2000, scans=200)
+    drawn = expected_gain(sensors, particles, weights, paths, rng, dims=dims, noise=NOISE, samples=2000, scans=200)
     fine = np.diag(FINEST**2)
     after = np.array([expected_covariance(MEAN, covariance, path, sensors) for path in paths])
     closed = gaussian_entropy(covariance + fine, dims) - gaussian_entropy(after + fine, dims)
@@ -122,9 +125,7 @@ def test_the_gain_is_the_fall_of_entropy():
 
 def test_only_sensors_that_find_something_are_taken():
     nothing = Sensors.of(World(), RIG)
-    assert nothing.rfid is None
-    assert nothing.bearing_range is None
-    assert nothing.camera is None
+    assert nothing.forecasts == ()
     (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], nothing)
     assert gain < 0.0
     assert math.isfinite(gain)

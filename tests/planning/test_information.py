@@ -1,6 +1,7 @@
 """Entropies against closed forms, and the expected gain against enumeration and against far larger samples."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from factorgraph_loc.planning.information import (
     particle_entropy,
 )
 from factorgraph_loc.planning.paths import Path, look_around, primitives
+from factorgraph_loc.planning.sensors import Sensors
+from factorgraph_loc.sensors.rfid.expectation import RfidForecast
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset
@@ -43,7 +46,12 @@ def beam(*points, tempering=1.0, antennas=8, **settings):
     around = tuple(Antenna(yaw=2.0 * math.pi * i / antennas) for i in range(antennas))
     model = RfidModel(around, (BeamModel(**settings),), 1e-3, 0.0, tempering)
     places = np.array([(x, y, 0.0) for x, y in points]).reshape(-1, 3)
-    return RfidLikelihood(model, TagArray(places, np.full(len(places), np.nan)))
+    return reading(RfidLikelihood(model, TagArray(places, np.full(len(places), np.nan))))
+
+
+def reading(likelihood):
+    """A robot that reads tags alone."""
+    return Sensors(OdometryModel(), (RfidForecast(likelihood),))
 
 
 def straight(length):
@@ -134,10 +142,10 @@ def test_two_places_are_told_apart_as_often_as_enumeration_says(tempering):
     """Half the particles where a tag is read with a known probability, half where it is read by mistake alone: the posterior after
     each number of reads, and how often there are so many, are exact. 512 scans: five standard deviations of their mean, at
     most log(2) / 2 each, are 0.08 nats."""
-    found = beam((2.0, 0.0), tempering=tempering, antennas=1, p0=0.15, s_r=0.1)
+    (reads,) = beam((2.0, 0.0), tempering=tempering, antennas=1, p0=0.15, s_r=0.1).forecasts
     particles = np.concatenate((np.tile((0.1, 0.1, 0.0), (256, 1)), np.tile((30.1, 0.1, 0.0), (256, 1))))
     path = Path(np.array(((0.0, 0.0, 0.0), (0.25, 0.0, 0.0))), "arc")
-    q = float(found.probabilities(np.array(((0.35, 0.1, 0.0),)), 0)[0, 0])
+    q = float(reads.likelihood.probabilities(np.array(((0.35, 0.1, 0.0),)), 0)[0, 0])
     rounds, floor = 10, 1e-3
     after = 0.0
     for here in (True, False):
@@ -148,14 +156,13 @@ def test_two_places_are_told_apart_as_often_as_enumeration_says(tempering):
             share = likelihoods[0] / sum(likelihoods)
             after += 0.5 * chance * stats.entropy((share, 1.0 - share))
     (gain,) = expected_gain(
-        found,
+        Sensors(OdometryModel(), (replace(reads, rounds_per_metre=4.0 * rounds),)),
         particles,
         np.full(512, 1.0 / 512),
         [path],
         np.random.default_rng(0),
         samples=512,
         scans=512,
-        rounds_per_metre=4.0 * rounds,
     )
     assert gain == pytest.approx(math.log(2.0) - after, abs=0.08)
     assert 0.2 < gain < 0.6
@@ -228,14 +235,15 @@ def test_a_small_sample_chooses_nearly_as_well_as_a_large_one():
     world = make_world(settings.world, np.random.default_rng(3))
     space = free_space(world, 0.3)
     rfid: RfidSettings = settings.rig.rfid
-    found = RfidLikelihood(rfid.model(), tag_map(world, settings.rig.survey).tags)
+    found = reading(RfidLikelihood(rfid.model(), tag_map(world, settings.rig.survey).tags))
+    found = replace(found, metres_per_radian=0.0)
     mean = np.append(space.centres[len(space.centres) // 3], 0.4)
     poses, weights = drawn(2000, np.diag((0.6**2, 0.6**2, 0.3**2)), mean)
     paths = primitives(6.0)
 
     def gains(seed, **samples):
         rng = np.random.default_rng(seed)
-        return expected_gain(found, poses, weights, paths, rng, space=space, rounds_per_radian=0.0, **samples)
+        return expected_gain(found, poses, weights, paths, rng, space=space, **samples)
 
     large = gains(9, samples=2000, scans=300)
     lost = [large.max() - large[np.argmax(gains(k))] for k in range(5)]
@@ -248,8 +256,9 @@ def test_a_turn_in_place_tells_something_but_not_without_rounds():
     assert turn[0].length == 0.0
     assert turn[0].duration(0.5, 1.0) == pytest.approx(2.0 * np.pi)
     (gain,) = expected_gain(found, poses, weights, turn, np.random.default_rng(0))
-    (more,) = expected_gain(found, poses, weights, turn, np.random.default_rng(0), rounds_per_radian=8.0)
-    (none,) = expected_gain(found, poses, weights, turn, np.random.default_rng(0), rounds_per_radian=0.0)
+    slow, fast = replace(found, metres_per_radian=2.0), replace(found, metres_per_radian=0.0)
+    (more,) = expected_gain(slow, poses, weights, turn, np.random.default_rng(0))
+    (none,) = expected_gain(fast, poses, weights, turn, np.random.default_rng(0))
     assert more > gain > 0.1
     assert none == pytest.approx(0.0, abs=1e-5)
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.model.rig import Rig
@@ -17,6 +16,7 @@ from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, 
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.sensors.odometry.model import odometry_model
+from factorgraph_loc.sensors.rfid.expectation import RfidForecast
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.rfid.detection import RfidLikelihood, TagArray
@@ -25,6 +25,7 @@ SIDE = 40.0
 SPACE = free_space(
     World(walls=((0, 0, SIDE, 0), (SIDE, 0, SIDE, SIDE), (SIDE, SIDE, 0, SIDE), (0, SIDE, 0, 0))), clearance=0.3
 )
+RIG = Rig(**RACKHAM_RIG)
 MODEL = RfidSettings(preset="rackham", preset_z=1.2).model()
 # the robot is in the middle and looks along x; tags around a place to its left alone
 TAGS = np.array(((20.0, 27.0, 1.2), (18.0, 28.0, 1.2), (22.0, 28.0, 1.2)))
@@ -34,9 +35,10 @@ def situation(candidates=None, free=None, tags=TAGS, seed=0):
     rng = np.random.default_rng(seed)
     particles = np.array((20.0, 20.0, 0.0)) + rng.standard_normal((500, 3)) * (0.8, 0.8, 0.1)
     paths = tuple(primitives(6.0) if candidates is None else candidates)
-    likelihood = RfidLikelihood(MODEL, TagArray(tags, np.full(len(tags), np.nan))) if len(tags) else None
+    reads = RfidForecast(RfidLikelihood(MODEL, TagArray(tags, np.full(len(tags), np.nan))))
+    sensors = Sensors(odometry_model(RIG, constants_as_noise=True), (reads,) if len(tags) else ())
     reach = np.full(len(paths), 3.0) if free is None else free
-    return Situation(particles, np.full(500, 1.0 / 500), likelihood, SPACE, paths, reach, ActiveSettings(), rng)
+    return Situation(particles, np.full(500, 1.0 / 500), sensors, SPACE, paths, reach, ActiveSettings(), rng)
 
 
 def direction(choice):
@@ -149,7 +151,7 @@ def test_the_expectation_in_closed_form_goes_where_tags_are():
     s = situation()
     settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
     world = World(tags={f"T{i}": {"x": x, "y": y, "z": z} for i, (x, y, z) in enumerate(TAGS.tolist())})
-    sensors = Sensors.of(world, parse_model(Rig, RACKHAM_RIG, "rig"))
+    sensors = Sensors.of(world, RIG)
     choice = make_policy("information").choose(replace(s, settings=settings, sensors=sensors))
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
     drawn = make_policy("information").choose(replace(s, sensors=sensors))
@@ -159,9 +161,8 @@ def test_the_expectation_in_closed_form_goes_where_tags_are():
 def test_they_go_where_landmarks_are():
     """Without a tag: two landmarks to the left, 9 m away, that are seen from 6 m."""
     world = World(landmarks={"A": {"x": 19.0, "y": 29.0}, "B": {"x": 21.0, "y": 29.0}})
-    sensors = Sensors.of(world, parse_model(Rig, RACKHAM_RIG, "rig"))
-    none = RfidLikelihood(MODEL, TagArray(np.empty((0, 3)), np.empty(0)))
-    choice = make_policy("information").choose(replace(situation(), likelihood=none, sensors=sensors))
+    sensors = Sensors.of(world, RIG)
+    choice = make_policy("information").choose(replace(situation(), sensors=sensors))
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
 
 
@@ -180,9 +181,8 @@ def test_a_wrong_name_is_an_error():
 def one_place(tags, candidates):
     """A situation with one place in the middle, known to 0.8 m and 0.1 rad, and what is seen from ways."""
     s = situation(candidates=candidates, tags=tags)
-    sensors = Sensors(World(), odometry_model(Rig(**RACKHAM_RIG), constants_as_noise=True), s.likelihood)
     mode = Mode(1.0, np.array((20.0, 20.0, 0.0)), np.diag((0.64, 0.64, 0.01)))
-    return replace(s, modes=(mode,), sensors=sensors)
+    return replace(s, modes=(mode,))
 
 
 def test_one_place_too_wide_is_told_by_tags_far_away():
@@ -195,5 +195,5 @@ def test_one_place_too_wide_is_told_by_tags_far_away():
 
 def test_what_the_odometry_takes_away_is_no_gain():
     s, policy = one_place(TAGS, primitives(3.0)), make_policy("information")
-    net, gross = policy.choose(s).values, policy.choose(replace(s, sensors=None, rng=one_place(TAGS, ()).rng)).values
+    net, gross = policy.choose(s).values, policy.choose(replace(s, modes=(), rng=one_place(TAGS, ()).rng)).values
     assert np.all(net < gross)

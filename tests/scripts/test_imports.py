@@ -24,7 +24,6 @@ EXCEPTIONS = {
     ("factorgraph_loc.sensors.camera.tracker", "factorgraph_loc.fusion.cloud"),
     ("factorgraph_loc.sensors.camera.tracker", "factorgraph_loc.fusion.known_position"),
     ("factorgraph_loc.sensors.landmarks.finder", "factorgraph_loc.fusion.known_position"),
-    ("factorgraph_loc.sensors.landmarks.forecast", "factorgraph_loc.planning.sensors"),
     ("factorgraph_loc.sensors.landmarks.window", "factorgraph_loc.fusion.known_position"),
     ("factorgraph_loc.sensors.rfid.tracker", "factorgraph_loc.fusion.cloud"),
     ("factorgraph_loc.sensors.rfid.tracker", "factorgraph_loc.fusion.known_position"),

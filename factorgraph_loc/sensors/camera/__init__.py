@@ -54,4 +54,5 @@ SENSOR = SensorType(
     },
     simulate="factorgraph_loc.sensors.camera.simulation:simulate",
     looks="factorgraph_loc.sensors.camera.simulation:looks",
+    forecast="factorgraph_loc.sensors.camera.forecast:forecast",
 )

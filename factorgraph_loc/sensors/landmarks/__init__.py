@@ -25,4 +25,6 @@ SENSOR = SensorType(
     },
     simulate="factorgraph_loc.sensors.landmarks.simulation:simulate",
     looks="factorgraph_loc.sensors.landmarks.simulation:looks",
+    on_robot="factorgraph_loc.sensors.landmarks.simulation:on_robot",
+    forecast="factorgraph_loc.sensors.landmarks.forecast:forecast",
 )

@@ -1,44 +1,73 @@
-"""What would be seen of landmarks on the way, and how well it would agree with each particle: the part of landmarks in
-:mod:`factorgraph_loc.planning.information`.
+"""What would be seen of landmarks on the way, and how well it would agree with each particle: the part of landmarks in planning.
 
 The sightings of one look are as one with the mean of all, of less noise. Landmarks that are not seen tell nothing.
 """
 
 import math
+from dataclasses import dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.planning.sensors import Sensors
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.forecast import Array32, Places
 from factorgraph_loc.sensors.landmarks.simulation import in_sight
-from factorgraph_loc.sensors.rfid.forecast import Array32, Places
+from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factors.landmarks import model as bearing_range
+from factors.landmarks.model import BearingRangeModel
 from factors.se2 import Array
 
 
-def add_log_weights(sensors: Sensors, poses: Array, looks: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-    """Add to ``out`` (J, M) what the sightings that the first J particles might make on one path tell of each of M.
+@dataclass(frozen=True, eq=False)
+class LandmarkForecast:
+    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of sightings, ``looks_per_metre``, of what is in sight as ``settings``
+    tell but for the rate."""
 
-    ``poses`` (S, M, 3): where they look; ``looks``: how often at each; ``stops`` (J,): at how many of the places each gets to look.
-    Draws are the same for all paths of one ``seed``.
-    """
-    model = sensors.bearing_range
-    assert model is not None, "landmarks are seen"
-    points = sensors.world.positions()
-    scans = len(stops)
-    for s in range(len(poses)):
-        j, k = in_sight(model, sensors.world, poses[s, :scans], sensors.sightings)
-        looking = s < stops[j]
-        j, k = j[looking], k[looking]
-        if not len(j):
-            continue
-        ranges, bearings = bearing_range.predict(model, poses[s][:, None], points[None])
-        sigmas = bearing_range.sigmas(model, ranges[j, k]) / math.sqrt(looks)
-        normals = np.random.default_rng((int(seed), s)).standard_normal((scans, len(points), 2))
-        noise = sigmas * normals[j, k]
-        measured = np.column_stack((ranges[j, k] + noise[:, 0], bearings[j, k] + noise[:, 1]))
-        _add(ranges, bearings, measured, sigmas, j, k, out)
+    world: World
+    model: BearingRangeModel
+    looks_per_metre: float = 4.0
+    settings: SightingSettings = field(default_factory=SightingSettings)
+    goals: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    def information(self, poses: Array, ways: Array) -> Array:
+        """Of the landmarks in sight."""
+        points = self.world.positions()
+        n, k = in_sight(self.model, self.world, poses, self.settings)
+        by_pose, _, _ = bearing_range.jacobians(self.model, poses[n], points[k])
+        ranges, _ = bearing_range.predict(self.model, poses[n], points[k])
+        whitened = by_pose / bearing_range.sigmas(self.model, ranges)[:, :, None]
+        out = np.zeros((len(poses), 3, 3))
+        np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
+        return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
+
+    def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
+        """By sightings that are drawn, of as many looks at each place as are made about it."""
+        looks, scans = metres * self.looks_per_metre / len(poses), len(out)
+        points = self.world.positions()
+        for s in range(len(poses)):
+            j, k = in_sight(self.model, self.world, poses[s, :scans], self.settings)
+            looking = s < stops[j]
+            j, k = j[looking], k[looking]
+            if not len(j):
+                continue
+            ranges, bearings = bearing_range.predict(self.model, poses[s][:, None], points[None])
+            sigmas = bearing_range.sigmas(self.model, ranges[j, k]) / math.sqrt(looks)
+            normals = np.random.default_rng((int(seed), s)).standard_normal((scans, len(points), 2))
+            noise = sigmas * normals[j, k]
+            measured = np.column_stack((ranges[j, k] + noise[:, 0], bearings[j, k] + noise[:, 1]))
+            _add(ranges, bearings, measured, sigmas, j, k, out)
+
+
+def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> LandmarkForecast | None:
+    """Of a robot that drives at ``speed`` [m/s], with the settings of a simulation; None if it has no such sensor or the map no
+    landmarks."""
+    if rig.bearing_range is None or not world.landmarks:
+        return None
+    sightings = SightingSettings() if settings is None else settings.sightings
+    return LandmarkForecast(world, rig.bearing_range.model(), sightings.rate / speed, sightings)
 
 
 @numba.njit(cache=True)

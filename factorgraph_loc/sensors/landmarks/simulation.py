@@ -1,12 +1,15 @@
 """Range and bearing of landmarks in sight, drawn from the model of a rig."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.simulated import Ride, Simulated
@@ -66,3 +69,32 @@ def in_sight(
     n, k = np.nonzero(near)
     visible = ~crosses(world, sensors[n, :2], points[k])
     return n[visible], k[visible]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSightings:
+    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor`: one look at the landmarks at a time."""
+
+    model: BearingRangeModel
+    world: World
+    settings: SightingSettings
+    rng: np.random.Generator
+    channel: str = "bearing_range"
+    decides: bool = False
+
+    @property
+    def rate(self) -> float:
+        """Looks per second."""
+        return self.settings.rate
+
+    def measure(self, t: float, pose: Array) -> BearingRange:
+        """A look at ``t``."""
+        seen = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
+        return BearingRange(t, tuple(seen.landmark), seen.range, seen.bearing)
+
+
+def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
+    """The sensor of a rig; None if it has none, or the world no landmarks."""
+    if rig.bearing_range is None or not world.landmarks:
+        return None
+    return SimulatedSightings(rig.bearing_range.model(), world, settings.sightings, rng)

@@ -40,4 +40,6 @@ SENSOR = SensorType(
     },
     simulate="factorgraph_loc.sensors.rfid.simulated_drive:simulate",
     looks="factorgraph_loc.sensors.rfid.simulated_drive:looks",
+    on_robot="factorgraph_loc.sensors.rfid.simulated_robot:on_robot",
+    forecast="factorgraph_loc.sensors.rfid.expectation:forecast",
 )

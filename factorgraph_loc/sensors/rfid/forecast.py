@@ -14,13 +14,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.sensors.forecast import Array32, Places
 from factors.rfid.detection import RfidLikelihood
 from factors.rfid.kernels import FAST, of_tag, placed
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed
 from factors.se2 import Array
-
-Array32 = NDArray[np.float32]
-Places = NDArray[np.int64]
 
 CELL = 0.15  # m, of the tables
 FACINGS = 24  # directions in which a tag may face

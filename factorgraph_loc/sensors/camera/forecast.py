@@ -1,0 +1,60 @@
+"""What a camera is expected to tell on the way, by the points of the map: the part of cameras in planning."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
+from factorgraph_loc.sensors.forecast import Array32, Places
+from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+IMAGES_PER_SECOND = 2.0  # where nothing else is said
+
+
+@dataclass(frozen=True, eq=False)
+class CameraForecast:
+    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of images, ``looks_per_metre``; what is seen in one is as ``settings``
+    tell, and not through walls. It draws no images, so that particles are not weighed by any."""
+
+    world: World
+    model: CameraModel
+    looks_per_metre: float = 4.0
+    settings: PixelSettings = field(default_factory=PixelSettings)
+    goals: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    def information(self, poses: Array, ways: Array) -> Array:
+        """Of the points in sight."""
+        looks = (self.looks_per_metre * ways)[:, None, None]
+        return np.asarray(looks * np.array([self._of_image(pose) for pose in poses]).reshape(-1, 3, 3))
+
+    def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
+        """Nothing."""
+
+    def _of_image(self, pose: Array) -> Array:
+        """Information (3, 3) of one image from a pose (3,)."""
+        model, points = self.model, self.world.points
+        assert points is not None, "a camera has points to look at"
+        pixels, depth = reprojection.predict(model, pose, points.positions)
+        near = np.flatnonzero((depth > 0.0) & (depth <= self.settings.max_depth) & model.contains(pixels))
+        eye, _ = reprojection.camera_pose(model, pose)
+        ends = points.positions[near, :2]
+        seen = near[~crosses(self.world, np.broadcast_to(eye[:2], (len(near), 2)), ends)]
+        _, by_pose, _, _ = reprojection.linearize(model, pose, points.positions[seen])
+        share = min(1.0, self.settings.max_points / max(len(seen), 1))
+        weight = share * model.tempering / model.sigma**2
+        return np.asarray(weight * np.einsum("kia,kib->ab", by_pose, by_pose))
+
+
+def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> CameraForecast | None:
+    """Of a robot that drives at ``speed`` [m/s], with the rate of a simulation's settings; None if it has no camera or the map no
+    points."""
+    if rig.camera is None or world.points is None:
+        return None
+    pixels = PixelSettings(rate=IMAGES_PER_SECOND) if settings is None else settings.pixels
+    return CameraForecast(world, rig.camera.model(), pixels.rate / speed, pixels)

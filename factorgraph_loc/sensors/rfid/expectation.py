@@ -1,0 +1,60 @@
+"""What antennas are expected to read on the way: the part of RFID in planning."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.rfid.forecast import ScanTables, log_weights, make_tables
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factors.rfid.detection import Looks, RfidLikelihood
+from factors.se2 import Array
+
+ROUNDS_PER_SECOND = 2.0  # where nothing else is said
+
+
+@dataclass(frozen=True, eq=False)
+class RfidForecast:
+    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of inventory rounds, ``rounds_per_metre`` of each antenna."""
+
+    likelihood: RfidLikelihood
+    rounds_per_metre: float = 4.0
+
+    @property
+    def goals(self) -> Array:
+        """The tags' places."""
+        return self.likelihood.tags.points[:, :2]
+
+    @cached_property
+    def _tables(self) -> ScanTables:
+        return make_tables(self.likelihood)
+
+    def information(self, poses: Array, ways: Array) -> Array:
+        """In proportion to the rounds, whatever is read in them."""
+        count = len(self.likelihood.model.antennas)
+        hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
+        one_round = Looks(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
+        found = self.likelihood.score(poses, one_round).information
+        return np.asarray((self.rounds_per_metre * ways)[:, None, None] * found)
+
+    def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
+        """By scans that are drawn, as many rounds as there are on the way, spread over the places."""
+        looks, total = len(poses), round(metres * self.rounds_per_metre)
+        rounds = np.diff(np.arange(looks + 1) * total // looks).astype(np.int64)
+        found = np.empty_like(out)
+        tempering = self.likelihood.model.tempering
+        log_weights(self._tables, poses, rounds, stops, len(out), seed, tempering, found)
+        out += found
+
+
+def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> RfidForecast | None:
+    """Of a robot that drives at ``speed`` [m/s], with the rates of a simulation's settings; None if it has no antennas or the map
+    no tags."""
+    if rig.rfid is None or not world.tags:
+        return None
+    rate = ROUNDS_PER_SECOND if settings is None else settings.rounds_per_second
+    return RfidForecast(RfidLikelihood(rig.rfid.model(), tag_map(world, rig.survey).tags), rate / speed)
