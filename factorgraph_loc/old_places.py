@@ -10,7 +10,10 @@ from typing import Any
 
 _SENSORS = tuple(f"factorgraph_loc.sensors.{name}" for name in ("odometry", "twist", "landmarks", "rfid", "camera"))
 _MODULES: dict[str, tuple[str, ...]] = {
-    "factorgraph_loc.calibration.mapping": ("factorgraph_loc.mapping.mapping",),
+    "factorgraph_loc.calibration.mapping": (
+        "factorgraph_loc.mapping.mapping",
+        "factorgraph_loc.sensors.landmarks.mapping",
+    ),
     "factorgraph_loc.calibration.phase": ("factorgraph_loc.sensors.rfid.calibration.phase",),
     "factorgraph_loc.calibration.rssi": ("factorgraph_loc.sensors.rfid.calibration.rssi",),
     "factorgraph_loc.calibration.tag_mapping": ("factorgraph_loc.mapping.tag_mapping",),

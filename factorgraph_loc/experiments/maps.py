@@ -27,6 +27,8 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
+from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
 from factors import se2
@@ -39,7 +41,6 @@ MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
 START_SIGMA = 1e-3  # m and rad; without a map the start is what defines the frame
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
-OF_CAMERA = ("camera", "sightings")
 OF_REFERENCE = "that of the reference"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
 
@@ -131,20 +132,25 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
     of_landmarks = bool(options.settings) or options.estimator != MAPPERS[0]
     of_tags = options.tag_height is not None
     of_others = of_landmarks or of_tags or options.extend
-    of = options.of
+    of, there = options.of, _mappable(log)
     if of == "points" and of_others:
         raise InputError("--estimator, --set, --extend and --tag-height are for other maps, but points are mapped here")
-    if of == "points" or (of is None and not of_others and "camera" in log.streams and log.rig.camera is not None):
+    if of == "points" or (of is None and not of_others and "points" in there):
         return "points"
     if of not in (None, "landmarks", "tags"):
         raise InputError(f"--of is {quoted(of)}, expected landmarks, tags or points")
-    if of == "tags" or (of is None and "bearing_range" not in log.streams and "rfid" in log.streams):
+    if of == "tags" or (of is None and "landmarks" not in there and "tags" in there):
         if of_landmarks:
             raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
         return "tags"
     if of_tags or options.poses is not None:
         raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
     return "landmarks"
+
+
+def _mappable(log: Log) -> dict[str, str]:
+    """The layers of a world that can be made of a log, and the sensors that tell of them."""
+    return {layer: name for name, function in functions("mappable") if (layer := function(log)) is not None}
 
 
 def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
@@ -155,7 +161,7 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         )
     if "landmarks" in settings:
         raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
-    mapping.check(log)
+    landmarks_mapping.check(log)
     if options.extend and not log.world.landmarks:
         raise InputError(f"{log.name}: has no map that could be extended; leave --extend out")
     source = ""
@@ -199,7 +205,7 @@ def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     """The map as it is, but for tags that were not read where the smoother says that they should have been."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
         raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
-    if "rfid" not in log.streams or not log.world.tags:
+    if "tags" not in _mappable(log) or not log.world.tags:
         raise InputError(f"{log.name}: has no reads, or no map of tags, expected both to find tags that are dead")
     with stages("smoother") as report:
         result = run(log, RunConfig("smoother", prior=options.prior), lambda share: report(share, 1.0))
@@ -216,7 +222,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     camera = log.rig.camera
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
-    if "camera" not in log.streams:
+    if "points" not in _mappable(log):
         raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
     warnings: tuple[str, ...] = ()
     frame = OF_REFERENCE
@@ -274,9 +280,10 @@ def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tu
 
     Its covariances say how well each pose is known, so that images of a place that is visited again still draw it together.
     """
-    others = tuple(name for name in log.rig.sensors if name in log.streams and name not in OF_CAMERA)
+    eyes = {channel.name for channel in sensors()[_mappable(log)["points"]].channels}
+    others = tuple(name for name in log.rig.sensors if name in log.streams and name not in eyes)
     started, frame = _started_exactly(log, prior)
-    blind = replace(started, streams={name: s for name, s in log.streams.items() if name not in OF_CAMERA})
+    blind = replace(started, streams={name: s for name, s in log.streams.items() if name not in eyes})
     with stages("smoother") as report:
         result = run(blind, RunConfig("smoother", sensors=others, prior="log"), lambda share: report(share, 1.0))
     return replace(log, reference=result.final, reference3=None), f"that of the start: {frame}", result.warnings

@@ -9,6 +9,7 @@ from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.model.belief import PosePrior, SpacePose
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.slam.space_pose import planar_estimate
 from factorgraph_loc.text import quoted
 
@@ -63,10 +64,12 @@ def check_prior(prior: str | None) -> None:
 
 def first_odometry(log: Log) -> float:
     """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
-    stream = log.streams.get("odometry")
-    if stream is None or len(stream.t) == 0:
-        return log.span()[0]
-    return float(stream.t.min()) + log.rig.time_offset("odometry")
+    starts = [
+        float(t.min()) + log.rig.time_offset(name)
+        for name in moving(log.streams, "floor")
+        if len(t := log.streams[name].t)
+    ]
+    return min(starts, default=log.span()[0])
 
 
 def _from_reference(log: Log) -> PosePrior:

@@ -18,13 +18,12 @@ from itertools import combinations
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.alignment import align_points
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors import se2
 from factors.se2 import Array
 
@@ -111,20 +110,6 @@ class Alignment:
 
 
 IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
-
-
-def check(log: Log) -> None:
-    """InputError if no landmark can be located from what the log's sightings hold."""
-    stream = log.streams.get("bearing_range")
-    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
-        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so that there is nothing to map")
-    if log.rig.bearing_range is None:
-        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and place")
-    if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
-        lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
-        raise InputError(
-            f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
-        )
 
 
 def make_map(

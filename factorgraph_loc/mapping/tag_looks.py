@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factorgraph_loc.text import listed
 from factors.rfid.detection import Looks
 from factors.rfid.model import RfidModel
@@ -48,22 +48,18 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
 
     Raises InputError if the log has no reads, or its rig no antennas that made one.
     """
-    stream = log.streams.get("rfid")
-    if not isinstance(stream, RfidStream) or not any(stream.epc):
+    scans = whole_scans(log)
+    found = {epc for scan in scans for epc in scan.tags}
+    if not found:
         raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")
     if log.rig.rfid is None:
         raise InputError(f"{log.name}: its rig has no [rfid], expected antennas and what they read")
     antennas = {name: i for i, name in enumerate(log.rig.rfid.all_antennas())}
     model = log.rig.rfid.model()
     given = tag_map(log.world, log.rig.survey)
-    names = (*given.names, *sorted(set(stream.epc) - set(given.names) - {""}))
+    names = (*given.names, *sorted(found - set(given.names)))
     index = {name: i for i, name in enumerate(names)}
-    rows = [
-        row
-        for m in stream.measurements(log.rig.time_offset("rfid"))
-        if isinstance(m, RfidScan)
-        for row in _rows(m, antennas, index)
-    ]
+    rows = [row for m in scans for row in _rows(m, antennas, index)]
     if not rows:
         known = listed(antennas)
         raise InputError(f"{log.name}: no antenna that read is in its rig, expected some of {known}")

@@ -63,7 +63,8 @@ class SensorType:
     Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
     together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
     diagnostics)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in the map
-    and the words for that nothing of it was found, or None.
+    and the words for that nothing of it was found, or None; ``mappable``: ``(log)``, the layer of a world that ``fgloc map`` can
+    make of what it measured, or None.
 
     Of simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:
@@ -84,6 +85,7 @@ class SensorType:
     prepare: Place = ""
     doubts: Place = ""
     findable: Place = ""
+    mappable: Place = ""
     simulate: Place = ""
     looks: Place = ""
     on_robot: Place = ""

@@ -9,12 +9,13 @@ from scipy.stats import binom
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, check, make_map
+from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, make_map
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark
+from factorgraph_loc.sensors.landmarks.mapping import check
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors import se2

@@ -48,6 +48,7 @@ SENSOR = SensorType(
     prepare="factorgraph_loc.sensors.camera.prepare:prepare",
     doubts="factorgraph_loc.sensors.camera.describe:doubts",
     findable="factorgraph_loc.sensors.camera.describe:findable",
+    mappable="factorgraph_loc.sensors.camera.describe:mappable",
     draw="factorgraph_loc.sensors.camera.draw:draw",
     simulation={
         "pixels": Section("factorgraph_loc.sensors.camera.simulation_settings:PixelSettings", always=True),

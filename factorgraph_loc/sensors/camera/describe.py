@@ -16,6 +16,11 @@ def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
     return None
 
 
+def mappable(log: Log) -> str | None:
+    """The layer of a world that can be made from a log's images, if it has some and the camera is known."""
+    return "points" if "camera" in log.streams and log.rig.camera is not None else None
+
+
 def doubts(use: Use, _: Diagnostics) -> Iterator[str]:
     """A map without points that the camera could find, where the estimator needs them."""
     used = [name for name in NAMES if name in use.sensors]

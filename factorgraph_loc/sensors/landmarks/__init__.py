@@ -19,6 +19,7 @@ SENSOR = SensorType(
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",
     findable="factorgraph_loc.sensors.landmarks.describe:findable",
+    mappable="factorgraph_loc.sensors.landmarks.mapping:mappable",
     draw="factorgraph_loc.sensors.landmarks.draw:draw",
     simulation={
         "sightings": Section("factorgraph_loc.sensors.landmarks.simulation_settings:SightingSettings", always=True),

@@ -32,6 +32,7 @@ SENSOR = SensorType(
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
     findable="factorgraph_loc.sensors.rfid.describe:findable",
+    mappable="factorgraph_loc.sensors.rfid.describe:mappable",
     draw="factorgraph_loc.sensors.rfid.draw:draw",
     simulation={
         "rssi": Section("factorgraph_loc.sensors.rfid.simulation_settings:RssiSettings"),

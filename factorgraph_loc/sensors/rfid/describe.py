@@ -15,6 +15,11 @@ def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
     return ("tags", "no tag of the map was read") if log.world.tags and "rfid" in sensors else None
 
 
+def mappable(log: Log) -> str | None:
+    """The layer of a world that can be made from a log's reads, if it has some."""
+    return "tags" if "rfid" in log.streams else None
+
+
 def doubts(use: Use, diagnostics: Diagnostics) -> Iterator[str]:
     """That an estimator takes no tags, that none is read, or which are believed dead at the end, the surest first."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
@@ -94,7 +94,7 @@ def _looks(log: Log) -> tuple[Array, Array]:
     rfid, reference, stream = log.rig.rfid, log.reference, log.streams.get("rfid")
     if rfid is None or reference is None or stream is None or not reference.has_heading:
         raise InputError(f"{log.name}: expected a log with rfid, antennas in its rig and a reference with headings")
-    scans = [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
+    scans = whole_scans(log)
     tags = tag_map(log.world, log.rig.survey, {epc for scan in scans for epc in scan.tags})
     if not np.isfinite(tags.tags.facing).all():
         raise InputError(f"{log.name}: has tags without a facing, expected one of each to find like ones by")

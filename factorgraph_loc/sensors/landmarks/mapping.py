@@ -1,0 +1,26 @@
+"""Whether landmarks can be mapped from the sightings of a log."""
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+
+
+def mappable(log: Log) -> str | None:
+    """The layer of a world that can be made from a log's sightings, if it has some."""
+    return "landmarks" if "bearing_range" in log.streams else None
+
+
+def check(log: Log) -> None:
+    """InputError if no landmark can be located from what the log's sightings hold."""
+    stream = log.streams.get("bearing_range")
+    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so that there is nothing to map")
+    if log.rig.bearing_range is None:
+        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and place")
+    if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
+        raise InputError(
+            f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
+        )
