@@ -147,6 +147,14 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
     )
 
 
+def rows_of(table: Table, stream: Stream) -> Iterator[dict[str, Any]]:
+    """The rows of a stream's table, values by the names of its columns, without stamps."""
+    names = [column.name for column in table.columns[1:]]
+    columns = [getattr(stream, column.field or column.name) for column in table.columns[1:]]
+    plain = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns]
+    return (dict(zip(names, row, strict=True)) for row in zip(*plain, strict=True))
+
+
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
     """The bounds of a stream's numbers, by the names of its fields."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):

@@ -39,9 +39,9 @@ def back(path):
     return rosbag.read(path, parse_model(rosbag.Options, options, "proposal"))
 
 
-def stamps(draw, count):
-    """Stamps in seconds, exact to the nanosecond, at least 1 us apart."""
-    steps = draw(st.lists(st.integers(1_000, 10**9), min_size=count, max_size=count))
+def stamps(draw, count, least=1_000):
+    """Stamps in seconds, exact to the nanosecond, at least so many of them apart."""
+    steps = draw(st.lists(st.integers(least, least + 10**9), min_size=count, max_size=count))
     return np.cumsum(steps) / 1e9
 
 
@@ -56,7 +56,8 @@ def logs(draw):
         moves = [column(MOVES) for _ in range(3)]
         for move in moves:
             move[0] = 0.0
-        odometry = IncrementStream(t, *moves)
+        # slow enough to be no jump, as to the origin, where odometry that begins anew would be
+        odometry = IncrementStream(stamps(draw, count, 2 * 10**9), *moves)
     streams = {"odometry": odometry, "imu": YawRateStream(stamps(draw, count), column(NUMBERS))}
     names = draw(st.lists(st.sampled_from(NAMES), min_size=count, max_size=count))
     ranges = column(st.floats(0.1, 100.0) | st.just(np.nan))

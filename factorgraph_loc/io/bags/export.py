@@ -16,18 +16,18 @@ from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.files.checks import absolute
 from factorgraph_loc.files.temporary import sweep, temporary_folder
 from factorgraph_loc.io.bags.file import ROS1, SUFFIXES, require_rosbags
-from factorgraph_loc.io.bags.messages import DEFINITIONS, INITIAL_POSE, LANDMARK, PIXEL, READ, ROUND
+from factorgraph_loc.io.bags.messages import INITIAL_POSE, READ, ROUND, definitions, tables_of_messages
 from factorgraph_loc.io.bags.poses import POINT
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.stream import ImageStream, RightSightingStream, SightingStream
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tables import tables_of
+from factorgraph_loc.sensors.tables import rows_of
 from factors import se2
 from factors.se2 import Array
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 MAP, ODOM, BASE, CAMERA = "map", "odom", "base_link", "camera"
+FRAMES = {"sightings": CAMERA}  # of tables that are not in the robot's
 PNG_OR_JPEG = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 LATEST = 2**31 * 10**9  # ns: what the 32 bits of a stamp's seconds hold
 
@@ -71,7 +72,7 @@ def _write(log: Log, folder: Path, suffix: str) -> Path:
 
     is_ros1 = suffix == ROS1
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    for kind, text in DEFINITIONS.items():
+    for kind, text in definitions().items():
         store.register(get_types_from_msg(text.format(time="time" if is_ros1 else "builtin_interfaces/Time"), kind))
     writer: Any
     if is_ros1:
@@ -159,18 +160,16 @@ def _of_stream(name: str, stream: Stream, log: Log, build: _Builder) -> Iterator
             kind, frame, rows = "nav_msgs/msg/Odometry", ODOM, _odometry(stream, build)
         case YawRateStream():
             kind, rows = "sensor_msgs/msg/Imu", _imu(stream, build)
-        case BearingRangeStream():
-            columns = zip(stream.landmark, stream.range.tolist(), stream.bearing.tolist(), strict=True)
-            kind, rows = LANDMARK, ({"landmark": n, "range": r, "bearing": b} for n, r, b in columns)
-        case SightingStream() if not isinstance(stream, RightSightingStream):
-            columns = zip(stream.point, stream.u.tolist(), stream.v.tolist(), strict=True)
-            kind, frame, rows = PIXEL, CAMERA, ({"landmark": n, "u": u, "v": v} for n, u, v in columns)
         case ImageStream():
             topic = f"/{name}/image/compressed"
             kind, frame, rows = "sensor_msgs/msg/CompressedImage", CAMERA, _images(stream)
         case _:
-            what = type(stream).__name__
-            raise InputError(f"{log.name}: {name} cannot be written to a bag, which has no message for {what}")
+            table = next(((k, t) for k, t in tables_of_messages().items() if t.name == name), None)
+            if table is None:
+                what = type(stream).__name__
+                raise InputError(f"{log.name}: {name} cannot be written to a bag, which has no message for {what}")
+            kind, rows = table[0], rows_of(table[1], stream)
+            frame = FRAMES.get(name, BASE)
     return _stamped(topic, kind, absolute(stream.t, log.t0_ns).tolist(), rows, frame, build)
 
 

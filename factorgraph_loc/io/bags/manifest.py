@@ -15,7 +15,7 @@ from factorgraph_loc.io.bags.fields import LIST, has_header, leaves
 from factorgraph_loc.io.bags.file import Bag, Topic
 from factorgraph_loc.io.bags.frames import STATIC
 from factorgraph_loc.io.bags.landmarks import CORNERS, DETECTIONS
-from factorgraph_loc.io.bags.messages import INITIAL_POSE, LANDMARK, PIXEL, ROUND
+from factorgraph_loc.io.bags.messages import INITIAL_POSE, ROUND, tables_of_messages
 from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
 from factorgraph_loc.io.bags.poses import POINT, POSES
 
@@ -80,7 +80,7 @@ def propose(bag: Bag) -> Proposal:
     _reference(out, topics)
     _one_of(out, "imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
-    _landmarks(out, topics)
+    _tables(out, topics)
     _rfid(out, bag, topics)
     if STATIC in bag.topics:
         out.uses[STATIC] = "where sensors sit"
@@ -184,12 +184,12 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
     _others(out, "camera", images[1:])
 
 
-def _landmarks(out: Proposal, topics: Sequence[Topic]) -> None:
+def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
+    ours = tables_of_messages()
     for topic in topics:
-        if topic.type == LANDMARK:
-            out.take("bearing_range", topic, fields={name: name for name in ("landmark", "range", "bearing")})
-        elif topic.type == PIXEL:
-            out.take("sightings", topic, fields={name: name for name in ("landmark", "u", "v")})
+        if topic.type in ours:
+            table = ours[topic.type]
+            out.take(table.name, topic, fields={column.name: column.name for column in table.columns[1:]})
         elif topic.type in DETECTIONS and "bearing_range" not in out.options:
             out.take("bearing_range", topic)
         elif topic.type == CORNERS and "sightings" not in out.options:

@@ -1,17 +1,41 @@
-"""The messages that our own logs become in a bag: those of ROS where it has one for the purpose, and three of our own."""
+"""The messages that our own logs become in a bag: those of ROS where it has one for the purpose, else our own.
 
-LANDMARK = "factorgraph_loc_msgs/msg/LandmarkSighting"
-PIXEL = "factorgraph_loc_msgs/msg/PixelSighting"
-ROUND = "factorgraph_loc_msgs/msg/RfidRound"
+A table whose rows are no message of ROS has one of its own, with a field for each column.
+"""
+
+from collections.abc import Mapping
+
+from factorgraph_loc.files.columns import Table
+from factorgraph_loc.sensors.tables import native_tables
+
+OURS = "factorgraph_loc_msgs/msg/"
+NAMED = {"bearing_range": f"{OURS}LandmarkSighting", "sightings": f"{OURS}PixelSighting"}
+ROS_HAS = ("odometry", "imu", "camera", "rfid", "inventories")  # tables that become other messages
+READ, ROUND = f"{OURS}RfidRead", f"{OURS}RfidRound"
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 LINE = "=" * 80
-DEFINITIONS = {
-    LANDMARK: "std_msgs/Header header\nstring landmark\nfloat64 range\nfloat64 bearing\n",
-    PIXEL: "std_msgs/Header header\nstring landmark\nfloat64 u\nfloat64 v\n",
-    # stamped at the end of the round; one that read nothing holds no reads
-    ROUND: "std_msgs/Header header\nstring antenna\nRfidRead[] reads\n"
-    f"{LINE}\nMSG: factorgraph_loc_msgs/RfidRead\n"
-    "{time} stamp\nstring epc\nfloat64 rssi\nfloat64 phase\nfloat64 frequency\n",
-}
-READ = "factorgraph_loc_msgs/msg/RfidRead"
+KINDS = {"number": "float64", "whole": "int64", "name": "string", "file": "string"}
+
+
+def tables_of_messages() -> Mapping[str, Table]:
+    """The tables each of whose rows is a message of our own, by its type."""
+    return {
+        NAMED.get(name) or OURS + "".join(part.capitalize() for part in name.split("_")): tables[0]
+        for name, (_, tables) in native_tables().items()
+        if name not in ROS_HAS
+    }
+
+
+def definitions() -> dict[str, str]:
+    """Our own messages by their types, ``{time}`` for what a stamp is of."""
+    rows = {
+        kind: "std_msgs/Header header\n" + "".join(f"{KINDS[c.kind]} {c.name}\n" for c in table.columns[1:])
+        for kind, table in tables_of_messages().items()
+    }
+    return rows | {
+        # stamped at the end of the round; one that read nothing holds no reads
+        ROUND: "std_msgs/Header header\nstring antenna\nRfidRead[] reads\n"
+        f"{LINE}\nMSG: factorgraph_loc_msgs/RfidRead\n"
+        "{time} stamp\nstring epc\nfloat64 rssi\nfloat64 phase\nfloat64 frequency\n",
+    }

@@ -4,12 +4,12 @@ The bag is read once, as a stream; of its messages only the numbers that a log n
 """
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.io.bags import clock as bag_clock
 from factorgraph_loc.io.bags import rig as bag_rig
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
@@ -17,9 +17,11 @@ from factorgraph_loc.io.bags.clock import TF, Clock, Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
 from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
+from factorgraph_loc.io.bags.messages import tables_of_messages
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
 from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
+from factorgraph_loc.io.bags.tables import RowsOfTopic, TableTopic
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream
@@ -43,6 +45,10 @@ class Options(FileModel):
     start: StartTopic | None = None
     clock: Clock = "header"
     base_frame: str = "base_link"
+
+
+OTHERS = [table for table in tables_of_messages().values() if table.name not in Options.model_fields]
+add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="sightings")
 
 
 class Gatherer(Protocol):
@@ -95,6 +101,7 @@ class Gathered:
     sightings: PixelsOfPoints | None = None
     reference: Poses | FrameReference | None = None
     start: Start | None = None
+    others: dict[str, RowsOfTopic] = field(default_factory=dict)
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -131,6 +138,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         streams["camera"] = gathered.camera.stream(t0_ns, warnings)
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
+    streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
     notes: list[str] = []  # of the bag's own rig, which one of the manifest replaces
     rig = _rig(streams, gathered, options, frames, notes)
     name = bag.path.resolve().stem
@@ -167,6 +175,10 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
             out.sightings,
             listeners.stamper(options.sightings.topic, options.sightings.clock),
         )
+    for table in OTHERS:
+        if (told := getattr(options, table.name)) is not None:
+            out.others[table.name] = RowsOfTopic(bag, told, table)
+            listeners.add(told.topic, out.others[table.name], listeners.stamper(told.topic, told.clock))
     if options.camera:
         out.camera, out.info = _listen_to_camera(listeners, options.camera)
     if options.reference:

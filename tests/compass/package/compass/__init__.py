@@ -1,0 +1,18 @@
+"""A compass: it measures the robot's heading, with a constant bias."""
+
+from factorgraph_loc.model.sections import Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+SENSOR = SensorType(
+    "compass",
+    channels=(
+        Channel(
+            "compass",
+            streams=("compass.stream:HeadingStream",),
+            measurements=("compass.stream:Heading",),
+            tables=("compass.columns:HEADINGS",),
+            section="compass",
+        ),
+    ),
+    settings={"compass": Section("compass.settings:CompassSettings")},
+)

@@ -1,0 +1,162 @@
+"""What a compass can be used for where its package is installed: run by ``test_compass.py``, which puts it on the path."""
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from compass.columns import HEADINGS
+from compass.settings import CompassSettings
+from compass.stream import Heading, HeadingStream
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.sensors.registry import channels
+from factorgraph_loc.sensors.tables import all_tables
+
+T = np.arange(50) / 10.0
+UNIX = 1_700_000_000_000_000_000
+FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+RIG = fgloc.Rig(
+    name="cart", sensors=("odometry", "compass"), compass=CompassSettings(bias=0.1, uncertainty={"bias": 0.3})
+)
+
+
+def made_log() -> fgloc.Log:
+    """Five seconds along an arc, with a compass that reports 0.1 rad too much, twice a second."""
+    truth = np.column_stack((np.sin(0.2 * T) / 0.2, (1.0 - np.cos(0.2 * T)) / 0.2, 0.2 * T))
+    streams = {
+        "odometry": fgloc.VelocityStream(T, np.ones(50), np.full(50, 0.2)),
+        "compass": HeadingStream(T[::5] + 0.03, 0.2 * (T[::5] + 0.03) + 0.1),
+    }
+    start = fgloc.StartPose(0.0, np.zeros(3), np.full(3, 0.01))
+    return fgloc.Log("arc", RIG, fgloc.World(), streams, fgloc.Trajectory(T, truth), start, t0_ns=UNIX)
+
+
+def command(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*FGLOC, *map(str, words)], capture_output=True, text=True, check=False)
+
+
+def test_its_channel_and_its_table_are_known():
+    assert "compass" in channels()
+    assert HEADINGS in list(all_tables())
+
+
+def test_a_rig_has_its_section(tmp_path):
+    file = tmp_path / "a.rig.toml"
+    fgloc.write_rig(RIG, file)
+    assert fgloc.read_rig(file) == RIG
+    assert RIG.compass is RIG.find(CompassSettings)
+    assert RIG.estimated("compass").names == ("bias",)
+    assert fgloc.Rig().compass is None
+    assert fgloc.Rig(compass=CompassSettings(time_offset=0.2)).time_offset("compass") == 0.2
+    file.write_text("[compass]\nsigma = 2\n")
+    with pytest.raises(fgloc.InputError, match=r"a\.rig\.toml: compass\.sigma is 2: input should be less than"):
+        fgloc.read_rig(file)
+    file.write_text("[compas]\n")
+    with pytest.raises(fgloc.InputError, match="unknown key compas: did you mean compass"):
+        fgloc.read_rig(file)
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_a_log_comes_back_from_its_folder(tmp_path, format):
+    log = made_log()
+    fgloc.write_native(log, tmp_path / "arc", format=format)
+    found = fgloc.read_log(tmp_path / "arc")
+    assert found.rig == log.rig
+    assert not [line for line in found.warnings if "compass" in line]
+    np.testing.assert_array_equal(found.streams["compass"].heading, log.streams["compass"].heading)
+    np.testing.assert_allclose(found.streams["compass"].t, log.streams["compass"].t, atol=1e-9)
+
+
+def test_what_is_wrong_in_its_table_is_told_with_file_and_row(tmp_path):
+    fgloc.write_native(made_log(), tmp_path / "arc")
+    (tmp_path / "arc/compass.csv").write_text(f"t_ns,heading\n{UNIX},0.1\n{UNIX + 10**9},90\n")
+    with pytest.raises(fgloc.InputError, match=r"compass\.csv:3: heading is 90.*radians, not degrees"):
+        fgloc.read_log(tmp_path / "arc")
+
+
+def test_a_table_of_another_program_by_a_mapping(tmp_path):
+    (tmp_path / "wheels.csv").write_text("time,v,w\n0.0,1,0\n1.0,1,0\n")
+    (tmp_path / "kvh.csv").write_text("time;yaw\n0.0;90\n0.5;-45\n")
+    (tmp_path / "arc.toml").write_text(
+        'title = "arc"\nreader = "mapped"\nlicence = "none"\norigin = "made"\npath = "."\n'
+        '[options.odometry]\nfile = "wheels.csv"\ncolumns = { t = "time", v = "v", w = "w" }\nunits = { t = "s" }\n'
+        '[options.compass]\nfile = "kvh.csv"\nseparator = ";"\ncolumns = { t = "time", heading = "yaw" }\n'
+        'units = { t = "s", heading = "deg" }\nclock_offset = 0.25\n'
+    )
+    stream = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
+    np.testing.assert_allclose(stream.t, (0.25, 0.75))
+    np.testing.assert_allclose(stream.heading, (math.pi / 2.0, -math.pi / 4.0))
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_a_bag_gives_it_back(tmp_path, suffix):
+    log = made_log()
+    path = tmp_path / f"arc{suffix}"
+    fgloc.write_log(log, path)
+    with open_bag(path) as bag:
+        manifest = manifest_of(propose(bag), path.name, {"rig": "arc.rig.toml", "world": "arc.world.toml"})
+    (tmp_path / "arc.toml").write_text(manifest_text(manifest, []))
+    found = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
+    np.testing.assert_array_equal(found.heading, log.streams["compass"].heading)
+    np.testing.assert_allclose(found.t, log.streams["compass"].t, atol=1e-8)
+
+
+def test_parts_of_logs_hold_it():
+    log = made_log()
+    assert len(cut(log, 1.0, 2.0).streams["compass"].t) == 2
+    assert len(join(log, log).streams["compass"].t) == 20
+    given = [m for m in log.measurements(log.rig.sensors) if isinstance(m, Heading)]
+    assert [m.t for m in given] == log.streams["compass"].t.tolist()
+
+
+def test_what_lies_outside_its_bounds_is_not_run():
+    log = made_log()
+    log.streams["compass"].heading[3] = 1e3
+    with pytest.raises(fgloc.InputError, match=r"arc: compass at 1\.530 s: heading is 1000\.0"):
+        fgloc.run(log, "dead_reckoning")
+
+
+@pytest.mark.parametrize("estimator", ["dead_reckoning", "ekf", "particle_filter"])
+def test_an_estimator_that_does_not_use_it_counts_it(estimator):
+    run = fgloc.run(made_log(), estimator, sensors=["odometry", "compass"])
+    assert run.result.diagnostics.ignored == {"compass": 10}
+
+
+def test_it_is_pushed():
+    localizer = fgloc.Localizer(RIG, estimator="ekf")
+    localizer.initialize((0.0, 0.0, 0.0), t=0.0)
+    localizer.push(fgloc.VelocityOdometry(0.0, 1.0, 0.0))
+    localizer.push(Heading(0.5, 0.1))
+    assert localizer.estimate().t == 0.5
+    with pytest.raises(
+        fgloc.InputError, match=r"^Heading at 0\.600 s: heading is nan, expected a finite number of radians"
+    ):
+        localizer.push(Heading(0.6, math.nan))
+
+
+def test_info_tells_of_it(tmp_path):
+    fgloc.write_native(made_log(), tmp_path / "arc")
+    done = command("info", tmp_path / "arc", "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["streams"]["compass"]["rows"] == 10
+    assert told["rig"]["compass"]["bias"] == 0.1
+
+
+def test_it_is_named_on_the_command_line(tmp_path):
+    fgloc.write_native(made_log(), tmp_path / "arc")
+    done = command(
+        "run", tmp_path / "arc", "--estimator", "ekf", "--sensors", "odometry,compas", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 2
+    assert "did you mean compass?" in done.stderr
+    done = command(
+        "run", tmp_path / "arc", "--estimator", "ekf", "--sensors", "odometry,compass", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 0, done.stderr
