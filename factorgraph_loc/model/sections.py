@@ -25,10 +25,18 @@ class Section:
 @dataclass(frozen=True)
 class Layer:
     """A layer of a world, things by name. ``kind``: the class of one, a :class:`~factorgraph_loc.files.models.FileModel`;
-    ``table``: the description of the table that may hold many of them."""
+    ``table``: the description of the table that may hold many of them.
+
+    ``read``: ``(content, source, folder) -> things``, of what stands in the file of a world in ``folder``, such as the name of a
+    table; ``write``: ``(things, world's file without suffixes) -> what stands there in place of them``, or None; ``suffix``: of the
+    tables that they read and write.
+    """
 
     kind: Place
     table: Place = ""
+    read: Place = ""
+    write: Place = ""
+    suffix: str = ""
 
 
 class _Channel(Protocol):

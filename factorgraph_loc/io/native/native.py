@@ -21,11 +21,11 @@ from factorgraph_loc.maps.points import POINTS_SUFFIX
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.planar import on_floor, rotations_of
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import layers
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.registry import Channel, channel
-from factorgraph_loc.sensors.rfid.map import TAGS_SUFFIX
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
 from factorgraph_loc.text import listed
 
@@ -107,12 +107,11 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
                 tables[name] = rows
             else:
                 warnings.append(f"{file}: holds no rows")
+    suffixes = (POINTS_SUFFIX, *(layer.suffix for layer in layers().values() if layer.suffix))
     unread = sorted(
         file.name
         for file in folder.iterdir()
-        if file.suffix in SUFFIXES
-        and file.stem not in native_tables()
-        and not file.name.endswith((TAGS_SUFFIX, POINTS_SUFFIX))
+        if file.suffix in SUFFIXES and file.stem not in native_tables() and not file.name.endswith(suffixes)
     )
     if unread:
         warnings.append(f"{folder}: this version does not read {listed(unread)}")

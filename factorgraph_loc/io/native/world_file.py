@@ -9,8 +9,9 @@ from factorgraph_loc.files.models import FileModel, inside, parse_model, read_to
 from factorgraph_loc.maps.markers import Marker, corner_points
 from factorgraph_loc.maps.occupancy import read_walls
 from factorgraph_loc.maps.points import POINTS_SUFFIX, read_points, write_points
+from factorgraph_loc.model.sections import layers
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.rfid.map import TAGS_SUFFIX, TagsFile, read_mapped_tags, read_tags, write_tags
+from factorgraph_loc.plugins import load
 from factorgraph_loc.text import quoted
 
 
@@ -27,15 +28,11 @@ def read_world(path: str | Path) -> World:
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
     """A map as it stands in a file ``source``; tables that it names lie below ``folder``. InputError as of :func:`read_world`.
 
-    ``walls`` may name an occupancy map, ``tags`` a table of another program with the mapping of its columns; the corners of
-    ``markers`` become points.
+    ``walls`` may name an occupancy map, a layer a table of its own; the corners of ``markers`` become points.
     """
-    tags = content.get("tags")
-    if isinstance(tags, str):
-        content = {**content, "tags": read_tags(inside(folder, tags, source))}
-    elif isinstance(tags, dict) and isinstance(tags.get("file"), str):
-        mapping = parse_model(TagsFile, tags, f"{source} [tags]")
-        content = {**content, "tags": read_mapped_tags(inside(folder, mapping.file, source), mapping)}
+    for name, layer in layers().items():
+        if layer.read and name in content:
+            content = {**content, name: load(layer.read)(content[name], source, folder)}
     if isinstance(walls := content.get("walls"), str):
         content = {**content, "walls": read_walls(inside(folder, walls, source))}
     points = content.get("points")
@@ -55,14 +52,14 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
 
 
 def write_world(world: World, path: str | Path) -> None:
-    """Write ``NAME.world.toml``, the tags beside it as ``NAME.tags.csv``, or in the same file where one has a covariance, and the
-    points as ``NAME.points.parquet``."""
+    """Write ``NAME.world.toml``, layers that have tables beside it, such as ``NAME.tags.csv``, and the points as
+    ``NAME.points.parquet``."""
     path = Path(path)
     content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
     base = path.name.removesuffix(".toml").removesuffix(".world")
-    if world.tags and all(tag.covariance is None for tag in world.tags.values()):
-        content["tags"] = base + TAGS_SUFFIX
-        write_tags(world.tags, path.parent / content["tags"])
+    for name, layer in layers().items():
+        if layer.write and (told := load(layer.write)(getattr(world, name), path.parent / base)) is not None:
+            content[name] = told
     if world.points is not None:
         content["points"] = base + POINTS_SUFFIX
         write_points(world.points, path.parent / content["points"])

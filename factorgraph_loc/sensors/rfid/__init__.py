@@ -28,7 +28,15 @@ SENSOR = SensorType(
         "rfid": Section("factorgraph_loc.sensors.rfid.settings:RfidSettings"),
         "survey": Section("factorgraph_loc.sensors.rfid.settings:SurveySettings", always=True),
     },
-    layers={"tags": Layer("factorgraph_loc.sensors.rfid.map:Tag", "factorgraph_loc.sensors.rfid.columns:TAGS")},
+    layers={
+        "tags": Layer(
+            "factorgraph_loc.sensors.rfid.map:Tag",
+            table="factorgraph_loc.sensors.rfid.columns:TAGS",
+            read="factorgraph_loc.sensors.rfid.map:read_layer",
+            write="factorgraph_loc.sensors.rfid.map:write_layer",
+            suffix=".tags.csv",
+        )
+    },
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
     findable="factorgraph_loc.sensors.rfid.describe:findable",

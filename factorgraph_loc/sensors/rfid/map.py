@@ -5,14 +5,14 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
 from factorgraph_loc.files.csv_cells import read_cells
-from factorgraph_loc.files.models import Coordinate, FileModel, parse_model, write_text
+from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model, write_text
 from factorgraph_loc.model.survey import Covariance
 from factorgraph_loc.sensors.rfid.columns import TAGS
 from factors.se2 import Array
@@ -42,6 +42,24 @@ class TagsFile(ColumnMapping):
     letters EPCs are compared with the reads."""
 
     epc_case: EpcCase = "as written"
+
+
+def read_layer(content: Any, source: object, folder: Path) -> Any:
+    """The tags of a world's file: there, in a table that it names, or in one of another program by a mapping."""
+    if isinstance(content, str):
+        return read_tags(inside(folder, content, source))
+    if isinstance(content, dict) and isinstance(content.get("file"), str):
+        mapping = parse_model(TagsFile, content, f"{source} [tags]")
+        return read_mapped_tags(inside(folder, mapping.file, source), mapping)
+    return content
+
+
+def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
+    """Write tags as a table, and return its name; None if one has a covariance, for which a table has no column."""
+    if not tags or any(tag.covariance is not None for tag in tags.values()):
+        return None
+    write_tags(tags, base.with_name(base.name + TAGS_SUFFIX))
+    return base.name + TAGS_SUFFIX
 
 
 def read_tags(path: Path) -> dict[str, Tag]:
