@@ -12,6 +12,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
@@ -36,6 +37,11 @@ def whole() -> Log:
     bearing = np.arctan2(away[:, 1], away[:, 0]) - poses[:, 2] + 0.02 * rng.standard_normal(len(t))
     seen = BearingRangeStream(t, names, np.maximum(distance, 0.01), se2.wrap(bearing))
     return replace(log, streams={**log.streams, "bearing_range": seen})
+
+
+def in_order(log: Log) -> list[tuple[str, Stream]]:
+    """The streams, in an order of which random draws can be sure."""
+    return [(name, log.streams[name]) for name in ("odometry", "rfid", "bearing_range")]
 
 
 def fault(function: Fault) -> Fault:
@@ -129,14 +135,14 @@ def many_glitches(log, rng):
 
 @fault
 def repeated_rows(log, rng):
-    for name, stream in log.streams.items():
+    for name, stream in in_order(log):
         log = rows(log, name, np.sort(rng.integers(0, len(stream.t), 2 * len(stream.t))))
     return log
 
 
 @fault
 def missing_rows(log, rng):
-    for name, stream in log.streams.items():
+    for name, stream in in_order(log):
         log = rows(log, name, np.flatnonzero(rng.random(len(stream.t)) < 0.4))
     return log
 
