@@ -7,9 +7,8 @@ import sys
 
 import numpy as np
 import pytest
-from compass.columns import HEADINGS
 from compass.settings import CompassSettings
-from compass.stream import Heading, HeadingStream
+from compass.stream import HEADINGS, Heading, HeadingStream
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
@@ -147,6 +146,8 @@ def test_info_tells_of_it(tmp_path):
     told = json.loads(done.stdout)
     assert told["streams"]["compass"]["rows"] == 10
     assert told["rig"]["compass"]["bias"] == 0.1
+    assert told["compass"]["bias"] == pytest.approx(0.1, abs=1e-6)
+    assert "the compass reports 0.100 rad too much" in command("info", tmp_path / "arc").stdout
 
 
 def test_it_is_named_on_the_command_line(tmp_path):
@@ -160,3 +161,18 @@ def test_it_is_named_on_the_command_line(tmp_path):
         "run", tmp_path / "arc", "--estimator", "ekf", "--sensors", "odometry,compass", "--out", tmp_path / "out"
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_simulated_drive_has_it():
+    changes = {
+        "drive": {"duration": 20.0},
+        "rig": {"compass": {"bias": 0.1, "uncertainty": {"bias": 0.2}}},
+        "compass": {"rate": 5.0},
+    }
+    logs = [fgloc.simulate("office", seed, changes=changes) for seed in (1, 1, 2)]
+    assert logs[0].rig.sensors[-1] == "compass"
+    assert len(logs[0].streams["compass"].t) == 100
+    np.testing.assert_array_equal(*(log.streams["compass"].heading for log in logs[:2]))
+    biases = [fgloc.info(log).compass["bias"] for log in logs]
+    assert biases[1] != biases[2]
+    assert all(abs(bias - 0.1) < 0.8 for bias in biases)

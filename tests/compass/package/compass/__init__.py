@@ -10,9 +10,12 @@ SENSOR = SensorType(
             "compass",
             streams=("compass.stream:HeadingStream",),
             measurements=("compass.stream:Heading",),
-            tables=("compass.columns:HEADINGS",),
+            tables=("compass.stream:HEADINGS",),
             section="compass",
         ),
     ),
     settings={"compass": Section("compass.settings:CompassSettings")},
+    simulation={"compass": Section("compass.settings:CompassSimulation", always=True)},
+    simulate="compass.simulation:simulate",
+    summarize="compass.summary:summarize",
 )

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.simulation_units import Hertz
 from factorgraph_loc.model.units import Angle
 
 
@@ -22,3 +23,9 @@ class CompassSettings(SensorSettings):
     bias: Angle = 0.0
     sigma: Annotated[float, Field(ge=1e-4, le=1.0, description="rad, not degrees")] = 0.02
     uncertainty: CompassUncertainty = CompassUncertainty()
+
+
+class CompassSimulation(FileModel):
+    """``rate``: headings per second."""
+
+    rate: Hertz = 2.0

@@ -1,12 +1,20 @@
-"""What a compass reports, and its rows in a log."""
+"""What a compass reports, its rows in a log, and the table that holds them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
+from factorgraph_loc.files.columns import ANGLE, FULL_TURN, STAMP, Table, within
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.stream import Stream
 from factors.se2 import Array
+
+HEADINGS = Table(
+    "compass",
+    (STAMP, within("heading", ANGLE, FULL_TURN, "direction of the robot's x axis, with the compass's bias")),
+    "one each",
+    stream="compass.stream:HeadingStream",
+)
 
 
 @dataclass(frozen=True, slots=True)
