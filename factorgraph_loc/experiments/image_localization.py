@@ -22,6 +22,7 @@ from factorgraph_loc.mapping.triangulation import Cameras
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.prepare import frames_of
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
@@ -103,9 +104,8 @@ def evaluate_images(
         doubts += [one for one in warnings if one not in doubts]
         posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
         _check(log, seen, posed, {"map": mapped, **queries})
-        assert log.rig.camera is not None
         made = map_points(
-            log.rig.camera.model(),
+            log.rig.of(CameraSettings).model(),
             posed[np.array(mapped, dtype=np.int64)],
             PointSettings(distance=0.0, angle=0.0),
             told,

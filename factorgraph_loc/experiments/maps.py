@@ -27,8 +27,10 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
 from factorgraph_loc.sensors.registry import functions, sensors
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
 from factors import se2
@@ -212,14 +214,14 @@ def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     dead = dict(sorted(result.diagnostics.dead_tags.items(), key=lambda row: -row[1]))
     world = log.world.model_copy(update={"tags": {n: tag for n, tag in log.world.tags.items() if n not in dead}})
     details = DroppedTags(dead, len(world.tags))
-    known = tag_map(log.world, log.rig.survey)
+    known = tag_map(log.world, log.rig.of(SurveySettings))
     places = dict(zip(known.names, known.tags.points[:, :2], strict=True))
     draw = partial(map_figure.dropped_figure, log.name, places, dead, result.final.poses, world.walls)
     return MadeMap(world, "that of the given map", details, result.warnings, draw)
 
 
 def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
-    camera = log.rig.camera
+    camera = log.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
     if "points" not in _mappable(log):

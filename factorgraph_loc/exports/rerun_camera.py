@@ -13,6 +13,7 @@ from factorgraph_loc.exports.scene import GAP, LIT, SEEN
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import draw
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
@@ -30,7 +31,7 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
     """What the camera saw, as a picture before the first robot; identified points in it, and where the map's points should be."""
     import rerun as rr  # noqa: PLC0415
 
-    settings = log.rig.camera
+    settings = log.rig.find(CameraSettings)
     if settings is None or not draw.has_pictures(log):
         return
     model, at, poses = settings.model(), camera_path(log, runs), _carrier(log, runs)

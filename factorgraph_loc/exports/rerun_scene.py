@@ -28,6 +28,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.draw import has_pictures
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -241,7 +242,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
         eye_controls=eye,
     )
     beside: list[rrb.View] = []
-    if log.rig.camera is not None and has_pictures(log):
+    if log.rig.find(CameraSettings) is not None and has_pictures(log):
         beside.append(rrb.Spatial2DView(origin=camera_path(log, runs), name="camera"))
     titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
     beside += [

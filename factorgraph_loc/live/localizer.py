@@ -29,6 +29,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.camera.prepare import frontend_of
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.rfid.pushed import RfidRead, scan_of
@@ -136,7 +137,7 @@ class Localizer:
         InputError as of :meth:`push`, or if it is no such image.
         """
         t = seconds_of("image", t)
-        if self._rig.camera is None:
+        if self._rig.find(CameraSettings) is None:
             raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
         modalities = getattr(registry.estimator_type(self._name), "modalities", ())
         if "camera" not in self._sensors or "camera" not in modalities:
@@ -148,7 +149,7 @@ class Localizer:
                 # imported here, as without images no OpenCV is needed
                 from factorgraph_loc.sensors.camera.live import LiveFrontend  # noqa: PLC0415
 
-                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), self._rig.camera.model())
+                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), self._rig.of(CameraSettings).model())
             frame = self._frontend.frame(t, image)
         self.push(frame)
 

@@ -11,6 +11,7 @@ from factorgraph_loc.mapping.triangulation import Cameras, Integers
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.prepare import frames_of
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
 from factors.se2 import Array
@@ -41,9 +42,9 @@ def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames
     reference are missing, or nothing is left.
     """
     t, found = frames_of(log)
-    if log.rig.camera is None:
+    if log.rig.find(CameraSettings) is None:
         raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
-    model = log.rig.camera.model()
+    model = log.rig.of(CameraSettings).model()
     usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
     if log.reference3 is not None:
         inside = (t >= log.reference3.t[0]) & (t <= log.reference3.t[-1])

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factorgraph_loc.text import listed
@@ -52,11 +53,11 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
     found = {epc for scan in scans for epc in scan.tags}
     if not found:
         raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")
-    if log.rig.rfid is None:
+    if log.rig.find(RfidSettings) is None:
         raise InputError(f"{log.name}: its rig has no [rfid], expected antennas and what they read")
-    antennas = {name: i for i, name in enumerate(log.rig.rfid.all_antennas())}
-    model = log.rig.rfid.model()
-    given = tag_map(log.world, log.rig.survey)
+    antennas = {name: i for i, name in enumerate(log.rig.of(RfidSettings).all_antennas())}
+    model = log.rig.of(RfidSettings).model()
+    given = tag_map(log.world, log.rig.of(SurveySettings))
     names = (*given.names, *sorted(found - set(given.names)))
     index = {name: i for i, name in enumerate(names)}
     rows = [row for m in scans for row in _rows(m, antennas, index)]

@@ -148,7 +148,9 @@ def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
     if tag.covariance is None:
         return Landmark.bounded(x=x, y=y, sigma=tag.sigma)
     xx, xy, yy = tag.covariance
-    return Landmark.bounded(x=x, y=y, covariance=_turned(np.array(((xx, xy), (xy, yy))), float(log.rig.survey.heading)))
+    return Landmark.bounded(
+        x=x, y=y, covariance=_turned(np.array(((xx, xy), (xy, yy))), float(log.rig.of(SurveySettings).heading))
+    )
 
 
 def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
@@ -160,7 +162,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 
 def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool) -> World:
     """The map as it is written: learnt tags in the frame of the rig's survey, those that were kept as they were given."""
-    survey: SurveySettings = log.rig.survey
+    survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()
     tags: dict[str, Tag] = {}
     for i, name in enumerate(looks.names):

@@ -33,14 +33,14 @@ class Rig(FileModel):
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """The settings of a class, of the ``section`` if a rig may have several of that class; None if it has none."""
-        found: S | None = getattr(self, section or _section_of(kind))
+        found: S | None = getattr(self, section or _SECTIONS[kind])
         return found
 
     def of(self, kind: type[S], section: str | None = None) -> S:
         """Those of :meth:`find`; InputError if it has none."""
         found = self.find(kind, section)
         if found is None:
-            raise InputError(f"the rig {self.name} has no [{section or _section_of(kind)}]")
+            raise InputError(f"the rig {self.name} has no [{section or _SECTIONS[kind]}]")
         return found
 
     def estimated(self, section: str) -> Estimated:
@@ -66,11 +66,8 @@ class Rig(FileModel):
         return {name: found for name in _KINDS if isinstance(found := getattr(self, name), SensorSettings)}
 
 
-def _section_of(kind: type[FileModel]) -> str:
-    return next(name for name, other in _KINDS.items() if other is kind)
-
-
 _KINDS: dict[str, type[FileModel]] = {name: load(section.kind) for name, section in sections().items()}
+_SECTIONS = {kind: name for name, kind in reversed(_KINDS.items())}  # the first of those of one class
 _CLOCKS = sections_of_channels()
 add_fields(
     Rig,

@@ -13,6 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.processes import run_each
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.simulated import times as times_of
 from factorgraph_loc.simulation.chance import generator
@@ -91,7 +92,7 @@ def film(settings: SimulationSettings, seed: int) -> Film:
 
     InputError if the rig has no camera.
     """
-    camera = settings.rig.camera
+    camera = settings.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"rig {settings.rig.name}: has no camera, expected one to take images with")
     world_seed = seed if settings.world_seed is None else settings.world_seed
@@ -124,7 +125,7 @@ def with_images(
         _write(settings, seed, folder, range(count), lambda done: tell(done, count))
     else:
         _write_in_parallel(settings, seed, folder, count, workers, tell)
-    offset = settings.rig.camera.time_offset if settings.rig.camera else 0.0
+    offset = log.rig.time_offset("camera")
     streams = {**log.streams, "camera": ImageStream(times - offset, [folder / _name(i) for i in range(count)])}
     return replace(log, streams=streams, rig=with_sensors(log.rig, streams))
 

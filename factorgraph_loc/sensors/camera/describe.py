@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.usage import Use
 
 NAMES = ("camera", "sightings")
@@ -18,7 +19,7 @@ def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
 
 def mappable(log: Log) -> str | None:
     """The layer of a world that can be made from a log's images, if it has some and the camera is known."""
-    return "points" if "camera" in log.streams and log.rig.camera is not None else None
+    return "points" if "camera" in log.streams and log.rig.find(CameraSettings) is not None else None
 
 
 def doubts(use: Use, _: Diagnostics) -> Iterator[str]:

@@ -8,6 +8,7 @@ import numpy as np
 from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
 from factorgraph_loc.sensors.forecast import Array32, Places
 from factors.camera import model as reprojection
@@ -54,7 +55,8 @@ class CameraForecast:
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> CameraForecast | None:
     """Of a robot that drives at ``speed`` [m/s], with the rate of a simulation's settings; None if it has no camera or the map no
     points."""
-    if rig.camera is None or world.points is None:
+    camera = rig.find(CameraSettings)
+    if camera is None or world.points is None:
         return None
     pixels = PixelSettings(rate=IMAGES_PER_SECOND) if settings is None else settings.pixels
-    return CameraForecast(world, rig.camera.model(), pixels.rate / speed, pixels)
+    return CameraForecast(world, camera.model(), pixels.rate / speed, pixels)

@@ -20,6 +20,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.processes import ProcessDiedError, run_each
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.features import Extractor, extractor
@@ -78,11 +79,11 @@ def with_features(
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return log, ()
-    if log.rig.camera is None:
+    if log.rig.find(CameraSettings) is None:
         raise InputError(
             f"{log.name}: has images, but its rig {log.rig.name} has no [camera] that tells where they look"
         )
-    camera = log.rig.camera.model()
+    camera = log.rig.of(CameraSettings).model()
     kept = FeatureCache(cache_folder())
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
     _require_calibrated(log, images, camera)

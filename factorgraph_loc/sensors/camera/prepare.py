@@ -10,6 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.sensors.usage import Prepared, Use
 from factorgraph_loc.vision.frame import CameraFrame
@@ -19,7 +20,8 @@ from factors.se2 import Array
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
     """What is looked for in images: what the map's points look like in them, else what the rig's camera says."""
-    settings = rig.camera.frontend if rig.camera is not None else FrontendSettings()
+    camera = rig.find(CameraSettings)
+    settings = FrontendSettings() if camera is None else camera.frontend
     points = world.points
     if points is None or not points.feature or points.feature == settings.feature:
         return settings

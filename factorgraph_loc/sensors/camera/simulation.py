@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
 from factorgraph_loc.sensors.camera.stream import SightingStream
 from factorgraph_loc.sensors.simulated import Ride, Simulated
@@ -23,7 +24,7 @@ def simulate(ride: Ride) -> Simulated:
     """The pixels that the camera of a simulated drive identifies, in a world with points."""
     if ride.world.points is None:
         return Simulated()
-    settings, camera = ride.settings.pixels, ride.rig.camera
+    settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
     times = ride.times(settings.rate)
     seen = pixel_stream(camera.model(), ride.world, times, ride.truth.at(times), settings, ride.rng("points"))
     return Simulated({"sightings": replace(seen, t=seen.t - camera.time_offset)})
@@ -31,7 +32,7 @@ def simulate(ride: Ride) -> Simulated:
 
 def looks(settings: Any) -> dict[str, float]:
     """How often per second a simulated drive looks for all points; ValueError without a camera for them."""
-    if settings.world.points and settings.rig.camera is None:
+    if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")
     return {"points": settings.pixels.rate * settings.world.points}
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
 from factorgraph_loc.sensors.summary import Paragraph, Summary
 from factorgraph_loc.vision.features import extractor
@@ -94,8 +95,8 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
     known = set(log.world.points.names) if log.world.points is not None else set()
     counts = Counter(stream.point)
     outside = 0
-    if log.rig.camera is not None:
-        inside = log.rig.camera.model().contains(np.column_stack((stream.u, stream.v)))
+    if (camera := log.rig.find(CameraSettings)) is not None:
+        inside = camera.model().contains(np.column_stack((stream.u, stream.v)))
         outside = int(np.count_nonzero(~inside))
     return PixelSummary(
         rows=len(stream.t),
@@ -109,7 +110,7 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[str]:
     """What looks wrong with images and identified pixels, as lines for people."""
     out = []
-    if log.rig.camera is None:
+    if log.rig.find(CameraSettings) is None:
         there = [name for name, found in (("images", images), ("identified pixels", pixels)) if found is not None]
         out += [f"the log has {name}, but its rig has no [camera]: they are not used" for name in there]
     if images is not None:
@@ -134,12 +135,13 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
 
 
 def _wanted(log: Log) -> tuple[str, int]:
-    settings = log.rig.camera.frontend if log.rig.camera is not None else FrontendSettings()
+    camera = log.rig.find(CameraSettings)
+    settings = FrontendSettings() if camera is None else camera.frontend
     return settings.feature, settings.count
 
 
 def _calibration(log: Log, images: ImageSummary) -> list[str]:
-    camera = log.rig.camera
+    camera = log.rig.find(CameraSettings)
     if camera is None or not images.sizes:
         return []
     size = f"{camera.width}x{camera.height}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.simulation import in_sight
 from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factors.landmarks import model as bearing_range
@@ -64,10 +65,10 @@ class LandmarkForecast:
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> LandmarkForecast | None:
     """Of a robot that drives at ``speed`` [m/s], with the settings of a simulation; None if it has no such sensor or the map no
     landmarks."""
-    if rig.bearing_range is None or not world.landmarks:
+    if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     sightings = SightingSettings() if settings is None else settings.sightings
-    return LandmarkForecast(world, rig.bearing_range.model(), sightings.rate / speed, sightings)
+    return LandmarkForecast(world, rig.of(BearingRangeSettings).model(), sightings.rate / speed, sightings)
 
 
 @numba.njit(cache=True)

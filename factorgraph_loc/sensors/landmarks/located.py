@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors.landmarks.model import located, sigmas
 from factors.se2 import Array
@@ -25,7 +26,7 @@ class LocatedLandmark(NamedTuple):
 def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
     """The landmarks of ``names`` whose range and bearing were measured at once; none if the log's sightings are not among the
     ``sensors``, or its rig does not know that sensor."""
-    stream, settings = log.streams.get("bearing_range"), log.rig.bearing_range
+    stream, settings = log.streams.get("bearing_range"), log.rig.find(BearingRangeSettings)
     if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
         return []
     model = settings.model()

@@ -4,6 +4,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 
 
@@ -17,7 +18,7 @@ def check(log: Log) -> None:
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream) or not len(stream.t):
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so that there is nothing to map")
-    if log.rig.bearing_range is None:
+    if log.rig.find(BearingRangeSettings) is None:
         raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and place")
     if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
         lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")

@@ -10,6 +10,7 @@ from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.simulated import Ride, Simulated
@@ -24,7 +25,7 @@ def simulate(ride: Ride) -> Simulated:
     if not ride.world.landmarks:
         return Simulated()
     settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
-    model, poses = ride.rig.bearing_range.model(), ride.truth.at(times)
+    model, poses = ride.rig.of(BearingRangeSettings).model(), ride.truth.at(times)
     return Simulated(
         {"bearing_range": sighting_stream(model, ride.world, times, poses, settings, ride.rng("landmarks"))}
     )
@@ -32,7 +33,7 @@ def simulate(ride: Ride) -> Simulated:
 
 def looks(settings: Any) -> dict[str, float]:
     """How often per second a simulated drive looks for all landmarks; ValueError without a sensor for them."""
-    if settings.world.landmarks and settings.rig.bearing_range is None:
+    if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with bearing_range")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
 
@@ -95,6 +96,6 @@ class SimulatedSightings:
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
     """The sensor of a rig; None if it has none, or the world no landmarks."""
-    if rig.bearing_range is None or not world.landmarks:
+    if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
-    return SimulatedSightings(rig.bearing_range.model(), world, settings.sightings, rng)
+    return SimulatedSightings(rig.of(BearingRangeSettings).model(), world, settings.sightings, rng)

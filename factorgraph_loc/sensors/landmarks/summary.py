@@ -17,6 +17,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import clock_shift
 from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.summary import Summary
 from factors import se2
@@ -100,9 +101,13 @@ class _Seen:
 def _seen_from_reference(log: Log) -> dict[str, _Seen]:
     """The sightings with a range, by landmark of the map, where the reference has poses."""
     stream = log.streams.get("bearing_range")
-    if log.reference is None or log.rig.bearing_range is None or not isinstance(stream, BearingRangeStream):
+    if (
+        log.reference is None
+        or log.rig.find(BearingRangeSettings) is None
+        or not isinstance(stream, BearingRangeStream)
+    ):
         return {}
-    model = log.rig.bearing_range.model()
+    model = log.rig.of(BearingRangeSettings).model()
     t = stream.t + log.rig.time_offset("bearing_range")
     sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + _ROUNDING), np.array(model.mounting))
     ranges = stream.range / model.range_scale
@@ -178,7 +183,7 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 def _shifted(log: Log) -> list[str]:
     """A line, if sightings of mapped landmarks fit the reference better at another time."""
     stream, reference = log.streams.get("bearing_range"), log.reference
-    if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.bearing_range is None:
+    if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []
     if len(reference.t) < 2 or float(np.median(np.diff(reference.t))) > SLOWEST:
         return []
@@ -188,7 +193,7 @@ def _shifted(log: Log) -> list[str]:
     rows = rows[:: max(1, len(rows) // MOST)]
     marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
     places = np.array([(mark.x, mark.y) for mark in marks])
-    model, t = log.rig.bearing_range.model(), stream.t[rows] + log.rig.time_offset("bearing_range")
+    model, t = log.rig.of(BearingRangeSettings).model(), stream.t[rows] + log.rig.time_offset("bearing_range")
     shifts = STEP * SHIFTS
     costs = []
     for shift in shifts.tolist():

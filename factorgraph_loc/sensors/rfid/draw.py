@@ -4,13 +4,14 @@ import numpy as np
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.marks import Marks
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 
 
 def draw(log: Log) -> Marks:
     """The tags of the map, the survey's errors corrected as the rig knows them, and when an antenna has read one."""
-    known = tag_map(log.world, log.rig.survey)
+    known = tag_map(log.world, log.rig.of(SurveySettings))
     stream = log.streams.get("rfid")
     t, seen = np.empty(0), tuple[str, ...]()
     if isinstance(stream, RfidStream):

@@ -10,6 +10,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.forecast import Array32, Places
 from factorgraph_loc.sensors.rfid.forecast import ScanTables, log_weights, make_tables
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.rfid.detection import Looks, RfidLikelihood
 from factors.se2 import Array
@@ -54,7 +55,9 @@ class RfidForecast:
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> RfidForecast | None:
     """Of a robot that drives at ``speed`` [m/s], with the rates of a simulation's settings; None if it has no antennas or the map
     no tags."""
-    if rig.rfid is None or not world.tags:
+    if rig.find(RfidSettings) is None or not world.tags:
         return None
     rate = ROUNDS_PER_SECOND if settings is None else settings.rounds_per_second
-    return RfidForecast(RfidLikelihood(rig.rfid.model(), tag_map(world, rig.survey).tags), rate / speed)
+    return RfidForecast(
+        RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags), rate / speed
+    )

@@ -79,7 +79,7 @@ def recorded_looks(logs: list[Log]) -> RecordedLooks:
     InputError if a log lacks the reference, the antennas, the tags, or their facings.
     """
     parts = [_looks(log) for log in logs]
-    rfid = logs[0].rig.rfid
+    rfid = logs[0].rig.find(RfidSettings)
     assert rfid is not None, "that has been checked"
     features = np.concatenate([part[0] for part in parts])
     read = np.concatenate([part[1] for part in parts])
@@ -91,11 +91,11 @@ def recorded_looks(logs: list[Log]) -> RecordedLooks:
 
 
 def _looks(log: Log) -> tuple[Array, Array]:
-    rfid, reference, stream = log.rig.rfid, log.reference, log.streams.get("rfid")
+    rfid, reference, stream = log.rig.find(RfidSettings), log.reference, log.streams.get("rfid")
     if rfid is None or reference is None or stream is None or not reference.has_heading:
         raise InputError(f"{log.name}: expected a log with rfid, antennas in its rig and a reference with headings")
     scans = whole_scans(log)
-    tags = tag_map(log.world, log.rig.survey, {epc for scan in scans for epc in scan.tags})
+    tags = tag_map(log.world, log.rig.of(SurveySettings), {epc for scan in scans for epc in scan.tags})
     if not np.isfinite(tags.tags.facing).all():
         raise InputError(f"{log.name}: has tags without a facing, expected one of each to find like ones by")
     poses = reference.at(np.array([scan.t for scan in scans]), max_gap=MAX_GAP)

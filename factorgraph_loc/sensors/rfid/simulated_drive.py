@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.simulated_signals import phases, strengths
 from factorgraph_loc.sensors.rfid.simulation import draw_dead, draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
@@ -21,8 +22,8 @@ MOST_UNMATCHED = 0.1  # share of looks in reach without a recorded one that is a
 
 def simulate(ride: Ride) -> Simulated:
     """The reads of a simulated drive, with all faults."""
-    settings, rfid, recorded, rng = ride.settings, ride.rig.rfid, ride.recorded, ride.rng("reads")
-    tags = tag_map(ride.world, ride.rig.survey)
+    settings, rfid, recorded, rng = ride.settings, ride.rig.of(RfidSettings), ride.recorded, ride.rng("reads")
+    tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
     poses = ride.truth.at(times)
     # recorded outcomes are probabilities of zero and one
@@ -53,9 +54,9 @@ def simulate(ride: Ride) -> Simulated:
 
 def looks(settings: Any) -> dict[str, float]:
     """How often per second a simulated drive looks for all tags; ValueError where rig and faults do not fit together."""
-    if settings.rig.rfid is None:
+    if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no rfid, expected antennas")
-    stop, names = settings.faults.antenna_stop, list(settings.rig.rfid.all_antennas())
+    stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
     if stop is not None and stop.antenna not in names:
         raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
     return {"tags": settings.rounds_per_second * len(names) * settings.world.tag_count()}

@@ -8,6 +8,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.rfid.detection import RfidLikelihood
@@ -21,9 +22,9 @@ class SimulatedReader:
 
     def __init__(self, world: World, rig: Rig, rate: float, rng: np.random.Generator) -> None:
         self.rate, self._rng = rate, rng
-        self._antennas = tuple(rig.rfid.all_antennas())
-        self._map = tag_map(world, rig.survey)
-        self._likelihood = RfidLikelihood(rig.rfid.model(), self._map.tags)
+        self._antennas = tuple(rig.of(RfidSettings).all_antennas())
+        self._map = tag_map(world, rig.of(SurveySettings))
+        self._likelihood = RfidLikelihood(rig.of(RfidSettings).model(), self._map.tags)
 
     def measure(self, t: float, pose: Array) -> RfidScan:
         """A round that ends at ``t``."""

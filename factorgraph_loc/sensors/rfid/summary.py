@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.summary import Paragraph, Summary
 
@@ -116,7 +117,7 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
     if found.unknown:
         reads = sum(found.unknown.values())
         out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {_some(tuple(found.unknown))}")
-    carried = log.rig.rfid.all_antennas() if log.rig.rfid else {}
+    carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
         f"antenna {name} is not on the rig: {antenna.reads} reads, {antenna.rounds} rounds"
         for name, antenna in found.antennas.items()

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.model.rig import SurveySettings
 from factorgraph_loc.sensors.rfid.calibration.choice import Kind, choose
 from factorgraph_loc.sensors.rfid.calibration.fit import FACING, Floor, features, fit_beam, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.grid import Axes, design_of, fit_grid
 from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs, local, terms
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct, rounds_of
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factors.rfid.model import BeamModel, GridModel, LogisticModel, logits, probability
 
 TRUTH = LogisticModel((4.0, -1.6, 0.08, -1.7, 0.26, -0.06, -0.6, -0.1, 1.9, 0.23, -0.15))
