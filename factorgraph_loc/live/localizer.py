@@ -28,7 +28,7 @@ from factorgraph_loc.model.ticks import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.camera.prepare import frontend_of
+from factorgraph_loc.sensors.camera.prepare import frontend_of, uses_images
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.registry import channels
@@ -140,7 +140,7 @@ class Localizer:
         if self._rig.find(CameraSettings) is None:
             raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
         modalities = getattr(registry.estimator_type(self._name), "modalities", ())
-        if "camera" not in self._sensors or "camera" not in modalities:
+        if not uses_images(self._sensors, modalities):
             with self._lock:
                 self._begun(f"image at {t:.3f} s").diagnostics.ignore("images")
             return

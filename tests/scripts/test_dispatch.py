@@ -48,7 +48,6 @@ STILL = {
     "fusion/relocating.py": 2,
     "fusion/switching.py": 6,
     "fusion/timeline.py": 3,
-    "live/localizer.py": 2,
     "planning/active_mcl.py": 1,
     "slam/monoslam.py": 6,
     "slam/monoslam_sighting.py": 8,

@@ -1,6 +1,6 @@
 """What is done with a log's images before an estimator runs: their features are found, or they are set aside."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from time import perf_counter
 
@@ -16,6 +16,11 @@ from factorgraph_loc.sensors.usage import Prepared, Use
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
+
+
+def uses_images(sensors: Collection[str], modalities: Collection[str]) -> bool:
+    """Whether images are used by an estimator of these ``modalities`` that is given these ``sensors``."""
+    return "camera" in sensors and "camera" in modalities
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
