@@ -346,7 +346,7 @@ def _all(logs: LogLike | Sequence[LogLike]) -> list[Log]:
 
 def _score(log: Log) -> dict[str, Any]:
     """The scores of the EKF on a log, with the log's rig and its sensors; of the smoother where tags are read."""
-    return run(log, "smoother" if "rfid" in log.rig.sensors else "ekf").scores
+    return run(log, calibration.estimator_for(log.rig)).scores
 
 
 def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Progress) -> None:

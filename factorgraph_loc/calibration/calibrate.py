@@ -1,35 +1,21 @@
 """A complete rig from logs with reference poses: learn, make consistent, keep what pays, cross-validate."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.calibration.consistency import Consistency, Evaluate, inflated, make_consistent
+from factorgraph_loc.calibration.consistency import FACTORS, Consistency, Evaluate, make_consistent
 from factorgraph_loc.calibration.held_out import folds_of, recordings
 from factorgraph_loc.calibration.judging import Judgement
-from factorgraph_loc.calibration.learn import EXTEROCEPTIVE, Knowledge, has_heading, learn, sensing
-from factorgraph_loc.calibration.selection import (
-    MODEL,
-    PLACES,
-    SCATTER,
-    STRENGTH,
-    Bench,
-    Learner,
-    State,
-    Unit,
-    constants_of,
-    dependents_of,
-)
+from factorgraph_loc.calibration.learn import Knowledge, calibrators, has_heading, learn, senses, sensing
+from factorgraph_loc.calibration.selection import Bench, Learner, constants_of, dependents_of
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
-from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
-from factorgraph_loc.sensors.rfid.settings import default_models
-from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.calibrating import Calibrator, State, Told, Unit
+from factorgraph_loc.sensors.registry import channels, moving
 
 Scores = Mapping[str, Any]
 STEPS = 6  # that are told of progress
@@ -40,9 +26,9 @@ class Calibration:
     """What came out.
 
     ``judgements``: what an estimator says of each learnt parameter; ``accepted``: what the rig has of it. ``knowledge``: what is
-    learnt with those constants that it accepts. ``consistency``: of the landmark sensor with the EKF; ``rfid_consistency``: of the
-    tempering with the smoother, with rigs learnt from the other logs where there are any; None without such a sensor. ``before``
-    and ``after``: scores on each log with the input rig and the new one; ``held_out``: with a rig learnt from the other logs, but
+    learnt with those constants that it accepts. ``consistency``: of the noise of sensors, by their names: of landmarks with the
+    EKF, of the tempering of RFID with the smoother, with rigs learnt from the other logs where there are any. ``before`` and
+    ``after``: scores on each log with the input rig and the new one; ``held_out``: with a rig learnt from the other logs, but
     for the factor on the noise; empty where there are none. ``doubts``: one line each.
     """
 
@@ -52,8 +38,7 @@ class Calibration:
     knowledge: Knowledge
     judgements: tuple[Judgement, ...]
     accepted: State
-    consistency: Consistency | None
-    rfid_consistency: Consistency | None
+    consistency: Mapping[str, Consistency]
     before: tuple[Scores, ...]
     after: tuple[Scores, ...]
     held_out: tuple[Scores, ...]
@@ -66,6 +51,14 @@ class Calibration:
     def accepts(self, unit: Unit) -> bool:
         """Whether the rig has what was learnt of these parameters."""
         return unit in self.accepted
+
+    def told(self) -> Iterator[tuple[Calibrator, Told]]:
+        """What is told of each sensor."""
+        for name, calibrator in calibrators().items():
+            found, details = (part.get(name) for part in (self.knowledge.found, self.knowledge.details))
+            consistency = self.consistency.get(name)
+            trial = consistency.trial if consistency is not None else None
+            yield calibrator, Told(self.logs, found, details, self.knowledge.rig, self.rig, trial, self.accepted)
 
 
 def calibrate(
@@ -109,8 +102,7 @@ def calibrate(
         knowledge=_judged(knowledge, search.learnt, judgements),
         judgements=judgements,
         accepted=found,
-        consistency=search.of_landmarks,
-        rfid_consistency=search.of_rfid,
+        consistency=search.consistent,
         before=before,
         after=after,
         held_out=held_out,
@@ -124,16 +116,13 @@ class _Search:
     def __init__(self, logs: Sequence[Log], start: Rig, evaluate: Evaluate, grids: Path | None) -> None:
         self.logs, self.start, self._evaluate = logs, start, evaluate
         self.learnt = learn(logs, start, grids)
-        kind = self.learnt.rfid.choice.kind if self.learnt.rfid is not None else None
-        self.everyone = Learner(logs, start, grids, kind, self.learnt)
+        self.everyone = Learner(logs, start, grids, self.learnt)
         self._folds = folds_of(logs)
         learners = [
-            Learner(fold.train, start, _folder(grids, i), kind, shared=self.learnt)
-            for i, fold in enumerate(self._folds)
+            Learner(fold.train, start, _folder(grids, i), shared=self.learnt) for i, fold in enumerate(self._folds)
         ]
         self.bench = Bench(self._folds, learners, evaluate)
-        self.of_landmarks: Consistency | None = None
-        self.of_rfid: Consistency | None = None
+        self.consistent: dict[str, Consistency] = {}
 
     @property
     def knowledge(self) -> Knowledge:
@@ -148,49 +137,46 @@ class _Search:
             one.knowledge is not None and fold.tests for one, fold in zip(self.bench.learners, self._folds, strict=True)
         )
 
-    def make_consistent(self, *, landmarks: bool = True, rfid: bool = True) -> None:
-        """Each sensor with honest noise, by runs without the other one. That of RFID, whose models have many parameters, is honest
-        only on logs that these were not fitted to: with rigs that had no part of a log, if there are any. What is found holds for
-        all folds: a search in each would take longer than all the rest."""
-        rig, sensors = self.knowledge.rig, self.knowledge.rig.sensors
-
-        def alone(rig: Rig, sensor: str) -> Rig:
-            kept = tuple(name for name in sensors if name == sensor or name not in EXTEROCEPTIVE)
-            return rig.model_copy(update={"sensors": kept})
-
-        if "bearing_range" in sensors and landmarks:
-            known = self.of_landmarks.trial.factor if self.of_landmarks and self.of_landmarks.trial else 3.0
-            self.of_landmarks = make_consistent(self.logs, alone(rig, "bearing_range"), self._evaluate, known)
-        if self.knowledge.rfid is not None and rfid:
-            unseen = {
-                log.name: alone(one.knowledge.rig, "rfid")
-                for log, one in self._learners_of_others()
-                if one.knowledge is not None
-            }
-
-            def held_out(log: Log) -> Scores:
-                return self._evaluate(replace(log, rig=_tempered_as(unseen[log.name], log.rig)))
-
-            guess = self.knowledge.rfid.share**-0.5
-            # reads are not less alike than their scatter says, even if this estimator on these logs would bear it
-            self.of_rfid = make_consistent(
-                self.logs,
-                alone(rig, "rfid"),
-                held_out if len(unseen) == len(self.logs) else self._evaluate,
-                guess,
-                tempered,
-                least=guess,
-            )
+    def make_consistent(self, names: Collection[str] | None = None) -> None:
+        """Each sensor, or those of ``names``, with honest noise, by runs without the others. That of one whose models have many
+        parameters is honest only on logs that these were not fitted to: with rigs that had no part of a log, if there are any.
+        What is found holds for all folds: a search in each would take longer than all the rest."""
+        for name, found in self.knowledge.found.items():
+            if calibrators()[name].is_consistent and (names is None or name in names):
+                self.consistent[name] = self._made_consistent(name, found)
         for learner in (self.everyone, *self.bench.learners):
             learner.noisy(self._honest)
         self.bench.forget()
+
+    def _made_consistent(self, name: str, found: Any) -> Consistency:
+        one, rig = calibrators()[name], self.knowledge.rig
+
+        def alone(rig: Rig) -> Rig:
+            kept = tuple(n for n in self.knowledge.rig.sensors if n == one.channel or n not in senses())
+            return rig.model_copy(update={"sensors": kept})
+
+        others = self._learners_of_others() if one.judged_unseen else []
+        unseen = {log.name: alone(o.knowledge.rig) for log, o in others if o.knowledge is not None}
+
+        def held_out(log: Log) -> Scores:
+            return self._evaluate(replace(log, rig=one.as_honest_as(unseen[log.name], log.rig)))
+
+        before = self.consistent.get(name)
+        guess, least = one.guess(found), one.least(found)
+        if least is None:
+            guess = before.trial.factor if before is not None and before.trial is not None else guess
+        evaluate = held_out if len(unseen) == len(self.logs) else self._evaluate
+        return make_consistent(
+            self.logs, alone(rig), evaluate, guess, one.inflated, FACTORS[0] if least is None else least
+        )
 
     def choose(self) -> State:
         """The parameters that pay."""
         bench = self.bench
         constants, dependents = constants_of(self.learnt, self.start), dependents_of(self.learnt, self.start)
         # without them a sensor that the input rig does not know cannot be used at all
-        forced = frozenset({SCATTER} & {*dependents} if self.start.bearing_range is None else ())
+        needed = [one for one in calibrators().values() if getattr(self.start, one.section) is None]
+        forced = frozenset({unit for one in needed for unit in one.noise} & {*dependents})
         dependents = [unit for unit in dependents if unit not in forced]
         if not self.judges:
             return forced
@@ -201,10 +187,9 @@ class _Search:
         if refused:
             accepted = [name for unit in state & frozenset(constants) for name in unit.names]
             for learner in (self.everyone, *bench.learners):
-                learner.settle(accepted, placed=PLACES not in refused)
-            self.make_consistent(
-                landmarks=any(unit.section == "bearing_range" for unit in refused), rfid=PLACES in refused
-            )
+                learner.settle(accepted)
+            sections = {unit.section for unit in refused}
+            self.make_consistent([name for name, one in calibrators().items() if one.section in sections])
         for unit in dependents:
             state = bench.tried(state, unit)
         if not bench.better(state, forced):
@@ -213,9 +198,8 @@ class _Search:
             for unit in [*constants, *dependents]:
                 if unit in left:
                     state = bench.tried(state, unit)
-        rfid = self.knowledge.rig.rfid
-        if rfid is not None and rfid.rssi is not None:
-            state = bench.tried(state, STRENGTH)
+        for unit in (unit for one in calibrators().values() for unit in one.optional(self.knowledge.rig)):
+            state = bench.tried(state, unit)
         return state
 
     def unseen(self, state: State) -> dict[str, Rig]:
@@ -230,13 +214,11 @@ class _Search:
         return [(log, learners[part]) for log, part in zip(self.logs, parts, strict=True)]
 
     def _honest(self, rig: Rig) -> Rig:
-        """A rig with the factor, the tempering and the share of dead tags that were found."""
-        if self.of_landmarks is not None and self.of_landmarks.trial and rig.bearing_range is not None:
-            rig = inflated(rig, self.of_landmarks.trial.factor)
-        if self.of_rfid is None or rig.rfid is None or self.learnt.rig.rfid is None:
-            return rig
-        share = {"dead_tags": self.learnt.rig.rfid.dead_tags}
-        return _tempered_as(rig.model_copy(update={"rfid": rig.rfid.model_copy(update=share)}), self.of_rfid.rig)
+        """A rig with the noise that was found."""
+        for name, found in self.consistent.items():
+            factor = None if found.trial is None else found.trial.factor
+            rig = calibrators()[name].honest(rig, factor, found.rig, self.learnt.rig)
+        return rig
 
 
 def _folder(grids: Path | None, fold: int) -> Path | None:
@@ -246,12 +228,6 @@ def _folder(grids: Path | None, fold: int) -> Path | None:
     folder = grids.parent / f"{grids.name}.fold{fold}"
     folder.mkdir()
     return folder / grids.name
-
-
-def _tempered_as(rig: Rig, other: Rig) -> Rig:
-    if rig.rfid is None or other.rfid is None:
-        return rig
-    return tempered(rig, other.rfid.tempering**-0.5)
 
 
 def _judged(knowledge: Knowledge, learnt: Knowledge, judgements: Sequence[Judgement]) -> Knowledge:
@@ -267,24 +243,19 @@ def _judged(knowledge: Knowledge, learnt: Knowledge, judgements: Sequence[Judgem
             constants.append(replace(settled[c.sensor, c.name], why=judgement.why))
         else:
             constants.append(replace(c, kept=False, why=judgement.why))
-    return replace(knowledge, constants=tuple(constants), rfid=_judged_places(knowledge.rfid, found))
-
-
-def _judged_places(rfid: RfidKnowledge | None, found: Mapping[str, Judgement]) -> RfidKnowledge | None:
-    if rfid is None:
-        return None
-    (name,) = PLACES.names
-    judgement = found.get(name)
-    accepted = judgement is not None and judgement.accepted
-    why = judgement.why if judgement is not None else "refused: the logs are too short to judge it"
-    offsets = tuple(replace(o, kept=accepted, why=why) if o.kept else o for o in rfid.offsets)
-    return replace(rfid, offsets=offsets)
+    parts = {name: calibrators()[name].judged(one, found) for name, one in knowledge.found.items()}
+    return replace(knowledge, constants=tuple(constants), found=parts)
 
 
 def _is_complete(rig: Rig) -> bool:
-    """Whether a rig has what its sensors need, learnt or stated: with the default model of detection a run tells nothing."""
-    given = rig.rfid is None or rig.rfid.models != default_models()
-    return given and all(getattr(rig, name) is not None for name in EXTEROCEPTIVE if name in rig.sensors)
+    """Whether a rig has what its sensors need, learnt or stated."""
+    return all(one.is_complete(rig) for one in calibrators().values())
+
+
+def estimator_for(rig: Rig) -> str:
+    """The estimator that judges what is learnt of the sensors of a rig."""
+    named = [one.estimator for one in calibrators().values() if one.estimator and one.channel in rig.sensors]
+    return named[0] if named else "ekf"
 
 
 def check(logs: Sequence[Log]) -> None:
@@ -294,12 +265,14 @@ def check(logs: Sequence[Log]) -> None:
     for log in logs:
         if log.reference is None or len(log.reference) < 2:
             raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
-        if not _has(log, "odometry"):
+        if not any(_has(log, name) for name in moving(log.streams, "floor")):
             raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
-        if not any(_has(log, sensor) for sensor in EXTEROCEPTIVE):
-            raise InputError(f"{log.name}: has no bearing_range and no rfid, expected one of them to calibrate from")
-        for sensor, kind in (("bearing_range", BearingRangeStream), ("rfid", RfidStream)):
-            if sensor in log.streams and not isinstance(log.streams[sensor], kind):
+        if not any(_has(log, sensor) for sensor in senses()):
+            lacking = " and ".join(f"no {sensor}" for sensor in senses())
+            raise InputError(f"{log.name}: has {lacking}, expected one of them to calibrate from")
+        for sensor in senses():
+            kinds = tuple(load(place) for place in channels()[sensor].streams)
+            if sensor in log.streams and not isinstance(log.streams[sensor], kinds):
                 raise InputError(f"{log.name}: its {sensor} is of another kind than that sensor's")
     first = logs[0]
     for log in logs[1:]:
@@ -310,16 +283,12 @@ def check(logs: Sequence[Log]) -> None:
 
 
 def _check_alike(first: Log, log: Log) -> None:
-    for sensor in EXTEROCEPTIVE:
+    for sensor in senses():
         for one, other in ((first, log), (log, first)):
             if _has(one, sensor) and not _has(other, sensor):
                 raise InputError(f"{other.name}: has no {sensor}, expected one in every log to calibrate from")
-    if type(log.streams["odometry"]) is not type(first.streams["odometry"]):
-        kinds = {VelocityStream: "velocities", IncrementStream: "increments"}
-        ours, theirs = (kinds.get(type(one.streams["odometry"]), "another kind") for one in (log, first))
-        raise InputError(
-            f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
-        )
+    for calibrator in calibrators().values():
+        calibrator.check_alike(first, log)
     if has_heading(log) != has_heading(first):
         raise InputError(f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart")
 
@@ -339,31 +308,17 @@ def _doubts(knowledge: Knowledge, search: _Search, found: State) -> tuple[str, .
         doubts.append(
             "The logs are too short to judge what was learnt on parts that had no part in it: nothing is changed."
         )
-    noise = knowledge.noise
-    if noise is not None and noise.outliers > 0.05:
-        doubts.append(
-            f"{100.0 * noise.outliers:.0f} % of the odometry windows are outliers: slip, collisions, or gaps in the reference?"
-        )
-    if noise is not None and noise.floored:
-        doubts.append(
-            f"The fitted noise of the odometry ({', '.join(noise.floored)}) is below what wheels can do and was raised: the "
-            "reference is probably not independent of the odometry."
-        )
-    for unit, one in ((SCATTER, search.of_landmarks), (MODEL, search.of_rfid)):
-        if one is None or unit not in found:
-            continue
-        if one.trial is None:
-            doubts.append("No log has enough poses of a reference to score: the noise in the rig is the mere scatter.")
-        elif not one.reached:
-            doubts.append(
-                "No factor on the noise makes the estimator consistent: ANEES over its ideal value is "
-                f"{one.trial.causal:.2f} causal, {one.trial.final:.2f} final."
-            )
-    if knowledge.rfid is not None:
-        for tag in knowledge.rfid.doubts:
-            doubts.append(f"Tag {tag.name} seems to be {tag.distance:.1f} m from where the map has it.")
-        if silent := knowledge.rfid.dead.tags:
-            believed = knowledge.rfid.dead.believed
-            names = f"; believed dead, as they should have been: {', '.join(believed)}" if believed else ""
-            doubts.append(f"{len(silent)} tags of the map are never read{names}.")
+    for name, calibrator in calibrators().items():
+        one = search.consistent.get(name)
+        if one is not None and found.intersection(calibrator.noise + calibrator.models):
+            if one.trial is None:
+                doubts.append(
+                    "No log has enough poses of a reference to score: the noise in the rig is the mere scatter."
+                )
+            elif not one.reached:
+                doubts.append(
+                    "No factor on the noise makes the estimator consistent: ANEES over its ideal value is "
+                    f"{one.trial.causal:.2f} causal, {one.trial.final:.2f} final."
+                )
+        doubts += calibrator.doubts(knowledge.found.get(name), knowledge.details.get(name))
     return tuple(doubts)

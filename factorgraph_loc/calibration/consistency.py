@@ -48,23 +48,6 @@ class Consistency:
     reached: bool
 
 
-def inflated(rig: Rig, factor: float) -> Rig:
-    """The rig with the sigmas of its landmark sensor multiplied, at most to their bounds."""
-    assert rig.bearing_range is not None
-    s = rig.bearing_range
-    return rig.model_copy(
-        update={
-            "bearing_range": s.model_copy(
-                update={
-                    "range_sigma": factor * s.range_sigma,
-                    "range_sigma_relative": factor * s.range_sigma_relative,
-                    "bearing_sigma": factor * s.bearing_sigma,
-                }
-            )
-        }
-    )
-
-
 Change = Callable[[Rig, float], Rig]
 
 
@@ -72,8 +55,8 @@ def make_consistent(
     logs: Sequence[Log],
     rig: Rig,
     evaluate: Evaluate,
-    guess: float = 3.0,
-    change: Change = inflated,
+    guess: float,
+    change: Change,
     least: float = FACTORS[0],
 ) -> Consistency:
     """The factor for which the estimator's ANEES is ideal on ``logs``; ``guess``: where the search begins, ``least``: its end,

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.calibrating import Calibrator
 from factorgraph_loc.sensors.odometry.calibration.windows import odometry_of
-from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
 
 QUARTERS = 4  # that a log has
 WARM_UP = 2.0  # s of odometry before a stretch: commands act late
@@ -28,13 +29,18 @@ class Fold:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """The number of what each log recorded: of logs that hold the same reads one is no test of the other."""
-    return distinct(logs) if "rfid" in logs[0].streams else list(range(len(logs)))
+    """The number of what each log recorded: of logs that hold the same measurements one is no test of the other."""
+    found = [one.recordings(logs) for one in _sensing(logs)]
+    return next((numbers for numbers in found if len(set(numbers)) < len(logs)), list(range(len(logs))))
+
+
+def _sensing(logs: Sequence[Log]) -> list[Calibrator]:
+    return [one for one in calibrators().values() if one.channel in logs[0].streams]
 
 
 def folds_of(logs: Sequence[Log]) -> tuple[Fold, ...]:
-    """Each recording is judged with what the others tell. Of a single one each quarter with what the other quarters tell, or each
-    third, in two stretches, where tags are read: models of detection take long to fit."""
+    """Each recording is judged with what the others tell. Of a single one each quarter with what the other quarters tell, or fewer
+    and larger parts, in several stretches, where a sensor's models take long to fit."""
     parts = recordings(logs)
     if len(set(parts)) > 1:
         out = []
@@ -43,7 +49,7 @@ def folds_of(logs: Sequence[Log]) -> tuple[Fold, ...]:
             own = [log for log, p in zip(logs, parts, strict=True) if p == part]
             out.append(Fold(part, train, tuple(test for log in own for test in _stretches(log, 0.0, 1.0, QUARTERS))))
         return tuple(out)
-    count, each = (3, 2) if "rfid" in logs[0].streams else (QUARTERS, 1)
+    count, each = min(one.folds for one in _sensing(logs))
     shares = [(k / count, (k + 1) / count) for k in range(count)]
     return tuple(
         Fold(

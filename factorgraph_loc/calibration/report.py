@@ -4,31 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from factorgraph_loc.calibration import figures
-from factorgraph_loc.calibration.calibrate import Calibration, Scores
-from factorgraph_loc.calibration.constants import Learnt
-from factorgraph_loc.calibration.selection import MODEL, NOISE, SCATTER
-from factorgraph_loc.drawing.markup import image, table, text
-from factorgraph_loc.sensors.rfid.calibration import figures as rfid_figures
-from factorgraph_loc.sensors.rfid.calibration import report as rfid_report
+from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
+from factorgraph_loc.calibration.learn import calibrators
+from factorgraph_loc.drawing.markup import Rows, number, table, text
+from factorgraph_loc.fitting.constants import Learnt
 from factors.se2 import Array
-
-UNITS = {
-    "speed_bias": "m/s",
-    "heading_rate_bias": "rad/s",
-    "heading_drift": "rad/m",
-    "direction": "rad",
-    "delay": "s",
-    "lag": "s",
-    "turn_slowdown": "m/rad",
-    "x": "m",
-    "y": "m",
-    "bearing_bias": "rad",
-    "depth_axis": "rad",
-    "time_offset": "s",
-}
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
-"""Header and rows of a table."""
 
 KINDS = ("causal", "final")
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
@@ -36,11 +16,6 @@ _STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padd
 table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ddd;text-align:right}
 th:first-child,td:last-child{text-align:left}tbody th{font-weight:normal}.wide{overflow-x:auto}img{max-width:100%}
 .doubt{background:#fff4d6;padding:.5em 1em;margin:.4em 0}"""
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """A number for a table, a dash where there is none."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def constants_table(constants: Sequence[Learnt]) -> Rows:
@@ -82,19 +57,13 @@ def accuracy_table(calibration: Calibration) -> Rows:
     return header, rows
 
 
-def rfid_tables(calibration: Calibration) -> list[Rows]:
-    """Survey and mounting, models of detection, and doubtful tags if there are any."""
-    found = calibration.knowledge.rfid
-    if found is None:
-        return []
-    tables = [rfid_report.offsets_table(found), rfid_report.models_table(found, accepted=calibration.accepts(MODEL))]
-    return [*tables, rfid_report.tags_table(found)] if found.doubts else tables
+def sensor_tables(calibration: Calibration) -> list[Rows]:
+    """What else sensors tell, such as survey, mounting and models of detection."""
+    return [table for calibrator, told in calibration.told() for table in calibrator.tables(told)]
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
     """Everything of the report as plain values."""
-    noise, rfid = calibration.knowledge.noise, calibration.knowledge.rfid
-    trial = calibration.consistency.trial if calibration.consistency else None
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
 
     def scores(found: Sequence[Scores]) -> dict[str, Any]:
@@ -128,14 +97,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
             }
             for one in calibration.judgements
         ],
-        "odometry_outliers": None if noise is None else noise.outliers,
-        "odometry_widened": None if noise is None else noise.widened,
-        "noise_factor": None if trial is None else trial.factor,
-        "correlation": {
-            log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
-            for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=False)
-        },
-        "rfid": None if rfid is None else rfid_report.rfid_document(rfid, accepted=calibration.accepts(MODEL)),
+        **{key: value for calibrator, told in calibration.told() for key, value in calibrator.document(told).items()},
         "before": scores(calibration.before),
         "after": scores(calibration.after),
         "held_out": scores(calibration.held_out),
@@ -157,7 +119,6 @@ def _figures(values: Array) -> dict[str, float]:
 
 def page(calibration: Calibration) -> str:
     """The report as one HTML page, with its plots inside."""
-    knowledge = calibration.knowledge
     parts = [
         f"<h1>Calibration of {text(calibration.rig.name)}</h1>",
         f"<p>From {text(', '.join(calibration.logs))}. {text(_verdict(calibration))}</p>",
@@ -170,8 +131,8 @@ def page(calibration: Calibration) -> str:
         + "</p>",
         table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
-        *_noise(calibration),
-        *_rfid(calibration),
+        *(part for calibrator, told in calibration.told() for part in calibrator.told_noise(told)),
+        *(part for calibrator, told in calibration.told() for part in calibrator.told_section(told)),
         *_judgements(calibration),
         f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
         "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is too sure. "
@@ -183,18 +144,8 @@ def page(calibration: Calibration) -> str:
         + "</p>",
         table(*accuracy_table(calibration)),
     ]
-    if knowledge.seen:
-        parts += [
-            "<h2>How alike neighbouring errors are</h2>",
-            "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
-            "one, and the noise in the rig must be larger than the scatter.</p>",
-            table(*_correlations(calibration)),
-            "<h2>Residuals of the sightings</h2>",
-            image(figures.sightings_figure(knowledge)),
-            image(figures.correlation_figure(knowledge)),
-        ]
-    if knowledge.windows:
-        parts += ["<h2>Residuals of the odometry</h2>", image(figures.odometry_figure(knowledge))]
+    for calibrator, told in reversed(list(calibration.told())):
+        parts += calibrator.told_residuals(told)
     title = f"Calibration of {text(calibration.rig.name)}"
     head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
     return f"{head}<body>\n" + "\n".join(parts) + "\n</body></html>\n"
@@ -224,56 +175,6 @@ def _long_constants(calibration: Calibration) -> Rows:
     return (*header, *parts, "differs between logs by", "why"), long
 
 
-def _noise(calibration: Calibration) -> list[str]:
-    noise = calibration.knowledge.noise
-    trial = calibration.consistency.trial if calibration.consistency else None
-    out = []
-    if noise is not None:
-        if not calibration.accepts(NOISE):
-            out.append("<p>The noise of the odometry below is refused: the rig has that of the input.</p>")
-        rows = [
-            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
-            for error, g in noise.growth.items()
-        ]
-        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-        out.append(table(header, rows))
-        out.append(
-            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise is {noise.widened:.2f} times "
-            "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
-        )
-    scatter, rig = calibration.knowledge.rig.bearing_range, calibration.rig.bearing_range
-    if not calibration.knowledge.seen or scatter is None or rig is None:
-        return out
-    if not calibration.accepts(SCATTER):
-        out.append("<p>The noise of the sightings is refused: the rig has that of the input.</p>")
-    names = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
-    rows = [(f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(rig, n))) for n, unit in names.items()]
-    out.append(table(("noise of the sightings", "scatter", "in the rig"), rows))
-    if trial is not None and calibration.accepts(SCATTER):
-        out.append(
-            f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
-            f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
-        )
-    return out
-
-
-def _rfid(calibration: Calibration) -> list[str]:
-    found = calibration.knowledge.rfid
-    if found is None:
-        return []
-    tables = [table(*one) for one in rfid_tables(calibration)]
-    return [
-        "<h2>RFID</h2>",
-        f"<p>{text(rfid_report.tempering_text(found, calibration.rig))}</p>",
-        f"<p>{text(rfid_report.dead_text(found))}</p>",
-        *tables,
-        "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or stretches.</p>",
-        image(rfid_figures.reliability_figure(found)),
-        "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the model.</p>",
-        image(rfid_figures.field_figure(found)),
-    ]
-
-
 def _judgements(calibration: Calibration) -> list[str]:
     if not calibration.judgements:
         return []
@@ -288,18 +189,11 @@ def _judgements(calibration: Calibration) -> list[str]:
 
 
 def _estimator(calibration: Calibration) -> str:
-    return "EKF" if calibration.knowledge.rfid is None else "smoother"
-
-
-def _correlations(calibration: Calibration) -> Rows:
-    header = ("log", "range: next sighting", "falls to 1/e in [s]", "bearing: next sighting", "falls to 1/e in [s]")
-    rows: list[tuple[str, ...]] = [
-        (log, number(c.next_one[0], 2), number(c.time[0], 1), number(c.next_one[1], 2), number(c.time[1], 1))
-        for log, c in zip(calibration.logs, calibration.knowledge.correlations, strict=True)
-    ]
-    return header, rows
+    name = estimator_for(calibration.rig)
+    return name.upper() if name == "ekf" else name
 
 
 def _label(c: Learnt) -> str:
-    unit = f" [{UNITS[c.name]}]" if c.name in UNITS else ""
+    units = {name: unit for one in calibrators().values() for name, unit in one.units.items()}
+    unit = f" [{units[c.name]}]" if c.name in units else ""
     return f"{c.sensor}.{c.name}{unit}"

@@ -8,121 +8,54 @@ remain.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.calibration.constants import Learnt
 from factorgraph_loc.calibration.held_out import Fold
 from factorgraph_loc.calibration.judging import Judgement, Outcome, judged
-from factorgraph_loc.calibration.learn import (
-    FIRST_SENSOR,
-    RANGE_KIND,
-    Knowledge,
-    has_heading,
-    learn,
-    settled,
-)
+from factorgraph_loc.calibration.learn import Knowledge, calibrators, has_heading, learn, settled
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.calibration.choice import Kind
-from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
-from factorgraph_loc.sensors.rfid.settings import RfidSettings
-
-TOGETHER = (("x", "y"), ("delay", "lag"))  # constants that are judged together where both are learnt
-SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")
-
-
-@dataclass(frozen=True)
-class Unit:
-    """Parameters that are judged together: a section of the rig, and its fields."""
-
-    section: str
-    fields: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The fields with their section."""
-        return tuple(f"{self.section}.{field}" for field in self.fields)
-
-
-State = frozenset[Unit]
-NOISE = Unit("odometry", ("noise",))
-SCATTER = Unit("bearing_range", SIGMAS)
-PLACES, MODEL, STRENGTH = Unit("rfid", ("places",)), Unit("rfid", ("models",)), Unit("rfid", ("rssi",))
+from factorgraph_loc.sensors.calibrating import State, Unit
 
 
 def constants_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
-    """Of the constants that the fits would keep, those that gain least in the fits first; then the places of tags and antennas."""
-    kept = [c for c in knowledge.constants if c.kept]
+    """Of the constants that the fits would keep, those that gain least in the fits first; then what no fit can tell the gain of."""
     units: dict[Unit, float] = {}
-    before = start.bearing_range or FIRST_SENSOR
-    sensor = knowledge.rig.bearing_range
-    if knowledge.sensor is not None and sensor is not None and sensor.range_kind != before.range_kind:
-        # constants of another kind of ranges are none of this one
-        fields = tuple(c.name for c in kept if c.sensor == "bearing_range")
-        units[Unit("bearing_range", (*fields, RANGE_KIND.partition(".")[2]))] = float("inf")
-        kept = [c for c in kept if c.sensor != "bearing_range"]
-    for section in ("odometry", "bearing_range"):
-        for group in _grouped([c for c in kept if c.sensor == section]):
-            units[Unit(section, tuple(c.name for c in group))] = sum(c.gain for c in group)
-    places = [PLACES] if knowledge.rfid is not None and any(o.kept for o in knowledge.rfid.offsets) else []
-    return [*sorted(units, key=units.__getitem__), *places]
+    for name, found in knowledge.found.items():
+        calibrator = calibrators()[name]
+        kept = [c for c in knowledge.constants if c.kept and c.sensor == calibrator.section]
+        units |= calibrator.constant_units(found, kept, knowledge.rig, start)
+    return sorted(units, key=units.__getitem__)
 
 
 def dependents_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
-    """What is learnt for the constants that remain, without the strength of reads."""
-    units = [NOISE] if knowledge.wheels is not None else []
-    units += [SCATTER] if knowledge.sensor is not None else []
-    for section in ("odometry", "bearing_range"):
-        old, new = getattr(start, section) or FIRST_SENSOR, getattr(knowledge.rig, section)
-        if new is not None and new.uncertainty != old.uncertainty:
-            units.append(Unit(section, ("uncertainty",)))
-    return [*units, *([MODEL] if knowledge.rfid is not None else [])]
-
-
-def _grouped(kept: Sequence[Learnt]) -> list[list[Learnt]]:
-    groups: dict[str, list[Learnt]] = {}
-    for c in kept:
-        group = next((names[0] for names in TOGETHER if c.name in names), c.name)
-        groups.setdefault(group, []).append(c)
-    return list(groups.values())
+    """What is learnt for the constants that remain, without what is tried last."""
+    used = [calibrators()[name] for name in knowledge.found]
+    learnt = [one for one, part in zip(used, knowledge.found.values(), strict=True) if one.has_noise(part)]
+    units = [unit for one in learnt for unit in one.noise]
+    for one in used:
+        old, new = one.settings(start), getattr(knowledge.rig, one.section)
+        if one.uncertain and new is not None and new.uncertainty != old.uncertainty:
+            units.append(Unit(one.section, ("uncertainty",)))
+    return [*units, *(unit for one in used for unit in one.models)]
 
 
 def mixed(old: Rig, new: Rig, state: State) -> Rig:
     """The rig with what is ``new`` of the parameters in ``state``, and ``old`` of the others."""
     changes: dict[str, Any] = {}
-    for section in ("odometry", "bearing_range"):
-        learnt = getattr(new, section)
-        update = {field: getattr(learnt, field) for unit in state if unit.section == section for field in unit.fields}
-        if update:
-            changes[section] = (getattr(old, section) or FIRST_SENSOR).model_copy(update=update)
-    if old.rfid is not None and new.rfid is not None and state & {PLACES, MODEL, STRENGTH}:
-        changes["rfid"] = _mixed_rfid(old.rfid, new.rfid, state)
-        changes["survey"] = new.survey if PLACES in state else old.survey
+    for calibrator in calibrators().values():
+        changes |= calibrator.mixed(old, new, state)
     return old.model_copy(update=changes)
-
-
-def _mixed_rfid(old: RfidSettings, new: RfidSettings, state: State) -> RfidSettings:
-    models, places = (new if unit in state else old for unit in (MODEL, PLACES))
-    of_model = models.all_antennas()
-    antennas = {name: a.model_copy(update={"model": of_model[name].model}) for name, a in places.all_antennas().items()}
-    return models.model_copy(
-        update={
-            "antennas": antennas,
-            "preset": None,
-            "rssi": new.rssi if STRENGTH in state else old.rssi,
-            "phase": new.phase,
-        }
-    )
 
 
 class Learner:
     """What some logs tell, with all parameters free or with some of them held at the values of ``start``.
 
-    ``grids`` and ``kind``: see :func:`~factorgraph_loc.calibration.learn.learn`; ``shared``: what all logs tell, for the
-    uncertainties, which a single log does not tell. Learns nothing from logs that are too short.
+    ``grids``: see :func:`~factorgraph_loc.calibration.learn.learn`; ``shared``: what all logs tell, also for the uncertainties,
+    which a single log does not tell. Learns nothing from logs that are too short.
     """
 
     def __init__(
@@ -130,31 +63,23 @@ class Learner:
         logs: Sequence[Log],
         start: Rig,
         grids: Path | None,
-        kind: Kind | None,
         knowledge: Knowledge | None = None,
         shared: Knowledge | None = None,
     ) -> None:
-        self._logs, self._start, self._grids, self._kind = list(logs), start, grids, kind
+        self._logs, self._start = list(logs), start
         # a single log, and one recording without a part of it, do not tell what differs between runs
         self._by_log = shared is None or len(logs) > 1
         self._shared = None if self._by_log else shared
         self._all: Knowledge | None = None
         with suppress(InputError):  # too short
-            self._all = knowledge or learn(logs, start, grids, kind, by_log=self._by_log)
+            self._all = knowledge or learn(logs, start, grids, shared, by_log=self._by_log)
         self.knowledge = self._all
         self._change: Callable[[Rig], Rig] = lambda rig: rig
 
-    def settle(self, accepted: Iterable[str], *, placed: bool) -> None:
-        """Learn anew with these constants alone, and, unless ``placed``, with tags and antennas where the input rig has them."""
-        if self._all is None:
-            return
-        found = settled(self._all, self._logs, self._start, frozenset(accepted), by_log=self._by_log)
-        if not placed and self._grids is not None:
-            folder = self._grids.parent / f"{self._grids.name}.unplaced"
-            folder.mkdir()
-            rig = learn_rfid(self._logs, self._start, folder / self._grids.name, self._kind, placed=False)[0]
-            found = replace(found, rig=found.rig.model_copy(update={"rfid": rig.rfid, "survey": rig.survey}))
-        self.knowledge = found
+    def settle(self, accepted: Iterable[str]) -> None:
+        """Learn anew with these constants alone."""
+        if self._all is not None:
+            self.knowledge = settled(self._all, self._logs, self._start, frozenset(accepted), by_log=self._by_log)
 
     def noisy(self, change: Callable[[Rig], Rig]) -> None:
         """From now on with the noise that ``change`` makes of what is learnt."""
@@ -172,9 +97,11 @@ class Learner:
 
 def _with_uncertainty(rig: Rig, other: Rig) -> Rig:
     changes = {
-        section: getattr(rig, section).model_copy(update={"uncertainty": getattr(other, section).uncertainty})
-        for section in ("odometry", "bearing_range")
-        if getattr(rig, section) is not None and getattr(other, section) is not None
+        one.section: getattr(rig, one.section).model_copy(
+            update={"uncertainty": getattr(other, one.section).uncertainty}
+        )
+        for one in calibrators().values()
+        if one.uncertain and getattr(rig, one.section) is not None and getattr(other, one.section) is not None
     }
     return rig.model_copy(update=changes)
 
@@ -236,8 +163,7 @@ class Bench:
 
 
 def _usable(rig: Rig, state: State) -> Rig:
-    """The rig whose sensors are those that it can use; the strength of reads is, where it is judged."""
-    sensors = [name for name in rig.sensors if name != "rssi" or (rig.rfid is not None and rig.rfid.rssi is not None)]
-    if STRENGTH in state and "rssi" not in sensors:
-        sensors.append("rssi")
-    return rig.model_copy(update={"sensors": tuple(sensors)})
+    """The rig whose sensors are those that it can use."""
+    for calibrator in calibrators().values():
+        rig = calibrator.usable(rig, state)
+    return rig

@@ -49,10 +49,9 @@ def calibrate(
         return
     show.table(*report.constants_table(found.knowledge.constants))
     show.line()
-    if found.knowledge.rfid is not None:
-        for table in report.rfid_tables(found):
-            show.table(*table)
-            show.line()
+    for table in report.sensor_tables(found):
+        show.table(*table)
+        show.line()
     show.table(*report.judgements_table(found))
     show.line()
     show.table(*report.accuracy_table(found))

@@ -3,8 +3,12 @@
 import base64
 import html
 import json
+import math
 from collections.abc import Iterable
 from typing import Any
+
+Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
+"""Header and rows of a table."""
 
 
 class Html(str):
@@ -59,3 +63,8 @@ def figure(title: object, caption: object, **attributes: object) -> Html:
 def image(png: bytes) -> Html:
     """A PNG image that is part of the page."""
     return Html(f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(png).decode()}">')
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for a table, a dash where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

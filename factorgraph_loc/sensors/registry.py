@@ -6,7 +6,7 @@ stand in :mod:`factorgraph_loc.builtin`. Another package registers one by an ent
 whose value is the place of its :class:`SensorType`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, cast
@@ -72,6 +72,8 @@ class SensorType:
     settings do not fit together. Of robots that choose where to drive: ``on_robot``: ``(world, rig, settings, rng) ->``
     :class:`~factorgraph_loc.sensors.simulated.LiveSensor` or None; ``forecast``: ``(world, rig, speed, settings) ->``
     :class:`~factorgraph_loc.sensors.forecast.Forecast` or None.
+
+    ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
     """
 
     name: str
@@ -90,6 +92,7 @@ class SensorType:
     looks: Place = ""
     on_robot: Place = ""
     forecast: Place = ""
+    calibrator: Place = ""
 
 
 def sensors() -> Mapping[str, SensorType]:
@@ -124,7 +127,7 @@ def channel(name: str) -> Channel:
     return next(own for own in sensor_of(name).channels if own.name == name)
 
 
-def functions(kind: str) -> Iterator[tuple[str, Callable[..., Any]]]:
+def functions(kind: str) -> Iterator[tuple[str, Any]]:
     """The functions of one kind, a field of :class:`SensorType`, of the sensors that have one, with their names."""
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):

@@ -43,7 +43,7 @@ def test_the_scatter_is_found_without_the_outliers(knowledge):
 
 def test_white_errors_have_no_correlation(knowledge):
     """The correlation of 7,000 pairs has a standard error of 0.012: 0.06 are five of them."""
-    (correlation,) = knowledge.correlations
+    (correlation,) = knowledge.details["landmarks"]
     np.testing.assert_allclose(correlation.next_one, 0.0, atol=0.06)
 
 

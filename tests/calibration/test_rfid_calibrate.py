@@ -55,7 +55,7 @@ def found_in_one(logs, tmp_path_factory):
 
 
 def test_tempering_makes_the_estimator_consistent(found):
-    assert found.rfid_consistency.reached
+    assert found.consistency["rfid"].reached
     assert found.rig.rfid.tempering == pytest.approx(0.25, rel=0.3)
 
 
@@ -71,15 +71,15 @@ def test_tempering_is_sought_on_logs_that_the_models_have_not_seen(found, models
     assert models[:2] == [found.input_rig.rfid.models] * 2
     assert of_all not in models[:-2]
     assert models[-2:] == [of_all, of_all]
-    assert found.held_out == found.rfid_consistency.trial.scores
+    assert found.held_out == found.consistency["rfid"].trial.scores
 
 
 def test_tempering_is_never_above_what_the_scatter_of_reads_says(found_in_one):
     """Even if an estimator would bear it, and that is no reason to doubt the rig."""
-    assert found_in_one.rig.rfid.tempering == pytest.approx(found_in_one.knowledge.rfid.share)
-    assert found_in_one.rfid_consistency.trial.causal < 0.5
+    assert found_in_one.rig.rfid.tempering == pytest.approx(found_in_one.knowledge.found["rfid"].knowledge.share)
+    assert found_in_one.consistency["rfid"].trial.causal < 0.5
     assert not any("consistent" in doubt for doubt in found_in_one.doubts)
-    assert found_in_one.after == found_in_one.rfid_consistency.trial.scores
+    assert found_in_one.after == found_in_one.consistency["rfid"].trial.scores
 
 
 def test_a_rig_without_a_model_is_not_scored(found, found_in_one):

@@ -105,8 +105,8 @@ def test_a_survey_that_the_estimator_does_not_like_is_not_shifted(read_tags, tmp
         return scores(0.2 * (0.5 if learnt else 1.0) * (1.0 if not shifted else 3.0))
 
     found = calibrate([log], evaluate, rig, grids=tmp_path / "cart")
-    assert any(o.name == "x" and o.change > 0.3 for o in found.knowledge.rfid.offsets)
-    assert not any(o.kept for o in found.knowledge.rfid.offsets)
+    assert any(o.name == "x" and o.change > 0.3 for o in found.knowledge.found["rfid"].knowledge.offsets)
+    assert not any(o.kept for o in found.knowledge.found["rfid"].knowledge.offsets)
     assert found.rig.survey == rig.survey
     places = [(a.x, a.y, a.yaw) for a in found.rig.rfid.antennas.values()]
     assert places == [(a.x, a.y, a.yaw) for a in rfid.antennas.values()]

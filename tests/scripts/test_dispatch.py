@@ -32,14 +32,6 @@ KEPT = {
     "simulation/settings.py": (2, "presets are rigs, as files would say them"),
 }
 STILL = {
-    "api.py": 1,
-    "calibration/calibrate.py": 9,
-    "calibration/consistency.py": 1,
-    "calibration/constants.py": 1,
-    "calibration/held_out.py": 2,
-    "calibration/learn.py": 5,
-    "calibration/report.py": 1,
-    "calibration/selection.py": 6,
     "fusion/ekf.py": 1,
     "fusion/graph_builder.py": 5,
     "fusion/heading_search.py": 2,

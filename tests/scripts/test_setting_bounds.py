@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from limits_tables import FILES, numbers_of, tables
 
-from factorgraph_loc.calibration.consistency import inflated
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.landmarks.calibrator import CALIBRATOR
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.settings import (
@@ -68,7 +68,9 @@ def test_uncertain_constants_beside_noise_at_its_bound_make_a_model():
 
 @pytest.mark.parametrize("factor", [1e-12, 1e12])
 def test_computed_settings_can_be_read_again(factor):
-    rig = inflated(Rig(bearing_range=BearingRangeSettings(range_sigma=0.1, range_sigma_relative=0.1)), factor)
+    rig = CALIBRATOR.inflated(
+        Rig(bearing_range=BearingRangeSettings(range_sigma=0.1, range_sigma_relative=0.1)), factor
+    )
     assert parse_model(Rig, rig.model_dump(exclude_none=True), "a.rig.toml") == rig
     assert GrowthSettings.bounded(per_distance=factor, per_time=-factor).per_time == 0.0
 

@@ -51,4 +51,5 @@ SENSOR = SensorType(
     looks="factorgraph_loc.sensors.rfid.simulated_drive:looks",
     on_robot="factorgraph_loc.sensors.rfid.simulated_robot:on_robot",
     forecast="factorgraph_loc.sensors.rfid.expectation:forecast",
+    calibrator="factorgraph_loc.sensors.rfid.calibration.calibrator:CALIBRATOR",
 )

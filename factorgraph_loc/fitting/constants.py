@@ -8,13 +8,6 @@ import numpy as np
 from factorgraph_loc.fitting.robust import Constant, Fit, is_worth
 from factors.se2 import Array
 
-# the constants that an estimator can learn on each run, with the most that the rig takes
-UNCERTAIN: dict[str, dict[str, float]] = {
-    "odometry": dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0),
-    "bearing_range": {"x": 10.0, "y": 10.0}
-    | dict.fromkeys(("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0),
-}
-
 
 @dataclass(frozen=True)
 class Learnt:
@@ -48,9 +41,11 @@ def describe(
     alone: Sequence[Mapping[str, float]],
     gain: Array,
     logs: int,
-    denied: Collection[str] = (),
+    denied: Collection[str],
+    uncertain: Collection[str],
 ) -> list[Learnt]:
-    """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one."""
+    """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one; ``uncertain``: names of
+    those that an estimator can learn on each run."""
     values, errors = everything.as_dict(), everything.errors_as_dict()
     kept = [] if pooled is None else [c.name for c in pooled.constants]
     if pooled is not None:
@@ -65,7 +60,7 @@ def describe(
             spread = float(np.sqrt(np.sum((parts - value) ** 2) / (len(parts) - (c.name in kept))))
         error = max(errors[c.name], spread / np.sqrt(len(parts)) if len(parts) and c.name in kept else 0.0)
         uncertainty = None
-        if c.name in UNCERTAIN[sensor] and logs > 1:
+        if c.name in uncertain and logs > 1:
             uncertainty = max(spread, error) / (abs(value) if "scale" in c.name else 1.0)
         out.append(
             Learnt(

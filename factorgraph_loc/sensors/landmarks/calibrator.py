@@ -1,0 +1,207 @@
+"""How a sensor of landmarks is calibrated: by its sightings from the poses of the reference, and by the EKF's errors."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from factorgraph_loc.drawing.markup import Rows, image, number, table
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, ConstantsFit, Settled, Told, Unit
+from factorgraph_loc.sensors.landmarks import calibration as sightings
+from factorgraph_loc.sensors.landmarks.calibration import Sightings
+from factorgraph_loc.sensors.landmarks.figures import correlation_figure, sightings_figure
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+
+MIN_SIGHTINGS = 100
+MOST_SIGHTINGS = 12000  # of a log that have a part in fits
+BLOCKS = 5  # stretches of time of a single log, each predicted by the others
+# ranges are taken to be of the other kind, distance or depth, if then their spread is below this share
+BETTER_KIND = 0.9
+ROUNDS = 2  # of constants and scatter in turn
+RANGE_KIND = "range_kind"
+SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
+SCATTER = Unit("bearing_range", tuple(SIGMAS))
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """All constants fitted together to sightings ``thinned`` out of all that were ``seen``; ``settings``: with these and their
+    scatter, of the kind of ranges that fits best."""
+
+    fit: ConstantsFit
+    settings: BearingRangeSettings
+    seen: tuple[Sightings, ...]
+    thinned: tuple[Sightings, ...]
+
+
+class LandmarkCalibrator(ConstantsCalibrator):
+    """See the module."""
+
+    section, channel, is_consistent = "bearing_range", "bearing_range", True
+    noise = (SCATTER,)
+    uncertain = {"x": 10.0, "y": 10.0} | dict.fromkeys(
+        ("bearing_bias", "range_scale", "depth_axis", "time_offset"), 1.0
+    )
+    together = (("x", "y"),)
+    units: ClassVar[Mapping[str, str]] = {
+        "x": "m",
+        "y": "m",
+        "bearing_bias": "rad",
+        "depth_axis": "rad",
+        "time_offset": "s",
+    }
+    first = BearingRangeSettings(range_sigma=0.1)
+
+    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> SensorFit | None:
+        """The constants of the sensor, of logs with sightings."""
+        if self.channel not in logs[0].streams:
+            return None
+        seen, before = tuple(_sightings(log) for log in logs), self.settings(rig)
+        thinned = [one.thinned(MOST_SIGHTINGS) for one in seen]
+        everything, settings = _fit_and_scatter(thinned, before)
+        if sightings.could_be_depths(thinned):
+            other = before.model_copy(update={RANGE_KIND: "distance" if before.range_kind == "depth" else "depth"})
+            found, changed = _fit_and_scatter(thinned, other)
+            if sightings.range_spread(thinned, changed) < BETTER_KIND * sightings.range_spread(thinned, settings):
+                everything, settings = found, changed
+        gain = gains(everything, folds([one.t for one in thinned], BLOCKS))
+        return SensorFit(ConstantsFit(everything, gain, everything.as_dict()), settings, seen, tuple(thinned))
+
+    def parts(self, found: SensorFit) -> Sequence[Sightings]:
+        """The sightings of each log."""
+        return found.thinned
+
+    def base(self, found: SensorFit, rig: Rig, accepted: Collection[str] | None) -> BearingRangeSettings:
+        """The settings with the scatter of all constants together, of the kind of ranges that is accepted."""
+        settings = found.settings.model_copy(update={c.name: c.neutral for c in found.fit.everything.constants})
+        if accepted is None or f"{self.section}.{RANGE_KIND}" in accepted:
+            return settings
+        return settings.model_copy(update={RANGE_KIND: self.settings(rig).range_kind})
+
+    def changed(self, base: BearingRangeSettings, values: Mapping[str, float]) -> BearingRangeSettings:
+        """The settings with other constants."""
+        return base.model_copy(update=dict(values))
+
+    def fit(
+        self,
+        _found: SensorFit,
+        parts: Sequence[Sightings],
+        base: BearingRangeSettings,
+        constants: Sequence[Constant],
+        start: Mapping[str, float],
+    ) -> Fit:
+        """By range and bearing."""
+        return sightings.fit_sensor(parts, base, constants, start)
+
+    def finished(
+        self,
+        found: SensorFit,
+        _logs: Sequence[Log],
+        rig: Rig,
+        base: BearingRangeSettings,
+        learnt: Sequence[Learnt],
+        *,
+        by_log: bool,
+    ) -> Settled:
+        """With the scatter that is left, and how alike neighbouring errors are."""
+        settings = sightings.with_scatter(found.thinned, base)
+        before, notes = rig.bearing_range, []
+        if before is not None and settings.range_kind != before.range_kind:
+            notes.append(f"The ranges fit better as the {settings.range_kind} than as the {before.range_kind}.")
+        correlations = tuple(sightings.correlation(one, settings) for one in found.seen if by_log)
+        return Settled({self.section: settings}, learnt, notes, correlations)
+
+    def constant_units(self, found: SensorFit, kept: Sequence[Learnt], learnt: Rig, start: Rig) -> dict[Unit, float]:
+        """Constants of another kind of ranges are none of this one."""
+        if learnt.bearing_range.range_kind == self.settings(start).range_kind:
+            return super().constant_units(found, kept, learnt, start)
+        return {Unit(self.section, (*(c.name for c in kept), RANGE_KIND)): float("inf")}
+
+    def inflated(self, rig: Rig, factor: float) -> Rig:
+        """The rig with the sensor's sigmas multiplied, at most to their bounds."""
+        settings = rig.bearing_range
+        update = {name: factor * getattr(settings, name) for name in SIGMAS}
+        return rig.model_copy(update={self.section: settings.model_copy(update=update)})
+
+    def document(self, told: Told) -> dict[str, Any]:
+        """The factor on the noise, and how alike neighbouring errors are."""
+        return {
+            "noise_factor": None if told.trial is None else told.trial.factor,
+            "correlation": {
+                log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
+                for log, c in zip(told.logs, told.details or (), strict=False)
+            },
+        }
+
+    def told_noise(self, told: Told) -> list[str]:
+        """The scatter, and what the rig has of it."""
+        scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
+        if told.found is None or scatter is None or settings is None:
+            return []
+        out = []
+        if SCATTER not in told.accepted:
+            out.append("<p>The noise of the sightings is refused: the rig has that of the input.</p>")
+        rows = [
+            (f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(settings, n))) for n, unit in SIGMAS.items()
+        ]
+        out.append(table(("noise of the sightings", "scatter", "in the rig"), rows))
+        if trial is not None and SCATTER in told.accepted:
+            out.append(
+                f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
+                f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
+            )
+        return out
+
+    def told_residuals(self, told: Told) -> list[str]:
+        """Of the sightings, and how alike neighbouring ones are."""
+        if told.found is None:
+            return []
+        return [
+            "<h2>How alike neighbouring errors are</h2>",
+            "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
+            "one, and the noise in the rig must be larger than the scatter.</p>",
+            table(*_correlations(told)),
+            "<h2>Residuals of the sightings</h2>",
+            image(sightings_figure(told.found.seen, told.learnt.bearing_range)),
+            image(correlation_figure(told.found.seen, told.details)),
+        ]
+
+
+def _sightings(log: Log) -> Sightings:
+    """The sightings of a log; InputError if they are too few."""
+    seen = sightings.sightings_of(log)
+    if len(seen.t) < MIN_SIGHTINGS:
+        raise InputError(
+            f"{log.name}: has {len(seen.t)} sightings of landmarks of the map while there is a reference, "
+            f"expected {MIN_SIGHTINGS} or more"
+        )
+    return seen
+
+
+def _fit_and_scatter(seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
+    """All constants of the sensor and its scatter, in turn."""
+    constants = sightings.constants_of(seen, before)
+    start = {c.name: c.neutral for c in constants}
+    settings = sightings.with_scatter(seen, before)
+    for _ in range(ROUNDS):
+        everything = sightings.fit_sensor(seen, settings, constants, start)
+        start = everything.as_dict()
+        settings = sightings.with_scatter(seen, settings.model_copy(update=start))
+    return everything, settings
+
+
+def _correlations(told: Told) -> Rows:
+    header = ("log", "range: next sighting", "falls to 1/e in [s]", "bearing: next sighting", "falls to 1/e in [s]")
+    rows: list[tuple[str, ...]] = [
+        (log, number(c.next_one[0], 2), number(c.time[0], 1), number(c.next_one[1], 2), number(c.time[1], 1))
+        for log, c in zip(told.logs, told.details, strict=True)
+    ]
+    return header, rows
+
+
+CALIBRATOR = LandmarkCalibrator()

@@ -1,0 +1,197 @@
+"""How wheel odometry is calibrated: by the motion of the reference over short windows."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from factorgraph_loc.drawing.markup import image, number, table
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, ConstantsFit, Settled, Told, Unit
+from factorgraph_loc.sensors.odometry.calibration import constants as odometry
+from factorgraph_loc.sensors.odometry.calibration.figures import odometry_figure
+from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
+from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut, odometry_of
+from factorgraph_loc.sensors.odometry.model import odometry_model
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
+from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factors.odometry.model import OdometryModel
+from factors.se2 import Array
+
+MIN_WINDOWS = 20
+BLOCKS = 5  # stretches of time of a single log, each predicted by the others
+ROUNDS = 2  # of constants and scatter in turn
+MOST_OUTLIERS = 0.05  # share of the windows
+NOISE = Unit("odometry", ("noise",))
+KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
+
+
+@dataclass(frozen=True)
+class WheelsFit:
+    """``windows`` of 2 s, by log, and the ``fit`` of all constants, with ``sigmas`` (3,) of the residuals; None and no windows
+    where the reference has no heading."""
+
+    windows: tuple[Windows, ...] = ()
+    fit: ConstantsFit | None = None
+    sigmas: Array | None = None
+
+
+class OdometryCalibrator(ConstantsCalibrator):
+    """See the module."""
+
+    section, channel, senses = "odometry", "odometry", False
+    noise = (NOISE,)
+    uncertain = dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0)
+    together = (("delay", "lag"),)
+    units: ClassVar[Mapping[str, str]] = {
+        "speed_bias": "m/s",
+        "heading_rate_bias": "rad/s",
+        "heading_drift": "rad/m",
+        "direction": "rad",
+        "delay": "s",
+        "lag": "s",
+        "turn_slowdown": "m/rad",
+    }
+
+    def check_alike(self, first: Log, log: Log) -> None:
+        """InputError if one reports velocities and the other increments."""
+        ours, theirs = (KINDS[type(odometry_of(one))] for one in (log, first))
+        if ours != theirs:
+            raise InputError(
+                f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
+            )
+
+    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> WheelsFit:
+        """The constants of the wheels, where the reference has headings."""
+        if logs[0].reference is None or not logs[0].reference.has_heading:
+            return WheelsFit()
+        windows = tuple(cut(log, odometry.WINDOW) for log in logs)
+        for one in windows:
+            if len(one.begin) < MIN_WINDOWS:
+                raise InputError(
+                    f"{one.log.name}: odometry and reference overlap in {len(one.begin)} windows of {odometry.WINDOW:g} s, "
+                    f"expected {MIN_WINDOWS} or more"
+                )
+        constants, model = odometry.constants_of(windows[0], rig.odometry), odometry_model(rig)
+        start = {c.name: c.neutral for c in constants}
+        start |= {name: max(start[name], odometry.LAGGING_START) for name in ("delay", "lag") if name in start}
+        for _ in range(ROUNDS):
+            sigmas = odometry.scatter(windows, odometry.with_constants(model, start))
+            everything = odometry.fit_odometry(windows, model, constants, sigmas, start)
+            start = everything.as_dict()
+        denied = odometry.denied_at_rest(everything, windows)
+        gain = gains(everything, folds([one.begin for one in windows], BLOCKS), denied)
+        return WheelsFit(windows, ConstantsFit(everything, gain, start, denied), sigmas)
+
+    def settle(
+        self, found: WheelsFit, logs: Sequence[Log], rig: Rig, accepted: Collection[str] | None, *, by_log: bool
+    ) -> Settled:
+        """See :meth:`ConstantsCalibrator.settle`."""
+        if found.fit is None:
+            note = "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
+            return Settled({"odometry": rig.odometry}, notes=(note,))
+        return super().settle(found, logs, rig, accepted, by_log=by_log)
+
+    def has_noise(self, found: WheelsFit) -> bool:
+        """Where the constants can be fitted."""
+        return found.fit is not None
+
+    def parts(self, found: WheelsFit) -> Sequence[Windows]:
+        """The windows of each log."""
+        return found.windows
+
+    def base(self, _found: WheelsFit, rig: Rig, _accepted: Collection[str] | None) -> OdometryModel:
+        """The model of the input rig."""
+        return odometry_model(rig)
+
+    def changed(self, base: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
+        """The model with other constants."""
+        return odometry.with_constants(base, values)
+
+    def fit(
+        self,
+        found: WheelsFit,
+        parts: Sequence[Windows],
+        base: OdometryModel,
+        constants: Sequence[Constant],
+        start: Mapping[str, float],
+    ) -> Fit:
+        """With the scatter of all constants together."""
+        assert found.sigmas is not None, "there are windows"
+        return odometry.fit_odometry(parts, base, constants, found.sigmas, start)
+
+    def finished(
+        self,
+        _found: WheelsFit,
+        logs: Sequence[Log],
+        rig: Rig,
+        base: OdometryModel,
+        learnt: Sequence[Learnt],
+        *,
+        by_log: bool,
+    ) -> Settled:
+        """With the noise that is left."""
+        noise = fit_noise(logs, base)
+        growth = {
+            error: GrowthSettings.bounded(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
+            for error, g in noise.growth.items()
+        }
+        changed: dict[str, Any] = {one.name: one.value for one in learnt} | {"noise": OdometryNoise(**growth)}
+        return Settled({"odometry": rig.odometry.model_copy(update=changed)}, learnt, details=noise)
+
+    def doubts(self, _found: WheelsFit, details: NoiseFit | None) -> list[str]:
+        """Outliers, and noise that is too good."""
+        doubts = []
+        if details is not None and details.outliers > MOST_OUTLIERS:
+            doubts.append(
+                f"{100.0 * details.outliers:.0f} % of the odometry windows are outliers: slip, collisions, or gaps in the "
+                "reference?"
+            )
+        if details is not None and details.floored:
+            doubts.append(
+                f"The fitted noise of the odometry ({', '.join(details.floored)}) is below what wheels can do and was raised: "
+                "the reference is probably not independent of the odometry."
+            )
+        return doubts
+
+    def document(self, told: Told) -> dict[str, Any]:
+        """Outliers, and by how much the noise was widened."""
+        noise: NoiseFit | None = told.details
+        return {
+            "odometry_outliers": None if noise is None else noise.outliers,
+            "odometry_widened": None if noise is None else noise.widened,
+        }
+
+    def told_noise(self, told: Told) -> list[str]:
+        """How each error grows."""
+        noise: NoiseFit | None = told.details
+        if noise is None:
+            return []
+        out = []
+        if NOISE not in told.accepted:
+            out.append("<p>The noise of the odometry below is refused: the rig has that of the input.</p>")
+        rows = [
+            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
+            for error, g in noise.growth.items()
+        ]
+        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
+        out.append(table(header, rows))
+        out.append(
+            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise is {noise.widened:.2f} times "
+            "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
+        )
+        return out
+
+    def told_residuals(self, told: Told) -> list[str]:
+        """Of the windows."""
+        if not told.found.windows:
+            return []
+        figure = odometry_figure(told.found.windows, odometry_model(told.learnt))
+        return ["<h2>Residuals of the odometry</h2>", image(figure)]
+
+
+CALIBRATOR = OdometryCalibrator()

@@ -1,0 +1,188 @@
+"""How RFID is calibrated: by what was read along the reference, and by the smoother's errors."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from factorgraph_loc.drawing.markup import Rows, image, table, text
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.calibrating import Calibrator, Settled, State, Told, Unit
+from factorgraph_loc.sensors.rfid.calibration import figures, report
+from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
+from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
+from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, default_models
+
+PLACES, MODEL, STRENGTH = Unit("rfid", ("places",)), Unit("rfid", ("models",)), Unit("rfid", ("rssi",))
+TOO_SHORT = "refused: the logs are too short to judge it"
+
+
+@dataclass(frozen=True)
+class RfidFound:
+    """The ``sections`` of the rig that were learnt, and the ``knowledge``; None of some of the logs, of which ``like`` is what all
+    tell. ``grids``: where files of grids are."""
+
+    sections: Mapping[str, Any]
+    knowledge: RfidKnowledge | None
+    like: RfidKnowledge
+    grids: Path
+
+
+class RfidCalibrator(Calibrator):
+    """See the module."""
+
+    section, channel, estimator, folds = "rfid", "rfid", "smoother", (3, 2)  # models of detection take long to fit
+    models = (MODEL,)
+    is_consistent = judged_unseen = True
+
+    def recordings(self, logs: Sequence[Log]) -> list[int]:
+        """Logs that hold the same reads are one."""
+        return distinct(logs)
+
+    def learn(self, logs: Sequence[Log], rig: Rig, grids: Path | None, like: RfidFound | None) -> RfidFound | None:
+        """Survey, mounting and models, of logs with reads; of some of the logs in the way that is best for all."""
+        if self.channel not in logs[0].streams:
+            return None
+        if grids is None:
+            raise ValueError("logs with reads of tags need a place for grids")
+        kind = None if like is None else like.like.choice.kind
+        learnt, knowledge = learn_rfid(logs, rig, grids, kind)
+        told = knowledge if like is None else like.like
+        assert told is not None, "all logs tell something"
+        return RfidFound({"rfid": learnt.rfid, "survey": learnt.survey}, knowledge, told, grids)
+
+    def settle(
+        self,
+        found: RfidFound,
+        logs: Sequence[Log],
+        rig: Rig,
+        accepted: Collection[str] | None,
+        *,
+        by_log: bool,
+    ) -> Settled:
+        """Anew, with tags and antennas where the input rig has them, if their places are refused."""
+        moved = any(offset.kept for offset in found.like.offsets)
+        if accepted is None or not moved or PLACES.names[0] in accepted:
+            return Settled(found.sections)
+        folder = found.grids.parent / f"{found.grids.name}.unplaced"
+        folder.mkdir()
+        kind = found.like.choice.kind
+        learnt = learn_rfid(logs, rig, folder / found.grids.name, kind, placed=False)[0]
+        return Settled({"rfid": learnt.rfid, "survey": learnt.survey})
+
+    def constant_units(self, found: RfidFound, _kept: Any, _learnt: Rig, _start: Rig) -> dict[Unit, float]:
+        """The places of tags and antennas come last."""
+        return {PLACES: float("inf")} if any(offset.kept for offset in found.like.offsets) else {}
+
+    def optional(self, learnt: Rig) -> tuple[Unit, ...]:
+        """The strength of reads."""
+        return (STRENGTH,) if learnt.rfid is not None and learnt.rfid.rssi is not None else ()
+
+    def mixed(self, old: Rig, new: Rig, state: State) -> dict[str, Any]:
+        """Places, models and strength, each on its own."""
+        if old.rfid is None or new.rfid is None or not state & {PLACES, MODEL, STRENGTH}:
+            return {}
+        models, places = (new.rfid if unit in state else old.rfid for unit in (MODEL, PLACES))
+        settings: RfidSettings = models
+        of_model = settings.all_antennas()
+        antennas = {
+            name: a.model_copy(update={"model": of_model[name].model}) for name, a in places.all_antennas().items()
+        }
+        strength = new.rfid.rssi if STRENGTH in state else old.rfid.rssi
+        update = {"antennas": antennas, "preset": None, "rssi": strength, "phase": new.rfid.phase}
+        survey = new.survey if PLACES in state else old.survey
+        return {"rfid": settings.model_copy(update=update), "survey": survey}
+
+    def usable(self, rig: Rig, state: State) -> Rig:
+        """The strength of reads is used where it is judged, and where the rig knows how."""
+        known = rig.rfid is not None and rig.rfid.rssi is not None
+        sensors = [name for name in rig.sensors if name != "rssi" or known]
+        if STRENGTH in state and "rssi" not in sensors:
+            sensors.append("rssi")
+        return rig.model_copy(update={"sensors": tuple(sensors)})
+
+    def is_complete(self, rig: Rig) -> bool:
+        """With the default model of detection a run tells nothing."""
+        return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
+
+    def guess(self, found: RfidFound) -> float:
+        """Reads are not less alike than their scatter says, even if an estimator on these logs would bear it."""
+        return float(found.like.share**-0.5)
+
+    def least(self, found: RfidFound) -> float:
+        """See :meth:`guess`."""
+        return self.guess(found)
+
+    def inflated(self, rig: Rig, factor: float) -> Rig:
+        """By the tempering."""
+        return tempered(rig, factor)
+
+    def as_honest_as(self, rig: Rig, other: Rig) -> Rig:
+        """By the tempering."""
+        return rig if rig.rfid is None or other.rfid is None else tempered(rig, other.rfid.tempering**-0.5)
+
+    def honest(self, rig: Rig, _factor: float | None, other: Rig, learnt: Rig) -> Rig:
+        """With the tempering, and the share of dead tags, that all logs tell."""
+        if rig.rfid is None or learnt.rfid is None:
+            return rig
+        settings = rig.rfid.model_copy(update={"dead_tags": learnt.rfid.dead_tags})
+        return self.as_honest_as(rig.model_copy(update={"rfid": settings}), other)
+
+    def judged(self, found: RfidFound, judgements: Mapping[str, Any]) -> RfidFound:
+        """With what an estimator says of the places."""
+        judgement = judgements.get(PLACES.names[0])
+        accepted = judgement is not None and judgement.accepted
+        why = TOO_SHORT if judgement is None else judgement.why
+        offsets = tuple(replace(o, kept=accepted, why=why) if o.kept else o for o in found.like.offsets)
+        knowledge = replace(found.like, offsets=offsets)
+        return replace(found, knowledge=knowledge, like=knowledge)
+
+    def doubts(self, found: RfidFound | None, _details: Any) -> list[str]:
+        """Tags that seem to be elsewhere or dead."""
+        if found is None:
+            return []
+        doubts = [
+            f"Tag {tag.name} seems to be {tag.distance:.1f} m from where the map has it." for tag in found.like.doubts
+        ]
+        dead = found.like.dead
+        if dead.tags:
+            names = f"; believed dead, as they should have been: {', '.join(dead.believed)}" if dead.believed else ""
+            doubts.append(f"{len(dead.tags)} tags of the map are never read{names}.")
+        return doubts
+
+    def document(self, told: Told) -> dict[str, Any]:
+        """Everything of the report."""
+        if told.found is None:
+            return {"rfid": None}
+        return {"rfid": report.rfid_document(told.found.like, accepted=MODEL in told.accepted)}
+
+    def tables(self, told: Told) -> list[Rows]:
+        """Survey and mounting, models of detection, and doubtful tags if there are any."""
+        if told.found is None:
+            return []
+        found = told.found.like
+        tables = [report.offsets_table(found), report.models_table(found, accepted=MODEL in told.accepted)]
+        return [*tables, report.tags_table(found)] if found.doubts else tables
+
+    def told_section(self, told: Told) -> list[str]:
+        """The tables, and how well the models predict."""
+        if told.found is None:
+            return []
+        found = told.found.like
+        return [
+            "<h2>RFID</h2>",
+            f"<p>{text(report.tempering_text(found, told.rig))}</p>",
+            f"<p>{text(report.dead_text(found))}</p>",
+            *(table(*one) for one in self.tables(told)),
+            "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or "
+            "stretches.</p>",
+            image(figures.reliability_figure(found)),
+            "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the "
+            "model.</p>",
+            image(figures.field_figure(found)),
+        ]
+
+
+CALIBRATOR = RfidCalibrator()
