@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import polars as pl
@@ -29,6 +30,16 @@ class TableRows:
     t_ns: Integers
     numbers: dict[str, Array]
     names: dict[str, list[str]]
+
+    def rows_at(self, which: Integers) -> Self:
+        """Some of the rows, in the order of their places ``which`` (M,)."""
+        return type(self)(
+            self.path,
+            self.rows[which],
+            self.t_ns[which],
+            {name: values[which] for name, values in self.numbers.items()},
+            {name: [texts[i] for i in which.tolist()] for name, texts in self.names.items()},
+        )
 
 
 def read_table(path: Path, tables: Sequence[Table]) -> TableRows:

@@ -1,19 +1,19 @@
 """Identified landmarks in a bag: markers that a detector found with their poses or their corners, or any message by a mapping."""
 
-from pathlib import Path
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
+from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.clock import Clock
-from factorgraph_loc.io.bags.fields import Fields, as_number, as_text, leaves
+from factorgraph_loc.io.bags.fields import leaves
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
-from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.bags.tables import RowsOfTopic
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.planar import Axes, Turned
 from factorgraph_loc.model.stream import Stream
@@ -40,6 +40,9 @@ DETECTIONS: dict[str, tuple[str, str]] = {
 }
 
 
+PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor's frame
+
+
 class LandmarkTopic(Turned):
     """``fields``: where a message has the landmark's name, and its range and bearing, or its place x, y, z in the sensor's frame;
     they are known for the usual detectors of markers. ``frame``: the sensor's, for tf_static to say where it sits; without it
@@ -62,7 +65,7 @@ class PixelTopic(FileModel):
     clock: Clock | None = None
 
 
-class Landmarks:
+class Landmarks(RowsOfTopic):
     """Gathers ranges and bearings of a topic, or the places that they are computed from."""
 
     def __init__(self, bag: Bag, options: LandmarkTopic) -> None:
@@ -82,27 +85,15 @@ class Landmarks:
         if "landmark" not in fields or not set(fields) <= wanted or len(fields) < (4 if self._places else 2):
             expected = "landmark with x, y and z, or with range, bearing or both"
             raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {expected}")
-        self._fields = Fields(bag, topic, fields)
-        self._rows = Rows(f"{bag.path} {topic.name}", 3 if self._places else 2)
-        self._names: list[str] = []
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        for values in self._fields.rows(item.message, item.row):
-            told = dict(zip(self._fields.names, values, strict=True))
-            self._names.append(_name(self._rows.source, told["landmark"], item.row))
-            wanted = "xyz" if self._places else ("range", "bearing")
-            self._rows.append(item, t_ns, tuple(as_number(told.get(name, np.nan)) for name in wanted))
+        columns = (BEARING_RANGE["landmark"], *PLACES) if self._places else BEARING_RANGE.columns[1:]
+        super().__init__(bag, options.topic, fields, columns, {})
 
     def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> Stream:
         """Ranges along the floor and bearings, in the robot's frame where ``frames`` say where the sensor sits there."""
-        source, rows = self._rows.source, self._rows.rows
-        ranges, bearings = self._polar(frames, base) if self._places else self._rows.values.T
-        table = TableRows(
-            Path(source), rows, self._rows.t_ns, {"range": ranges, "bearing": bearings}, {"landmark": self._names}
-        )
-        return stream_of(BEARING_RANGE, table, t0_ns, warnings)
+        rows = self.rows_of(self._polar(frames, base) if self._places else None)
+        return stream_of(BEARING_RANGE, rows, t0_ns, warnings)
 
-    def _polar(self, frames: StaticFrames, base: str) -> tuple[Array, Array]:
+    def _polar(self, frames: StaticFrames, base: str) -> dict[str, Array]:
         places = self._rows.values
         for i, axis in enumerate("xyz"):
             checks.require_finite(self._rows.source, self._rows.rows, axis, places[:, i])
@@ -112,10 +103,10 @@ class Landmarks:
         else:
             pose[:3, :3] = self._options.turned()
         x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
-        return np.hypot(x, y), np.arctan2(y, x)
+        return {"range": np.hypot(x, y), "bearing": np.arctan2(y, x)}
 
 
-class PixelsOfPoints:
+class PixelsOfPoints(RowsOfTopic):
     """Gathers identified pixels of a topic."""
 
     def __init__(self, bag: Bag, options: PixelTopic) -> None:
@@ -129,36 +120,23 @@ class PixelsOfPoints:
             known = leaves(bag.store(topic.name), topic.type)
             if lacking := [path for path in CORNER_FIELDS if path not in known]:
                 raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {listed(lacking)}")
-        fields: dict[Any, str] = dict(options.fields or {})
+        fields = dict(options.fields or {})
         if not self._corners and set(fields) != {"landmark", "u", "v"}:
             raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected landmark, u and v")
-        self._fields = Fields(bag, topic, fields)
-        self._rows = Rows(f"{bag.path} {topic.name}", 2)
-        self._names: list[str] = []
+        super().__init__(bag, options.topic, fields, SIGHTINGS.columns[1:], {})
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        if self._corners:
-            for found in item.message.detections:
-                names = corner_names(f"{found.family}-{found.id}")
-                # apriltag begins at the lower left one and goes on to the lower right one
-                for name, corner in zip(reversed(names), found.corners, strict=True):
-                    self._names.append(name)
-                    self._rows.append(item, t_ns, (corner.x, corner.y))
+        """Take the pixels of a message."""
+        if not self._corners:
+            super().add(item, t_ns)
             return
-        for values in self._fields.rows(item.message, item.row):
-            told = dict(zip(self._fields.names, values, strict=True))
-            self._names.append(_name(self._rows.source, told["landmark"], item.row))
-            self._rows.append(item, t_ns, (as_number(told["u"]), as_number(told["v"])))
+        for found in item.message.detections:
+            names = corner_names(f"{found.family}-{found.id}")
+            # apriltag begins at the lower left one and goes on to the lower right one
+            for name, corner in zip(reversed(names), found.corners, strict=True):
+                self._names["landmark"].append(name)
+                self._rows.append(item, t_ns, (corner.x, corner.y))
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
-        u, v = self._rows.values.T
-        source = Path(self._rows.source)
-        table = TableRows(source, self._rows.rows, self._rows.t_ns, {"u": u, "v": v}, {"landmark": self._names})
-        return stream_of(SIGHTINGS, table, t0_ns, warnings)
-
-
-def _name(source: str, value: Any, row: int) -> str:
-    text = as_text(value)
-    if not text:
-        raise bad_field(source, "landmark", text, BEARING_RANGE["landmark"].doc, row=row)
-    return text
+        """The pixels as a stream; what is wrong with them is an InputError or a warning."""
+        return stream_of(SIGHTINGS, self.rows_of(), t0_ns, warnings)

@@ -6,7 +6,7 @@ The bag is read once, as a stream; of its messages only the numbers that a log n
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields
@@ -21,7 +21,7 @@ from factorgraph_loc.io.bags.messages import tables_of_messages
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
 from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
-from factorgraph_loc.io.bags.tables import RowsOfTopic, TableTopic
+from factorgraph_loc.io.bags.tables import DescribedRows, TableTopic
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream
@@ -57,6 +57,18 @@ class Gatherer(Protocol):
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
 
+class TimedTopic(Protocol):
+    """What the options of any topic have."""
+
+    @property
+    def topic(self) -> str: ...
+    @property
+    def clock(self) -> Clock | None: ...
+
+
+G = TypeVar("G", bound=Gatherer)
+
+
 class Listeners:
     """Who takes the messages of which topic, and by which clock."""
 
@@ -74,6 +86,11 @@ class Listeners:
         self._of.setdefault(topic, []).append((stamper, gatherer))
         if timed:
             self.stampers.append(stamper)
+
+    def listen(self, options: TimedTopic, gatherer: G) -> G:
+        """Have a gatherer take the messages of a topic; the same."""
+        self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
+        return gatherer
 
     def run(self) -> None:
         """Read the bag."""
@@ -101,7 +118,7 @@ class Gathered:
     sightings: PixelsOfPoints | None = None
     reference: Poses | FrameReference | None = None
     start: Start | None = None
-    others: dict[str, RowsOfTopic] = field(default_factory=dict)
+    others: dict[str, DescribedRows] = field(default_factory=dict)
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -115,7 +132,7 @@ def read(path: Path | None, options: Options) -> Log:
 def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners = Listeners(bag, options.clock)
     motion = odometry(bag, options.odometry)
-    listeners.add(options.odometry.topic, motion, listeners.stamper(options.odometry.topic, options.odometry.clock))
+    listeners.listen(options.odometry, motion)
     frames = StaticFrames()
     if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
         listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
@@ -159,26 +176,16 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
     """All that the manifest names beside odometry."""
     bag, out = listeners.bag, Gathered()
     if options.imu:
-        out.imu = YawRates(bag, options.imu)
-        listeners.add(options.imu.topic, out.imu, listeners.stamper(options.imu.topic, options.imu.clock))
+        out.imu = listeners.listen(options.imu, YawRates(bag, options.imu))
     if options.rfid:
-        out.rfid = Reads(bag, options.rfid)
-        listeners.add(options.rfid.topic, out.rfid, listeners.stamper(options.rfid.topic, options.rfid.clock))
+        out.rfid = listeners.listen(options.rfid, Reads(bag, options.rfid))
     if options.bearing_range:
-        seen = options.bearing_range
-        out.bearing_range = Landmarks(bag, seen)
-        listeners.add(seen.topic, out.bearing_range, listeners.stamper(seen.topic, seen.clock))
+        out.bearing_range = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range))
     if options.sightings:
-        out.sightings = PixelsOfPoints(bag, options.sightings)
-        listeners.add(
-            options.sightings.topic,
-            out.sightings,
-            listeners.stamper(options.sightings.topic, options.sightings.clock),
-        )
+        out.sightings = listeners.listen(options.sightings, PixelsOfPoints(bag, options.sightings))
     for table in OTHERS:
         if (told := getattr(options, table.name)) is not None:
-            out.others[table.name] = RowsOfTopic(bag, told, table)
-            listeners.add(told.topic, out.others[table.name], listeners.stamper(told.topic, told.clock))
+            out.others[table.name] = listeners.listen(told, DescribedRows(bag, told, table))
     if options.camera:
         out.camera, out.info = _listen_to_camera(listeners, options.camera)
     if options.reference:
@@ -192,8 +199,7 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
             out.reference = FrameReference(bag, topic, stamper)
         listeners.add(topic.topic, out.reference, stamper)
     if options.start:
-        out.start = Start(bag, options.start.topic, options.start)
-        listeners.add(options.start.topic, out.start, listeners.stamper(options.start.topic, options.start.clock))
+        out.start = listeners.listen(options.start, Start(bag, options.start.topic, options.start))
     return out
 
 

@@ -1,13 +1,16 @@
 """Tables of sensors in a bag whose rows are messages, or parts of them, by a mapping of fields."""
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import Table
+from factorgraph_loc.files.columns import Column, Table
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.files.tables import NAMES, TableRows
+from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import Fields, as_number, as_text
 from factorgraph_loc.io.bags.file import Bag, Stamped
@@ -15,6 +18,7 @@ from factorgraph_loc.io.bags.rows import Rows
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
+from factors.se2 import Array
 
 
 class TableTopic(FileModel):
@@ -28,32 +32,48 @@ class TableTopic(FileModel):
 
 
 class RowsOfTopic:
-    """Gathers the rows of a table."""
+    """Gathers rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; a number that no field has
+    is NaN. ``units``: by column, what to multiply with."""
+
+    def __init__(
+        self, bag: Bag, topic: str, fields: Mapping[Any, str], columns: Sequence[Column], units: Mapping[str, float]
+    ) -> None:
+        self._fields = Fields(bag, bag.topic(topic), fields)
+        self._named = [column for column in columns if column.kind in NAMES]
+        self._numbered = [column.name for column in columns if column.kind in NUMBERS]
+        self._units = [units.get(name, 1.0) for name in self._numbered]
+        self._names: dict[str, list[str]] = {column.name: [] for column in self._named}
+        self._rows = Rows(f"{bag.path} {topic}", len(self._numbered))
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        """Take the rows of a message."""
+        for values in self._fields.rows(item.message, item.row):
+            told = dict(zip(self._fields.names, values, strict=True))
+            for column in self._named:
+                if not (text := as_text(told[column.name])):
+                    raise bad_field(self._rows.source, column.name, text, column.doc, row=item.row)
+                self._names[column.name].append(text)
+            self._rows.append(item, t_ns, tuple(as_number(told.get(name, math.nan)) for name in self._numbered))
+
+    def rows_of(self, numbers: Mapping[str, Array] | None = None) -> TableRows:
+        """What was gathered, or other ``numbers`` (N,) that were made of it."""
+        if numbers is None:
+            numbers = dict(zip(self._numbered, (self._rows.values * self._units).T, strict=True))
+        return TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, dict(numbers), self._names)
+
+
+class DescribedRows(RowsOfTopic):
+    """Gathers the rows of a table that is no more than its description."""
 
     def __init__(self, bag: Bag, options: TableTopic, table: Table) -> None:
-        topic = bag.topic(options.topic)
         columns = {column.name: column for column in table.columns[1:]}
         fields = options.fields or {name: name for name in columns}
         needed = {name for name, column in columns.items() if not column.may_lack}
         if not needed <= set(fields) <= set(columns):
-            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {listed(columns)}")
-        self._table, self._fields, self._units = table, Fields(bag, topic, fields), options.units
-        self._names: dict[str, list[str]] = {n: [] for n in fields if columns[n].kind in NAMES}
-        self._numbers = [name for name in fields if name not in self._names]
-        self._rows = Rows(f"{bag.path} {topic.name}", len(self._numbers))
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        for values in self._fields.rows(item.message, item.row):
-            told = dict(zip(self._fields.names, values, strict=True))
-            for name, texts in self._names.items():
-                if not (text := as_text(told[name])):
-                    raise bad_field(self._rows.source, name, text, self._table[name].doc, row=item.row)
-                texts.append(text)
-            numbers = (as_number(told[name]) * self._units.get(name, 1.0) for name in self._numbers)
-            self._rows.append(item, t_ns, tuple(numbers))
+            raise InputError(f"{bag.path} {options.topic}: fields are {listed(fields)}, expected {listed(columns)}")
+        super().__init__(bag, options.topic, fields, table.columns[1:], options.units)
+        self._table = table
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
         """The rows as a stream; what is wrong with them is an InputError or a warning."""
-        numbers = dict(zip(self._numbers, self._rows.values.T, strict=True))
-        rows = TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, numbers, self._names)
-        return stream_of(self._table, rows, t0_ns, warnings)
+        return stream_of(self._table, self.rows_of(), t0_ns, warnings)

@@ -1,6 +1,7 @@
 """Reads of RFID tags as readers and their tools log them: CSV or JSON lines by a mapping of columns, with presets."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
 from factorgraph_loc.text import quoted
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 SIGNALS = ("rssi", "phase", "frequency")
 OPTIONAL = (*SIGNALS, "channel", "last", "count")
@@ -124,15 +125,18 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """All reads of several tables in the order of time, as of ``path``."""
-    return _in_time(
-        TableRows(
-            path,
-            np.concatenate([table.rows for table in tables]),
-            np.concatenate([table.t_ns for table in tables]),
-            {name: np.concatenate([table.numbers[name] for table in tables]) for name in SIGNALS},
-            {name: [text for table in tables for text in table.names[name]] for name in ("epc", "antenna")},
-        )
+    """All reads of several tables in the order of time, as of ``path``: readers report in batches, in any order."""
+    together = _together(path, tables)
+    return together.rows_at(np.argsort(together.t_ns, kind="stable"))
+
+
+def _together(path: Path, tables: Sequence[TableRows]) -> TableRows:
+    return TableRows(
+        path,
+        np.concatenate([table.rows for table in tables]),
+        np.concatenate([table.t_ns for table in tables]),
+        {name: np.concatenate([table.numbers[name] for table in tables]) for name in SIGNALS},
+        {name: [text for table in tables for text in table.names[name]] for name in ("epc", "antenna")},
     )
 
 
@@ -164,7 +168,7 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
         {"epc": _epcs(mapped, options.epc_case), "antenna": [options.antennas.get(str(a), str(a)) for a in antennas]},
     )
     check_reads(table)
-    return _in_time(_with_last(table, mapped, options, warnings))
+    return joined(path, [_with_last(table, mapped, options, warnings)])
 
 
 def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> TableRows:
@@ -221,28 +225,6 @@ def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: li
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
             warnings.append(f"{table.path}: {more} reads between the first and the last of their row are left out")
-    return _taken(table, np.concatenate((np.arange(len(last_ns)), np.flatnonzero(several))), last_ns)
-
-
-def _taken(table: TableRows, order: Integers, last_ns: Integers) -> TableRows:
-    """The rows ``order`` (M,), the later ones of which are the last reads of rows that came before."""
-    repeated = np.arange(len(order)) >= len(table.rows)
-    return TableRows(
-        table.path,
-        table.rows[order],
-        np.where(repeated, last_ns[order], table.t_ns[order]),
-        {name: np.where(repeated, np.nan, values[order]) for name, values in table.numbers.items()},
-        {name: [texts[i] for i in order.tolist()] for name, texts in table.names.items()},
-    )
-
-
-def _in_time(table: TableRows) -> TableRows:
-    """In the order of time: readers report in batches, in any order."""
-    order = np.argsort(table.t_ns, kind="stable")
-    return TableRows(
-        table.path,
-        table.rows[order],
-        table.t_ns[order],
-        {name: values[order] for name, values in table.numbers.items()},
-        {name: [texts[i] for i in order.tolist()] for name, texts in table.names.items()},
-    )
+    repeated = table.rows_at(np.flatnonzero(several))
+    unknown = {name: np.full(len(repeated.rows), np.nan) for name in repeated.numbers}
+    return _together(table.path, (table, replace(repeated, t_ns=last_ns[several], numbers=unknown)))
