@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.maps.points import PointMap
     from factorgraph_loc.model.belief import PoseEstimate
     from factorgraph_loc.model.log import Log, StartPose
-    from factorgraph_loc.model.measurement import Exteroceptive, Measurement, Odometry, Tick
+    from factorgraph_loc.model.measurement import Measurement, Tick
     from factorgraph_loc.model.rig import Rig
     from factorgraph_loc.model.trajectory import Trajectory, read_tum, write_tum
     from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.landmarks.map import Landmark
     from factorgraph_loc.sensors.landmarks.measurement import BearingRange
     from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+    from factorgraph_loc.sensors.measurements import Exteroceptive, Odometry
     from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
     from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
     from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
@@ -144,7 +145,8 @@ _MODULES = {
     "maps.points": ("PointMap",),
     "model.belief": ("PoseEstimate",),
     "model.log": ("Log", "StartPose"),
-    "model.measurement": ("Exteroceptive", "Measurement", "Odometry", "Tick"),
+    "model.measurement": ("Measurement", "Tick"),
+    "sensors.measurements": ("Exteroceptive", "Odometry"),
     "model.rig": ("Rig",),
     "model.trajectory": ("Trajectory", "read_tum", "write_tum"),
     "model.trajectory3": ("Trajectory3",),

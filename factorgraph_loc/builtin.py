@@ -1,6 +1,6 @@
-"""The sensors, estimators and readers that this project brings itself, and where each stands."""
+"""The sensors, estimators, mappers and readers that this project brings itself, and where each stands."""
 
-from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, MAPPERS, READERS, SENSORS
 
 SENSORS.own.update(
     {
@@ -23,6 +23,7 @@ ESTIMATORS.own.update(
         "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
     }
 )
+MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own.update(
     {
         "native": "factorgraph_loc.io.native.native",

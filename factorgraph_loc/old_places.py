@@ -30,6 +30,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "factorgraph_loc.log": ("factorgraph_loc.model.log", *(f"{sensor}.stream" for sensor in _SENSORS)),
     "factorgraph_loc.measurements": (
         "factorgraph_loc.model.measurement",
+        "factorgraph_loc.sensors.measurements",
         *(f"{sensor}.measurement" for sensor in _SENSORS),
         "factorgraph_loc.vision.frame",
     ),

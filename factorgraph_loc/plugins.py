@@ -1,7 +1,7 @@
-"""Sensors, estimators and readers by name: ours, which :mod:`factorgraph_loc.builtin` lists, and those of other packages.
+"""Sensors, estimators, readers and mappers by name: ours, which :mod:`factorgraph_loc.builtin` lists, and those of other packages.
 
 Each is named by its place, and imported when it is first used. Another package adds its own by entry points of the groups
-``factorgraph_loc.sensors``, ``factorgraph_loc.estimators`` and ``factorgraph_loc.readers``.
+``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and ``factorgraph_loc.mappers``.
 """
 
 from __future__ import annotations
@@ -80,3 +80,4 @@ class Group(Mapping[str, Any]):
 SENSORS = Group("sensors", "channels", "settings", "layers")
 ESTIMATORS = Group("estimators", "process", "estimate")
 READERS = Group("readers", "Options", "read")
+MAPPERS = Group("mappers")

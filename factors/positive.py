@@ -83,6 +83,13 @@ def squared(errors: Array, covariances: Array) -> Array:
         return np.asarray(np.sum((_whitener(covariances) @ errors[..., None])[..., 0] ** 2, axis=-1))
 
 
+def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
+    """Draws (count, D) from a Gaussian of zero mean whose covariance (D, D) may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
+
+
 def _whitener(covariances: Array) -> Array:
     sigmas, values, vectors = _parts(covariances)
     return np.asarray(np.swapaxes(vectors / np.sqrt(values)[..., None, :], -1, -2) / sigmas[..., None, :])

@@ -20,6 +20,7 @@ from factors.se2 import Array
 
 CONVERGED = 1e-6  # of an iterated update, m and rad
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
+GATES = {1: 6.63, 2: GATE, 3: 11.34}  # with others
 
 
 class Sightings(Protocol):
@@ -27,7 +28,7 @@ class Sightings(Protocol):
     :class:`~factors.camera.factor.ReprojectionFactor`."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2) and its Jacobian (K, 2, d) by each value."""
+        """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""
@@ -37,20 +38,27 @@ class Sightings(Protocol):
 
 
 @dataclass(frozen=True)
-class Update:
-    """What a Kalman update gives: ``delta`` (S,) of the error state, its ``covariance`` (S, S) afterwards, and at the prediction
-    the whitened ``residual`` (K, 2), predicted less measured, and its normalised square (``nis``) with degrees of freedom."""
+class Correction:
+    """What an observation makes of a Gaussian: ``delta`` (S,) of the error state, and its ``covariance`` (S, S) afterwards.
+
+    At the prediction: the whitened ``residual`` (K, g), predicted less measured, and its normalised square (``nis``) with degrees
+    of freedom. Of a likelihood that is no residual: how much larger its negative logarithm was than expected (``excess_nll``), the
+    ``variance`` of that, and the ``evidence``, the log of its probability by Laplace's method.
+    """
 
     delta: Array
     covariance: Array
     residual: Array
     nis: float
     dof: int
+    excess_nll: float = 0.0
+    variance: float = 0.0
+    evidence: float = 0.0
 
 
 def robust_update(
     factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
-) -> Update:
+) -> Correction:
     """Kalman update of ``pose`` (3,) and further states by a factor on the pose alone; see :func:`update_state`.
 
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
@@ -58,7 +66,9 @@ def robust_update(
     if isinstance(factor, ReprojectionFactor) and factor.of_pose_alone:
         arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         try:
-            found = Update(*pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof())
+            found = Correction(
+                *pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof()
+            )
             _require_sound(found.delta, found.covariance)
         except np.linalg.LinAlgError:
             return linearized_update(factor, pose, covariance, iterations, converged)
@@ -68,7 +78,7 @@ def robust_update(
 
 def linearized_update(
     factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
-) -> Update:
+) -> Correction:
     """:func:`robust_update` by a factor of any kind."""
 
     def linearize(delta: Array) -> tuple[Array, Array]:
@@ -85,10 +95,10 @@ def update_state(
     iterations: int,
     dof: int,
     converged: float = CONVERGED,
-) -> Update:
+) -> Correction:
     """Kalman update, robust and iterated, in information form; by square roots where that has not the digits for it.
 
-    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, 2) and Jacobian (K, 2, D) by the
+    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, g) and Jacobian (K, g, D) by the
     first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the weight (K,) of squared
     residuals (K,), robust and tempered: that of zero is the tempering, which the innovation is free of. At first a sighting
     whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that it
@@ -104,7 +114,7 @@ def update_state(
     return found
 
 
-# Correction (S,) and covariance (S, S) from a Jacobian (K, 2, D) and residuals (K, 2), their weights (K,), and the correction (D,)
+# Correction (S,) and covariance (S, S) from a Jacobian (K, g, D) and residuals (K, g), their weights (K,), and the correction (D,)
 # at which they are linearised.
 _Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
@@ -117,11 +127,11 @@ def _iterated(
     iterations: int,
     dof: int,
     converged: float,
-) -> Update:
+) -> Correction:
     zero = np.zeros(len(covariance))
     residual, blocks = linearize(zero)
     size = blocks.shape[2]
-    widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATE)
+    widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATES[blocks.shape[1]])
     delta, updated = solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
@@ -137,7 +147,7 @@ def _iterated(
         residual, blocks = linearize(delta)
         weights = weight(np.einsum("ki,ki->k", residual, residual))
         delta, updated = solve(blocks, residual, weights, delta[:size])
-    return Update(delta, (updated + updated.T) / 2.0, first, nis, dof)
+    return Correction(delta, (updated + updated.T) / 2.0, first, nis, dof)
 
 
 def _informed(prior: Array) -> _Solver:
@@ -146,7 +156,7 @@ def _informed(prior: Array) -> _Solver:
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size = len(at)
         jacobian = blocks.reshape(-1, size)
-        weighted = jacobian.T * np.repeat(weight, 2)
+        weighted = jacobian.T * np.repeat(weight, blocks.shape[1])
         information = prior.copy()
         information[:size, :size] += weighted @ jacobian
         updated = np.asarray(np.linalg.inv(information), dtype=float)
@@ -159,7 +169,7 @@ def _rooted(root: Array) -> _Solver:
     """By the lower ``root`` (S, S) of the covariance before: what comes out is positive however far the numbers are apart."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
-        size, scale = len(at), np.sqrt(np.repeat(weight, 2))
+        size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))
         jacobian = scale[:, None] * blocks.reshape(-1, size)
         upper = np.asarray(
             np.linalg.qr(np.concatenate((jacobian @ root[:size], np.eye(len(root)))), mode="r"), dtype=float
@@ -179,8 +189,10 @@ def _require_sound(delta: Array, covariance: Array) -> None:
 
 
 def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of each landmark by itself."""
+    """Normalised innovation squared (K,) of each sighting by itself."""
     s = blocks @ covariance @ blocks.transpose(0, 2, 1)
+    if s.shape[1] != 2:
+        return np.asarray(positive.squared(residual, np.eye(s.shape[1]) + s))
     a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
     x, y = residual[:, 0], residual[:, 1]
     # rounding may take all of the difference, which is never less than that

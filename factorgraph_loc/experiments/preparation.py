@@ -62,7 +62,7 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel) -> Use:
     """What the sensors' packages are told of a run."""
     kind = registry.estimator_type(estimator)
-    modalities = frozenset(getattr(kind, "modalities", ()))
+    modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
 
 

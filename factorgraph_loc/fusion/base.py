@@ -1,5 +1,6 @@
 """The interface that all estimators share, and what they report."""
 
+from collections.abc import Container
 from typing import Protocol, runtime_checkable
 
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
@@ -8,6 +9,16 @@ from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
+
+
+class _Every:
+    """Contains every modality."""
+
+    def __contains__(self, modality: object) -> bool:
+        return True
+
+
+EVERY: Container[str] = _Every()  # modalities of an estimator that takes whatever sensor there is
 
 
 class Estimator(Protocol):

@@ -26,15 +26,13 @@ CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is lo
 class Cloud:
     """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
 
-    ``localized``: the place is known. ``slow`` and ``fast``: averages of the likelihood over many and over few stamps.
+    ``localized``: the place is known.
     """
 
     poses: Array
     constants: Array
     log_weights: Array
     localized: bool = True
-    slow: float = 0.0
-    fast: float = 0.0
 
     @property
     def weights(self) -> Array:
@@ -77,7 +75,7 @@ class Cloud:
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
         """Particles of equal weight: those of ``rows`` (M,), each with a draw from a ``kernel`` (3+P, 3+P)."""
-        noise = gaussian(kernel, len(rows), rng)
+        noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
             poses=se2.compose(self.poses[rows], se2.exp(noise[:, :3])),
@@ -167,13 +165,6 @@ def silverman(count: int, size: int) -> float:
     """Bandwidth, as a share of the standard deviation, of Gaussian kernels on ``count`` points in ``size`` dimensions
     (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
-
-
-def gaussian(covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draws (count, D) from a Gaussian whose covariance (D, D) may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
 
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:

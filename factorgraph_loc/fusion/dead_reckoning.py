@@ -8,8 +8,8 @@ import numpy as np
 
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factors import se2
 from factors.motion import Increment, propagate
 from factors.se2 import Array
@@ -32,8 +32,9 @@ class _Record:
 
 
 class DeadReckoning(Filter):
-    """Composes the odometry, with the covariance that grows on the way; landmarks are counted as ignored."""
+    """Composes the odometry, with the covariance that grows on the way; all else is counted as ignored."""
 
+    modalities = frozenset[str]()
     _state: _State
 
     def trajectory(self) -> Trajectory:
@@ -53,8 +54,8 @@ class DeadReckoning(Filter):
         s = self._state
         self._state = _State(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
 
-    def _update(self, m: BearingRange) -> None:
-        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+    def _see(self, m: Measurement) -> None:
+        raise AssertionError("dead reckoning has no sensor but odometry")
 
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance)

@@ -1,14 +1,15 @@
 """Extended Kalman filter on SE(2), with Rauch-Tung-Striebel smoothing for its final trajectory.
 
-The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by the constants of
-odometry and sensors that are estimated, and by the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990). A
-measurement whose innovation is too large has its noise widened instead of being dropped, so that the filter cannot lock itself out.
+The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by named blocks: the
+constants of odometry and sensors that are estimated, and the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990).
+One correction serves all sensors. A residual whose innovation is too large has its noise widened instead of being dropped, so that
+the filter cannot lock itself out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -16,39 +17,30 @@ from pydantic import Field
 from scipy.linalg.lapack import dpotrf
 
 from factorgraph_loc.fusion.heading_search import HeadingSearch
-from factorgraph_loc.fusion.known_position import KnownPosition
+from factorgraph_loc.fusion.layout import POSE, Layout
+from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
-from factorgraph_loc.model.measurement import Exteroceptive, Tick
-from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.variable import NOTHING
-from factorgraph_loc.sensors.camera.finder import MISSED, PixelFinder
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, KnownPoints, Predicted
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.pending import NewLandmarks
-from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
-from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.sensors.base import NewVariable
+from factorgraph_loc.sensors.binding import bound_sensors
 from factors import positive, se2
-from factors.camera.factor import ReprojectionFactor
-from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import TIME_OFFSET
 from factors.motion import Increment
-from factors.odometry.model import PARAMETERS, recalibrated
 from factors.se2 import Array
-from factors.update import update_state
 
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
+MOTION = "odometry"  # the block of its constants
 
 
 class EkfSettings(FilterSettings):
-    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993). Pixels, which are
-    sharp, have as many as they need.
+    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993). Sensors that need
+    more, as pixels and tags do, have as many as they need.
 
-    ``self_calibration``: constants to which the rig gives an uncertainty are states. ``landmarks``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
+    ``self_calibration``: constants to which the rig gives an uncertainty are states. ``landmarks``: ``known`` takes the map as it
+    is and ignores others, ``extended`` estimates the others, ``unknown`` estimates all, as if there were no map.
     """
 
     iterations: Annotated[int, Field(ge=1, le=20)] = 1
@@ -58,24 +50,31 @@ class EkfSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _State:
-    """``pose`` (3,); ``rest`` (R,): constants, then ``landmarks``; ``covariance`` (3+R, 3+R) of the error state.
-
-    ``waiting``: landmarks that are not in the state yet.
-    """
+    """``pose`` (3,); ``rest`` (R,): the blocks of the ``layout``; ``covariance`` (3+R, 3+R) of the error state."""
 
     pose: Array
     rest: Array
     covariance: Array
-    landmarks: tuple[str, ...] = ()
-    waiting: NewLandmarks[bool] = field(default_factory=NewLandmarks)
+    layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        pose = se2.compose(self.pose, se2.exp(delta[:3]))
-        return replace(self, pose=pose, rest=self.rest + delta[3:], covariance=covariance)
+        pose = se2.compose(self.pose, se2.exp(delta[:POSE]))
+        return replace(self, pose=pose, rest=self.rest + delta[POSE:], covariance=covariance)
 
     def first(self, size: int) -> _State:
-        """The first ``size`` components of the error state: without landmarks that were met later."""
-        return _State(self.pose, self.rest[: size - 3], self.covariance[:size, :size])
+        """The first ``size`` components of the error state: without blocks that came later."""
+        return replace(self, rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
+
+    def with_block(self, new: NewVariable) -> _State:
+        """The state with one more block."""
+        size, columns = len(self.covariance), self.layout.columns
+        carried, spread = new.joint(self.covariance, columns)
+        end = size + len(new.mean)
+        covariance = np.empty((end, end))
+        covariance[:size, :size] = self.covariance
+        covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = carried, carried.T, spread
+        rest = np.concatenate((self.rest, new.mean))
+        return _State(self.pose, rest, covariance, self.layout.plus(new.name, len(new.mean)))
 
 
 @dataclass(frozen=True)
@@ -103,71 +102,101 @@ class _Record:
     updated: _State
 
 
+class _View:
+    """What sensors see of the filter, at its time."""
+
+    offset = None
+    newest = True
+    localized = True
+
+    def __init__(self, ekf: Ekf) -> None:
+        self._ekf, self.t = ekf, ekf._t
+
+    @property
+    def pose(self) -> Array:
+        return self._ekf._state.pose
+
+    @property
+    def covariance(self) -> Array:
+        return self._ekf._state.covariance[:POSE, :POSE]
+
+    def value(self, name: str) -> Array | None:
+        return self._ekf._state.layout.values(self._ekf._state.rest).get(name)
+
+    def spread(self, name: str) -> Array:
+        part = self._ekf._state.layout.columns[name]
+        return self._ekf._state.covariance[part, part]
+
+    def joint(self) -> tuple[Array, Mapping[str, slice]]:
+        return self._ekf._state.covariance, self._ekf._state.layout.columns
+
+    def poses_at(self, times: Array) -> Array:
+        return self._ekf._poses_at(times)
+
+
 class Ekf(Filter):
     """The EKF; see the module."""
 
-    modalities = frozenset({"bearing_range", "camera"})
     _state: _State
 
     def __init__(self, setup: Setup, settings: EkfSettings) -> None:
         super().__init__(setup, settings)
         self._iterations = settings.iterations
-        self._odometry_constants = setup.rig.estimated("odometry") if settings.self_calibration else NOTHING
-        self._sensor_constants = setup.rig.estimated("bearing_range") if settings.self_calibration else NOTHING
-        self._landmarks = KnownLandmarks(setup, self.diagnostics, settings.landmarks, self._sensor_constants.indices)
-        self._camera_constants = setup.rig.estimated("camera") if settings.self_calibration else NOTHING
-        self._points = KnownPoints(setup, self.diagnostics, self._camera_constants, motion=self._motion)
-        self._finder = PixelFinder(self._points, self._motion)
-        self.supports_unknown_start = self._points.known
-        self.supports_unknown_heading = self._points.known or self._landmarks.known
-        self._setup = setup
-        self._search: HeadingSearch | None = None
-        # where the constants lie in the state's rest, and where the landmarks begin
-        middle = len(self._odometry_constants.names)
-        end = middle + len(self._sensor_constants.names)
-        self._first_landmark = end + len(self._camera_constants.names)
-        self._odometry_part, self._sensor_part = slice(0, middle), slice(middle, end)
-        self._camera_part = slice(end, self._first_landmark)
+        calibration: Calibration = "all" if settings.self_calibration else "none"
+        self._sensors = bound_sensors(
+            setup, self._motion, self.diagnostics, use=settings.landmarks, calibration=calibration
+        )
+        self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
+        finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
+        at_once = {name: sensor for name, sensor in finders.items() if sensor.finder and sensor.finder.at_once}
+        self._search = Search(at_once, self._motion, setup.rng)  # a Gaussian can be put where one measurement tells it
+        self._headings = Search(finders, self._motion, setup.rng)
+        self.supports_unknown_start = self._search.possible
+        self.supports_unknown_heading = self._headings.possible
+        self._heading: HeadingSearch | None = None
         self._step: _Step | None = None
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian; without a heading, once what is seen tells it."""
-        self._search = None
+        self._heading = None
         if prior.has_heading:
             super().initialize(prior)
             return
         self._wait(prior.t)
-        start = KnownPosition(prior, self._motion)
-        self._search = HeadingSearch(self._setup, self._motion, start, self._finder)
+        self._heading = HeadingSearch(self._headings, self._motion, prior)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; ``ambiguous`` while its heading is
-        sought."""
-        if self._search is None:
-            return super().estimate(t)
-        at = self._t if t is None else max(t, self._t)
-        likeliest = self._search.belief(at).modes[0]
-        return PoseEstimate(at, likeliest.pose, likeliest.covariance, "ambiguous")
+        sought, and while a sensor is silent where it should not be."""
+        if self._heading is not None:
+            at = self._t if t is None else max(t, self._t)
+            likeliest = self._heading.belief(at).modes[0]
+            return PoseEstimate(at, likeliest.pose, likeliest.covariance, "ambiguous")
+        return super().estimate(t)
 
     def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; of all headings while that is sought."""
-        if self._search is None:
+        if self._heading is None:
             return super().belief(t)
-        return self._search.belief(self._t if t is None else max(t, self._t))
+        return self._heading.belief(self._t if t is None else max(t, self._t))
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
         if self._state is None:
             return Learnt()
-        rest, covariance = self._state.rest, self._state.covariance[3:, 3:]
-        sigmas = np.sqrt(np.diag(covariance))
-        names = [*self._odometry_constants.names, *(f"bearing_range.{name}" for name in self._sensor_constants.names)]
-        names += [f"camera.{name}" for name in self._camera_constants.names]
-        points = {}
-        for number, name in enumerate(self._state.landmarks):
-            part = self._landmark_part(number)
-            points[name] = LearntPoint(rest[part], covariance[part, part])
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, rest, sigmas, strict=False)}, points)
+        values, points = {}, {}
+        found, s = self._state.layout.values(self._state.rest), self._state
+        for name, constants in self._blocks:
+            if constants.names:
+                part = s.layout.columns[name]
+                sigmas = np.sqrt(np.diag(s.covariance[part, part]))
+                prefix = "" if name == MOTION else f"{name}."
+                for label, value, sigma in zip(constants.names, found.pop(name), sigmas, strict=True):
+                    values[prefix + label] = float(value), float(sigma)
+        for name, position in found.items():
+            part = s.layout.columns[name]
+            points[name.partition("/")[2]] = LearntPoint(position, s.covariance[part, part])
+        return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
@@ -203,179 +232,90 @@ class Ekf(Filter):
         return here.plus(gain @ change, covariance)
 
     def _start(self, prior: PosePrior) -> _State:
-        constants = (self._odometry_constants, self._sensor_constants, self._camera_constants)
-        sigmas = np.concatenate([c.sigmas for c in constants])
-        covariance = np.diag(np.concatenate((np.zeros(3), sigmas**2)))
-        covariance[:3, :3] = se2.world_to_body(prior.pose, prior.covariance)
-        return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance)
+        sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
+        covariance = np.diag(np.concatenate((np.zeros(POSE), sigmas**2)))
+        covariance[:POSE, :POSE] = se2.world_to_body(prior.pose, prior.covariance)
+        layout = Layout.of((name, len(constants.names)) for name, constants in self._blocks)
+        return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, layout)
 
     def _predict(self, increment: Increment) -> None:
         s = self._state
         delta = increment.delta
-        transition = np.zeros((3, len(s.covariance)))
-        if self._odometry_constants.names:
-            changes = self._odometry_constants.full(s.rest[self._odometry_part], len(PARAMETERS))
-            delta, jacobian = recalibrated(increment, changes)
-            places = list(self._odometry_constants.indices)
-            transition[:, 3 : 3 + len(places)] = jacobian[:, places]
-        transition[:, :3] = se2.adjoint(se2.inverse(delta))
+        transition = np.zeros((POSE, len(s.covariance)))
+        part = s.layout.columns.get(MOTION)
+        if part is not None:
+            delta, transition[:, part] = self._motion.changed(increment, s.rest[part.start - POSE : part.stop - POSE])
+        transition[:, :POSE] = se2.adjoint(se2.inverse(delta))
         self._step = _Step(se2.compose(s.pose, delta), transition, increment.covariance)
         self._state = replace(s, pose=self._step.pose, covariance=self._step.covariance(s.covariance))
 
-    def _update(self, m: BearingRange) -> None:
+    def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()
-        twist = None
-        if TIME_OFFSET in self._sensor_constants.indices:
-            twist = self._motion.twist(m.t)
-        known = self._landmarks.factor(m, None, twist)
-        seen: list[tuple[BearingRangeFactor, slice | None]] = [] if known is None else [(known, None)]
-        met: list[tuple[str, BearingRangeFactor]] = []
-        for name, factor in self._landmarks.others(m, None, twist):
-            if name in self._state.landmarks:
-                seen.append((factor, self._landmark_part(self._state.landmarks.index(name))))
-            else:
-                met.append((name, factor))
-        if seen:
-            self._correct(m.t, seen)
-        for name, factor in met:
-            self._meet(name, factor)
-
-    def _look(self, m: PixelSightings | CameraFrame) -> None:
-        self._step = self._step or self._standstill()
-        prior, part = self._state, self._camera_part
-        twist = self._motion.twist(m.t) if self._points.needs_twist else None
-        predicted = Predicted(prior.pose, prior.covariance[:3, :3])
-        size = 3
-        if self._camera_constants.names:
-            size = 3 + part.stop
-            spread = prior.covariance[3 + part.start : size, 3 + part.start : size]
-            predicted = replace(predicted, constants=prior.rest[part], spread=spread)
-        factor = self._points.factor(m, predicted, None, twist)
-        if factor is not None:
-            self._correct_by_pixels(m.t, factor, size)
-        since = self._finder.refuted_since(m, self._odometry, self._state.pose)
-        found = self._finder.best
-        if since is not None and found is not None:
-            self.diagnostics.events.append((m.t, f"lost: {MISSED} since {since:.1f} s; goes on at another place"))
+        sensor, view = self._sensors[m.modality], _View(self)
+        for seen in sensor.observe(m, view):
+            if isinstance(seen, NewVariable):
+                self._state = self._state.with_block(seen)
+                continue
+            s = self._state
+            correction = seen.correct(
+                s.pose, s.covariance, s.layout.values(s.rest), s.layout.columns, seen.iterations or self._iterations
+            )
+            if not seen.is_judged or sensor.judge(seen, correction, view):
+                self._state = s.plus(correction.delta, correction.covariance)
+        refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
+        found = self._search.best if refuted is not None else None
+        if refuted is not None and found is not None:
+            what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
+            self.diagnostics.events.append((m.t, what))
             self._jump(found)
 
-    def _begin(self, m: Exteroceptive | Tick) -> None:
-        if self._search is None:
+    def _pose_back(self, t: float, pose: Array) -> Array:
+        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
+        return se2.compose(pose, self._poses_at(np.array([t]))[0])
+
+    def _poses_at(self, times: Array) -> Array:
+        constants = self._state.layout.values(self._state.rest).get(MOTION, np.zeros(0))
+        return self._motion.poses_at(self._odometry, times, constants)
+
+    def _begin(self, m: Measurement) -> None:
+        if self._heading is None:
             super()._begin(m)
             return
-        self._search.start.settle()
-        if m.t < max(self._search.start.t, self._t - self._max_delay):
+        self._heading.start.settle()
+        if m.t < max(self._heading.start.t, self._t - self._max_delay):
             self._drop_late(m)
             return
         self._t = max(self._t, m.t)
-        found = self._search.take(m)
+        found = self._heading.take(m)
         if found is None:
             return
-        again = self._search.kept()
+        again = self._heading.kept()
         self.diagnostics.events.append((m.t, "localized"))
         self.initialize(found)
         for one in again:
             self._take(one)
 
-    def _seek(self, m: Exteroceptive) -> _State | None:
-        if not isinstance(m, PixelSightings | CameraFrame) or not self._finder.look(m, self._odometry):
-            return None
-        found = self._finder.best
+    def _seek(self, m: Measurement) -> _State | None:
+        found = self._search.best if self._search.look(m, self._odometry) else None
         if found is None:
             return None
-        self._finder.clear()
+        self._search.begin_track(found=True)
         self.diagnostics.events.append((m.t, "localized"))
         return self._start(found)
 
     def _jump(self, found: PosePrior) -> None:
         """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before."""
-        self._finder.clear()
+        self._search.begin_track(found=True)
         s, body = self._state, se2.world_to_body(found.pose, found.covariance)
         covariance = s.covariance.copy()
         covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
         self._state = replace(s, pose=np.array(found.pose), covariance=covariance)
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
-    def _correct_by_pixels(self, t: float, factor: ReprojectionFactor, size: int) -> None:
-        """Update pose and camera's constants, the first ``size`` components of the error state up to the last of them."""
-        prior, part = self._state, self._camera_part
-
-        def linearize(delta: Array) -> tuple[Array, Array]:
-            state = prior.plus(delta, prior.covariance)
-            values = [state.pose, state.rest[part]] if self._camera_constants.names else [state.pose]
-            residual, blocks = factor.whitened(values)
-            jacobian = np.zeros((len(residual), 2, size))
-            jacobian[..., :3] = blocks[0]
-            if self._camera_constants.names:
-                jacobian[..., 3 + part.start :] = blocks[1]
-            return residual, jacobian
-
-        update = update_state(linearize, prior.covariance, factor.weight, ITERATIONS, factor.dof(), SETTLED)
-        self._points.report(t, factor, update)
-        self._state = prior.plus(update.delta, update.covariance)
-
-    def _correct(self, t: float, seen: Sequence[tuple[BearingRangeFactor, slice | None]]) -> None:
-        prior = self._state
-        size = 3  # of the part of the state that the measurement depends on
-        if any(part is not None for _, part in seen):
-            size = len(prior.covariance)
-        elif self._sensor_constants.names:
-            size = 3 + self._sensor_part.stop
-
-        def linearize(delta: Array) -> tuple[Array, Array]:
-            state = prior.plus(delta, prior.covariance)
-            parts = []
-            for factor, part in seen:
-                residual, blocks = factor.whitened(self._values(state, part))
-                jacobian = np.zeros((len(residual), 2, size))
-                jacobian[..., :3] = blocks[0]
-                if self._sensor_constants.names:
-                    jacobian[..., 3 + self._sensor_part.start : 3 + self._sensor_part.stop] = blocks[1]
-                if part is not None:
-                    jacobian[..., 3 + part.start : 3 + part.stop] = blocks[-1]
-                parts.append((residual, jacobian))
-            return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])
-
-        measured = together([factor for factor, _ in seen])
-        update = update_state(linearize, prior.covariance, measured.weight, self._iterations, measured.dof())
-        self._landmarks.report(t, measured, update)
-        self._state = prior.plus(update.delta, update.covariance)
-
-    def _meet(self, name: str, factor: BearingRangeFactor) -> None:
-        """A landmark that is not in the state: it comes in when an earlier sighting agrees, at where it is seen now."""
-        s = self._state
-        size = len(s.covariance)
-        point, blocks, noise = factor.locate(self._values(s, None))
-        jacobian = np.zeros((2, size))
-        jacobian[:, :3] = blocks[0]
-        if self._sensor_constants.names:
-            jacobian[:, 3 + self._sensor_part.start : 3 + self._sensor_part.stop] = blocks[1]
-        carried = jacobian @ s.covariance
-        spread = carried @ jacobian.T + noise
-        waiting, earlier = s.waiting.propose(name, point, spread, True)
-        if earlier is None:
-            self._state = replace(s, waiting=waiting)
-            return
-        covariance = np.empty((size + 2, size + 2))
-        covariance[:size, :size] = s.covariance
-        covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = carried, carried.T, spread
-        self._state = _State(s.pose, np.concatenate((s.rest, point)), covariance, (*s.landmarks, name), waiting)
-
-    def _values(self, state: _State, landmark: slice | None) -> list[Array]:
-        """The values of a factor."""
-        values = [state.pose]
-        if self._sensor_constants.names:
-            values.append(state.rest[self._sensor_part])
-        if landmark is not None:
-            values.append(state.rest[landmark])
-        return values
-
-    def _landmark_part(self, number: int) -> slice:
-        start = self._first_landmark + 2 * number
-        return slice(start, start + 2)
-
     def _estimate(self) -> PoseEstimate:
-        return world_estimate(self._t, self._state.pose, self._state.covariance[:3, :3])
+        estimate = world_estimate(self._t, self._state.pose, self._state.covariance[:POSE, :POSE])
+        silent = any(sensor.silent for sensor in self._sensors.values())
+        return replace(estimate, status="ambiguous") if silent else estimate
 
     def _record(self) -> _Record:
         step, self._step = self._step or self._standstill(), None

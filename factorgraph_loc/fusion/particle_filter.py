@@ -6,17 +6,15 @@ Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapte
 adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their stated spread is a
 little too small where landmarks tell next to nothing of them: resampling moves their mean at random.
 
-Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what landmarks tell of it
-(:mod:`~factorgraph_loc.fusion.landmark_tracker`), or where no landmarks are used from what scans of RFID tags tell
-(:mod:`~factorgraph_loc.sensors.rfid.tracker`). A camera tells it by itself (:mod:`~factorgraph_loc.sensors.camera.tracker`).
-A start with an unknown heading is such a place: particles there face anywhere.
+Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what the search among all that is
+seen tells of it (:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is such a place.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -25,30 +23,23 @@ from pydantic import Field
 
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
-from factorgraph_loc.fusion.known_position import KnownPosition
-from factorgraph_loc.fusion.landmark_tracker import LandmarkTracker
+from factorgraph_loc.fusion.layout import POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
+from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.learnt import Learnt
-from factorgraph_loc.model.measurement import Exteroceptive, Tick
-from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.variable import NOTHING, Estimated
-from factorgraph_loc.sensors.camera.finder import MISSED
-from factorgraph_loc.sensors.camera.sensor import Pixels
-from factorgraph_loc.sensors.camera.tracker import PixelTracker
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import Silence
-from factorgraph_loc.sensors.rfid.tracker import ScanTracker
+from factorgraph_loc.sensors.base import NewVariable, Observation
+from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
-from factors.landmarks import model as bearing_range
-from factors.landmarks.model import TIME_OFFSET
 from factors.motion import Increment
-from factors.odometry import model as odometry
-from factors.odometry.model import recalibrated
 from factors.se2 import Array
+
+MOTION = "odometry"  # the block of its constants
 
 
 class ParticleFilterSettings(FilterSettings):
@@ -68,12 +59,53 @@ class ParticleFilterSettings(FilterSettings):
     self_calibration: bool = True
 
 
+class _View:
+    """What sensors see of the filter, at its time."""
+
+    offset = None
+    newest = True
+
+    def __init__(self, owner: ParticleFilter) -> None:
+        self._filter, self.t = owner, owner._t
+
+    @property
+    def localized(self) -> bool:
+        return self._filter._state.localized
+
+    @property
+    def pose(self) -> Array:
+        return self._filter._state.moments[0]
+
+    @property
+    def covariance(self) -> Array:
+        return se2.world_to_body(*self._filter._state.moments)
+
+    def value(self, name: str) -> Array | None:
+        cloud, part = self._filter._state, self._filter._parts.get(name)
+        return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
+
+    def spread(self, name: str) -> Array:
+        cloud, part = self._filter._state, self._filter._parts[name]
+        return vector_moments(cloud.constants[:, part], cloud.weights)[1]
+
+    def joint(self) -> tuple[Array, Mapping[str, slice]]:
+        return self.covariance, {}
+
+    def poses_at(self, times: Array) -> Array:
+        constants = self.value(MOTION)
+        owner = self._filter
+        return owner._motion.poses_at(owner._odometry, times, np.zeros(0) if constants is None else constants)
+
+    def values(self, names: Sequence[str]) -> dict[str, Array]:
+        """The means of blocks that travel with the particles."""
+        return {name: value for name in names if (value := self.value(name)) is not None}
+
+
 class ParticleFilter(Filter):
     """The particle filter; see the module."""
 
     deterministic = False
     supports_unknown_start = True
-    modalities = frozenset({"bearing_range", "rfid", "camera"})
     _state: Cloud
     _rng: np.random.Generator
 
@@ -83,18 +115,15 @@ class ParticleFilter(Filter):
         self._rng = setup.rng
         # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time
         (self._smoothing_rng,) = setup.rng.spawn(1)
-        self._odometry_constants = self._sensor_constants = NOTHING
-        sensor = setup.rig.bearing_range
-        if settings.self_calibration:
-            self._odometry_constants = setup.rig.estimated("odometry")
-            self._sensor_constants = Estimated.of(bearing_range.PARAMETERS[:TIME_OFFSET], sensor and sensor.uncertainty)
-        middle = len(self._odometry_constants.names)
-        self._odometry_part = slice(0, middle)  # where they lie in the constants of the particles
-        self._landmarks = LandmarkTracker(setup, self._motion, self.diagnostics, self._sensor_constants, first=middle)
-        self._scans = ScanTracker(setup, self._motion, self.diagnostics, finds=not self._landmarks.known)
-        self._pixels = PixelTracker(setup, self._motion, self.diagnostics)
+        calibration: Calibration = "particles" if settings.self_calibration else "none"
+        self._sensors = bound_sensors(setup, self._motion, self.diagnostics, calibration=calibration)
+        self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
+        columns = Layout.of((name, len(constants.names)) for name, constants in self._blocks).columns
+        # where they lie in the constants of the particles
+        self._parts = {name: slice(part.start - POSE, part.stop - POSE) for name, part in columns.items()}
+        self._search = Search(self._sensors, self._motion, setup.rng)
+        self._search.remember()
         self._lost = False
-        self._from: KnownPosition | None = None
 
     def belief(self, t: float | None = None) -> Belief:
         """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
@@ -110,7 +139,11 @@ class ParticleFilter(Filter):
             return Learnt()
         mean, covariance = vector_moments(self._state.constants, self._state.weights)
         sigmas = np.sqrt(np.diag(covariance))
-        names = [*self._odometry_constants.names, *(f"bearing_range.{name}" for name in self._sensor_constants.names)]
+        names = [
+            label if block == MOTION else f"{block}.{label}"
+            for block, constants in self._blocks
+            for label in constants.names
+        ]
         return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, mean, sigmas, strict=True)})
 
     def trajectory(self) -> Trajectory:
@@ -138,49 +171,38 @@ class ParticleFilter(Filter):
         super().forget(max(clouds, default=-math.inf) if self._smooth else before)
 
     def _start(self, prior: PosePrior) -> Cloud:
-        if not prior.has_heading:
-            start = KnownPosition(prior, self._motion)
-            self._seek_from(start)
-            poses = start.drawn(self._rng, self._settings.particles, self._odometry)
-            return replace(self._cloud(poses), localized=False)
-        self._scans.start(found=False)
-        return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
+        if prior.has_heading:
+            self._search.begin_track(found=False)
+            return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
+        start = KnownPosition(prior, self._motion)
+        self._search.begin(start)
+        poses = start.drawn(self._rng, self._settings.particles, self._odometry)
+        return replace(self._cloud(poses), localized=False)
 
-    def _take(self, m: Exteroceptive | Tick) -> None:
-        if self._from is not None:
-            self._from.settle()
+    def _take(self, m: Measurement) -> None:
+        if self._search.start is not None:
+            self._search.start.settle()
         super()._take(m)
 
-    def _seek_from(self, start: KnownPosition | None) -> None:
-        """Tell the searches what is known of the start, as long as its heading is sought."""
-        self._from = start
-        for part in (self._landmarks, self._scans, self._pixels):
-            part.seek_from(start)
+    def _seek(self, m: Measurement) -> Cloud | None:
+        return self._found(self._t) if self._search.look(m, self._odometry) else None
 
-    def _seek(self, m: Exteroceptive) -> Cloud | None:
-        if isinstance(m, RfidScan):
-            return self._sought() if self._scans.seek(m, self._odometry) else None
-        if isinstance(m, Pixels):
-            if not self._pixels.seek(m, self._odometry):
-                return None
-            poses, clear = self._pixels.sought(self._settings.particles)
-            return replace(self._cloud(poses), localized=clear)
-        seen = self._landmarks.factor(m)
-        if seen is None:
-            return None
-        self._landmarks.seek(seen, self._odometry)
-        return replace(self._cloud(self._landmarks.sample(self._settings.particles)), localized=False)
-
-    def _sought(self) -> Cloud:
-        """Particles drawn from what scans alone tell."""
-        poses, clear = self._scans.sought(self._settings.particles)
-        return replace(self._cloud(poses), localized=clear)
+    def _found(self, since: float) -> Cloud:
+        """Particles drawn from what the search tells; once that is one place a track begins, with what was seen ``since`` then."""
+        poses = self._search.sample(self._rng, self._settings.particles)
+        if self._search.best is None:
+            return replace(self._cloud(poses), localized=False)
+        self._search.begin_track(found=True)
+        for sensor in self._sensors.values():
+            sensor.restart(since)
+        self.diagnostics.event(self._t, "recovered" if self._lost else "localized")
+        return self._cloud(poses)
 
     def _cloud(self, poses: Array) -> Cloud:
         """Particles at poses (N, 3), whose constants are those of the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
-        sigmas = np.concatenate((self._odometry_constants.sigmas, self._sensor_constants.sigmas))
+        sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
         return Cloud(poses, self._rng.standard_normal((count, len(sigmas))) * sigmas, np.full(count, -np.log(count)))
 
     def _predict(self, increment: Increment) -> None:
@@ -196,108 +218,56 @@ class ParticleFilter(Filter):
         """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
-        if self._odometry_constants.names:
-            values = cloud.constants[:, self._odometry_part]
+        part = self._parts.get(MOTION)
+        if part is not None:
+            values = cloud.constants[:, part]
             mean = cloud.weights @ values
-            delta, jacobian = recalibrated(increment, self._odometry_constants.full(mean, len(odometry.PARAMETERS)))
-            by_constants[:, self._odometry_part] = jacobian[:, list(self._odometry_constants.indices)]
-            changed = (values - mean) @ by_constants[:, self._odometry_part].T
+            delta, by_constants[:, part] = self._motion.changed(increment, mean)
+            changed = (values - mean) @ by_constants[:, part].T
             noise = changed if noise is None else noise + changed
         poses = se2.compose(cloud.poses, delta)
         if noise is not None:
             poses = se2.compose(poses, se2.exp(noise))
         return poses, np.concatenate((se2.adjoint(se2.inverse(delta)), by_constants), axis=1)
 
-    def _update(self, m: BearingRange) -> None:
-        seen = self._landmarks.factor(m)
-        if seen is None:
-            return
-        since = self._landmarks.refuted_since(m.t, seen, self._odometry, self._state)
-        if since is not None:
-            self._lost = True
-            self._state = replace(self._state, localized=False)
-            self._event(f"lost: landmarks are not where they were expected since {since:.1f} s")
-        self._state = self._landmarks.averaged(seen, self._state)
-        self._weigh(lambda cloud: self._landmarks.log_likelihood(seen, cloud))
-        if not self._state.localized and not self._scans.finds:
-            self._landmarks.search()
-            self._resample()
-            self._state = self._landmarks.injected(self._state)
-            if self._landmarks.settled(self._state):
-                self._state = replace(self._state, localized=True)
-                self._seek_from(None)
-                self._event("recovered" if self._lost else "localized")
-
-    def _look(self, m: Pixels) -> None:
+    def _see(self, m: Measurement) -> None:
         if not self._state.localized:
-            if self._pixels.seek(m, self._odometry):
-                self._go_on_seen("localized")
+            if self._search.look(m, self._odometry):
+                self._state = self._found(self._t)
             return
-        seen = self._pixels.factor(m, self._state)
-        if seen is not None:
-            self._weigh(lambda cloud: self._pixels.log_likelihood(seen, cloud))
-        since = self._pixels.refuted_since(m, self._odometry, self._state)
-        if since is not None:
-            self._records = [r.lost() if r.t >= since else r for r in self._records]
-            self._event(f"lost: {MISSED} since {since:.1f} s")
-            self._go_on_seen("recovered")
-
-    def _go_on_seen(self, what: str) -> None:
-        """Go on where a frame leads to; ``what`` that is, if it is one place."""
-        poses, clear = self._pixels.sought(self._settings.particles)
-        if clear or not self._scans.finds:
-            self._state = replace(self._cloud(poses), localized=clear)
-        if clear:
-            self._seek_from(None)
-            self._scans.start(found=True)
-            self._event(what)
-
-    def _scan(self, m: RfidScan) -> None:
-        if not self._state.localized and self._scans.finds:
-            if self._scans.seek(m, self._odometry):
-                self._go_on_found("localized")
-            return
-        silent = self._scans.silent
-        taken = self._scans.track(m, self._odometry, self._state, self._weigh)
-        if self._scans.silent and not silent:
-            self._event(Silence.EVENT)
-        if not taken:
-            return
-        if self._state.localized:
-            self._scans.take_phases(m, self._state, self._places, self._weigh)
-        since = self._scans.refuted_since(self._state, self._places)
-        if since is not None:
+        sensor, view = self._sensors[m.modality], _View(self)
+        for seen in sensor.observe(m, view):
+            if isinstance(seen, NewVariable):
+                continue
+            if seen.is_judged:
+                here = seen.on_pose(view.values(seen.blocks), {})
+                correction = here.correct(view.pose, view.covariance, {}, {}, 1)
+                if not sensor.judge(here, correction, view):
+                    continue
+                self._search.expect(sensor, here, self._odometry, view)
+            evidence = self._weigh(seen)
+            self._search.keep(sensor, seen, self._odometry, evidence)
+        refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
+        if refuted is not None:
             # for the final trajectory: since then the track was elsewhere
-            self._records = [r.lost() if r.t >= since else r for r in self._records]
-            self._event(f"lost: tags were not read as they were expected since {since:.1f} s")
-            self._go_on_found("recovered")
+            self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
+            self.diagnostics.event(self._t, f"lost: {refuted.why} since {refuted.since:.1f} s")
+            self._lost = True
+            self._state = self._found(refuted.since)
 
-    def _go_on_found(self, what: str) -> None:
-        """Go on where scans alone lead to; ``what`` that is, once it is one place."""
-        self._state = self._sought()
-        if self._state.localized:
-            self._seek_from(None)
-            self._scans.start(found=True)
-            self._event(what)
+    def _pose_back(self, t: float, pose: Array) -> Array:
+        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
+        return se2.compose(pose, _View(self).poses_at(np.array([t]))[0])
 
-    def _went_back(self) -> None:
-        self._scans.go_back(self._t)
-
-    def _places(self, times: Array) -> Array:
-        """Where the robot was at these times (R,), in the frame of its pose, (R, 3)."""
-        if not self._odometry_constants.names:
-            return self._motion.places(self._odometry, times)
-        mean = self._state.weights @ self._state.constants[:, self._odometry_part]
-        return self._motion.places(self._odometry, times, self._odometry_constants.full(mean, len(odometry.PARAMETERS)))
-
-    def _weigh(self, log_likelihood: Callable[[Cloud], Array]) -> float:
-        """Weigh the particles by the likelihood, by a share of it at a time if it leaves too few effective ones: they are resampled
-        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of its mean.
-        RunFailedError if it is not finite for any of them."""
+    def _weigh(self, observation: Observation) -> float:
+        """Weigh the particles by an observation, by a share of it at a time if it leaves too few effective ones: they are resampled
+        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of the mean of its
+        likelihood. RunFailedError if that is not finite for any of them."""
         mean, left = 0.0, 1.0
         while True:
             cloud = self._state
-            likelihood = weighable(log_likelihood(cloud), cloud.log_weights, self._t)
+            values = {name: cloud.constants[:, self._parts[name]] for name in observation.blocks}
+            likelihood = weighable(observation.log_likelihood(cloud.poses, values), cloud.log_weights, self._t)
             share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
             weighed = cloud.log_weights + share * likelihood
             log_weights = normalised(weighed)
@@ -316,14 +286,9 @@ class ParticleFilter(Filter):
         cloud, kernel = self._state.density()
         self._state = cloud.drawn(chosen, kernel, self._rng)
 
-    def _event(self, what: str) -> None:
-        # a late measurement makes the filter go through the last ones again
-        if (self._t, what) not in self.diagnostics.events:
-            self.diagnostics.events.append((self._t, what))
-
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            status: Status = "ambiguous" if self._scans.doubts else "localized"
+            status: Status = "ambiguous" if self._search.doubts else "localized"
             return PoseEstimate(self._t, *self._state.moments, status)
         mode = self._state.modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")

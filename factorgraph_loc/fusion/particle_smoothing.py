@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.fusion.ancestors import draw_ancestors
-from factorgraph_loc.fusion.cloud import Cloud, gaussian, pose_moments, systematic
+from factorgraph_loc.fusion.cloud import Cloud, pose_moments, systematic
 from factors import positive, se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -104,7 +104,7 @@ class BackwardSimulation:
             (se2.log(se2.between(predicted[rows], after.poses)), after.constants - here.constants[rows]), axis=1
         )
         gain = positive.solve(covariance, carried).T
-        step = error @ gain.T + gaussian(kernel - gain @ carried, len(rows), self._rng)
+        step = error @ gain.T + positive.draws(kernel - gain @ carried, len(rows), self._rng)
         constants = here.constants[rows] + step[:, 3:]
         poses = se2.compose(here.poses[rows], se2.exp(step[:, :3]))
         jumped = np.sum(error[:, :3] * positive.solve(covariance[:3, :3], error[:, :3].T).T, axis=1) > BREAK

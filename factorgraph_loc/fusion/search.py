@@ -1,180 +1,266 @@
-"""Where the robot is, from scans of RFID tags alone: for an unknown start, and after being carried elsewhere.
+"""Where the robot is when no track tells it: an unknown start, a heading that is not known, a robot that was carried elsewhere.
 
-A particle filter over pose that begins anywhere: evenly over the map's bounds, or with any heading where the start's position
-is known. Each scan is weighed a share at a time, with resampling from a kernel density in between (progressive correction:
-Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4), so that few particles find
-narrow places. Their number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each
-resampling some are drawn anywhere once more,
-with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
+Sensors that tell a place by themselves have finders. Where one only says how likely a place is, as RFID does, particles that begin
+anywhere are weighed by what all sensors see (:mod:`.population`), so that their evidence adds up. On the way what was seen is kept
+with the track's own evidence; when the track comes under suspicion the same search begins among what was seen since then, and
+refutes the track if "somewhere else" has become so much likelier than it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
-from factorgraph_loc.fusion.known_position import KnownPosition
+from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.sensors.base import Observation, Sensor, View
+from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import positive, se2
 from factors.motion import ChainState
-from factors.rfid.detection import Looks, RfidLikelihood
 from factors.se2 import Array
+from factors.update import Correction
 
-DENSITY = 25.0  # particles per m^2 and rad at first
-FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
-GROWTH = 4  # times as many particles, at most, after a resampling
-RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
-FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anywhere at a resampling, and their weight together
-# Variance of the odometry, times this: the constants of the odometry, which are not estimated here, err as well.
-NOISE = 2.0
-
-# the weight of a clear place, within so many standard deviations of it, and how large those may be at most: m, rad
-CLEAR_WEIGHT, REACH = 0.99, 5.0
-WIDEST_POSITION, WIDEST_HEADING = 0.45, 0.3
-CLEAR_SCANS, CLEAR_TAGS = 3, 2  # scans with reads, and different tags in them
-WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CLEAR_WEIGHT may be anywhere
-# s that a place must have been clear, where its standard deviations are at most this share of the largest, and where not
-NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
+DURATION = 60.0  # s of observations that are kept
+REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
+BEFORE = 2.0  # s before a suspicion in which a change may lie
+APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
-class Seeker:
-    """Places where the robot may be; see the module. ``bounds`` (2, 2): lower and upper corner [m] of where it may be, unless
-    ``start`` tells that."""
+class Kept(NamedTuple):
+    """An observation on the way, and the log of its probability under the track."""
 
-    def __init__(
-        self,
-        likelihood: RfidLikelihood,
-        motion: Motion,
-        bounds: Array,
-        rng: np.random.Generator,
-        start: KnownPosition | None = None,
-    ) -> None:
-        self._likelihood, self._motion, self._bounds, self._rng, self._start = likelihood, motion, bounds, rng, start
-        self._cloud: Cloud | None = None
-        self._odometry: ChainState | None = None
-        self._hypotheses: tuple[Mode, ...] | None = ()
-        self._log_evidence = 0.0
-        self._scans_with_reads = 0
-        self._tags: set[int] = set()
-        self._clear_since = math.inf
+    odometry: ChainState
+    observation: Observation
+    evidence: float
+
+
+class Refuted(NamedTuple):
+    """Why a track is given up, and since when it was wrong."""
+
+    why: str
+    since: float
+
+
+class Search:
+    """The search; see the module. ``sensors``: by the modality of their measurements."""
+
+    def __init__(self, sensors: Mapping[str, Sensor], motion: Motion, rng: np.random.Generator) -> None:
+        self._sensors, self._motion, self._rng = sensors, motion, rng
+        self._finders = {name: sensor.finder for name, sensor in sensors.items() if sensor.finder is not None}
+        bounds = [s.bounds for s in sensors.values() if s.bounds is not None]
+        self._bounds = None if not bounds else np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]))
+        self._population = self._new_population(None)
+        self._kept: deque[Kept] = deque()
+        self._last: dict[str, float] = {}  # when a sensor last told something new of a place
+        self._newest: ChainState | None = None
+        self._since = -math.inf
+        self._horizon = motion.horizon
+        self.start: KnownPosition | None = None
 
     @property
-    def hypotheses(self) -> tuple[Mode, ...]:
-        """Those at the time of the last scan, the likeliest first."""
-        if self._hypotheses is None:
-            self._hypotheses = self._cloud.modes() if self._cloud is not None else ()
-        return self._hypotheses
+    def possible(self) -> bool:
+        """Whether anything that may be seen tells a place."""
+        return bool(self._finders) or self._bounds is not None
+
+    @property
+    def weighs(self) -> bool:
+        """Whether places are compared by what all sensors see."""
+        return self._bounds is not None
+
+    def remember(self) -> None:
+        """Keep the odometry that a search on the way needs."""
+        self._motion.keep(2.0 * DURATION)
+        self._horizon = 2.0 * DURATION
+
+    def begin(self, start: KnownPosition | None) -> None:
+        """Seek the heading of a start whose position is known; None: that is over."""
+        self.start = start
+        for finder in self._finders.values():
+            finder.start = start
+        self._motion.keep(self._horizon if start is None else START_KEPT)
+        if start is not None:
+            self._population = self._new_population(start)
+
+    def look(self, m: Any, odometry: ChainState) -> bool:
+        """Take a measurement while no place is known; False where it tells nothing."""
+        sensor, finder = self._sensors.get(m.modality), self._finders.get(m.modality)
+        if sensor is None:
+            return False
+        told = finder is not None and finder.look(m, odometry)
+        if self._population is not None and self._is_due(sensor, odometry.t):
+            seen = sensor.evidence(m)
+            told = (seen is not None and self._population.add(odometry, seen)) or told
+        if told:
+            self._newest = odometry
+        return told
+
+    @property
+    def newest(self) -> ChainState | None:
+        """The odometry at the last measurement that told something."""
+        return self._newest
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last scan if one hypothesis has been clear for a while, else None."""
-        if self._odometry is None or not math.isfinite(self._clear_since):
+        """The one place that is clear, at its time; None where there is none."""
+        for finder in self._finders.values():
+            found = finder.best
+            if found is not None and not (self._population is not None and self._population.denies(found)):
+                return found
+        return None if self._population is None else self._population.best
+
+    def modes(self, t: float) -> list[Mode]:
+        """Where the robot may be at ``t``, the likeliest place first; none where nothing was seen."""
+        now = self._motion.state(t)
+        at, found = self._hypotheses()
+        if at is None:
+            return [] if self.start is None else [self.start.mode(now)]
+        since = self._motion.relative(at, now)
+        return [
+            Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
+            for h in found
+        ]
+
+    def particles(self, t: float) -> tuple[Array, Array] | None:
+        """Poses (N, 3) at ``t`` and weights (N,) of the particles that are anywhere, if these lead the search."""
+        if self._population is None or self._newest is None or self._at_once() is not None:
             return None
-        mode = self.hypotheses[0]
-        needed = CLEAR_FOR if self._width(mode) <= NARROW else CLEAR_FOR_WIDE
-        if self._odometry.t < self._clear_since + needed:
-            return None
-        return PosePrior(self._odometry.t, mode.pose, mode.covariance)
-
-    @property
-    def log_evidence(self) -> float:
-        """Log-probability of all scans so far for a robot that began anywhere."""
-        return self._log_evidence
-
-    def add(self, odometry: ChainState, looks: Looks) -> bool:
-        """Take a scan made when the odometry was at ``odometry``; False if it is left out, as it is not newer than the last."""
-        if self._odometry is not None and odometry.t <= self._odometry.t:
-            return False
-        if self._cloud is None or self._odometry is None:
-            area = float(np.prod(self._bounds[1] - self._bounds[0]))
-            count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
-            self._cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
-        else:
-            self._predict(self._cloud, self._odometry, odometry)
-        self._odometry = odometry
-        self._weigh(looks, odometry.t)
-        self._hypotheses = None
-        read = np.flatnonzero(looks.hits.any(axis=0))
-        self._scans_with_reads += len(read) > 0
-        self._tags.update(read.tolist())
-        self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
-        return True
-
-    @property
-    def particles(self) -> tuple[Array, Array]:
-        """Poses (N, 3) at the last scan and their weights (N,), of all hypotheses; none before the first scan."""
-        return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
+        poses, weights = self._population.particles
+        return se2.compose(poses, self._motion.relative(self._newest, self._motion.state(t)).delta), weights
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last scan, drawn from all hypotheses; none before the first scan."""
-        if self._cloud is None:
-            return np.empty((0, 3))
-        rows = systematic(self._cloud.weights, rng, count)
-        return kld.jittered(self._cloud.poses, rows, rng)
+        """Poses (N, 3) at the last measurement, drawn from what is known; none where nothing was seen."""
+        leading = self._at_once()
+        if leading is None and self._population is not None:
+            return self._population.sample(rng, count)
+        if leading is None:
+            leading = next((f for f in self._finders.values() if f.newest is not None), None)
+        return np.empty((0, 3)) if leading is None else leading.sample(rng, count)
 
-    def _is_clear(self) -> bool:
-        if self._scans_with_reads < CLEAR_SCANS or len(self._tags) < CLEAR_TAGS or self._cloud is None:
+    @property
+    def doubts(self) -> bool:
+        """Whether a track, or a sensor, is under suspicion."""
+        return any(s.suspicious_since is not None or s.silent for s in self._sensors.values())
+
+    def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
+        """An observation is about to be applied to a track."""
+        if sensor.finder is not None:
+            sensor.finder.follow(observation, odometry, view)
+
+    def keep(self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: float) -> None:
+        """An observation was applied to a track, of which ``evidence`` is the log of its probability."""
+        seen = None if self._population is None and self._bounds is None else observation.at_its_time()
+        if seen is None or not self._is_due(sensor, odometry.t):
+            return
+        self._kept.append(Kept(odometry, seen, evidence))
+        while self._kept[0].odometry.t < odometry.t - DURATION:
+            self._kept.popleft()
+        if self._population is not None:
+            self._population.add(odometry, seen)
+
+    def refuted(
+        self, m: Any, odometry: ChainState, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
+    ) -> Refuted | None:
+        """Why a track is wrong, if it is, after a measurement was applied to it; :attr:`best` is where the robot is.
+
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the track at the measurement. ``pose_at(t, best)``: where the robot
+        was at ``t`` if it is at ``best`` (3,) now.
+        """
+        finder = self._finders.get(m.modality)
+        if finder is not None:
+            since = finder.refuted_since(m, odometry, pose, covariance)
+            if since is not None:
+                return Refuted(self._sensors[m.modality].lost, since)
+        return self._refuted_by_all(pose, covariance, pose_at)
+
+    def _refuted_by_all(
+        self, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
+    ) -> Refuted | None:
+        doubting = [s for s in self._sensors.values() if s.suspicious_since is not None]
+        if not doubting or self._bounds is None:
+            self._population = None
+            return None
+        since = min(float(s.suspicious_since or 0.0) for s in doubting)
+        if self._population is None:
+            self._population, self._since = self._new_population(None), since
+            assert self._population is not None
+            for row in self._kept:
+                if row.odometry.t >= since:
+                    self._population.add(row.odometry, row.observation)
+        best = self._population.best
+        if best is None:
+            return None
+        if not _is_apart(best, pose, covariance):
+            for sensor in doubting:
+                sensor.accept()
+            self._population = None
+            return None
+        track = sum(row.evidence for row in self._kept if row.odometry.t >= self._since)
+        if self._population.log_evidence - track <= REFUTING:
+            return None
+        return Refuted(doubting[0].lost, self._change(best, pose_at))
+
+    def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> float:
+        """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track."""
+        kept = [row for row in self._kept if row.odometry.t >= self._since - BEFORE]
+        gains = [
+            float(row.observation.log_likelihood(pose_at(row.odometry.t, best.pose)[None], {})[0]) - row.evidence
+            for row in kept
+        ]
+        return kept[int(np.argmax(np.cumsum(gains[::-1])[::-1]))].odometry.t
+
+    def begin_track(self, *, found: bool) -> None:
+        """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""
+        self.begin(None)
+        if found:
+            self._kept.clear()
+            self._last.clear()
+        for finder in self._finders.values():
+            finder.clear()
+        self._population = None
+
+    def _hypotheses(self) -> tuple[ChainState | None, Sequence[Mode]]:
+        leading = self._at_once()
+        if leading is None and self._population is not None:
+            return self._newest, self._population.hypotheses if self._newest is not None else ()
+        if leading is None:
+            leading = next((f for f in self._finders.values() if f.newest is not None), None)
+        return (None, ()) if leading is None else (leading.newest, leading.hypotheses)
+
+    def _at_once(self) -> Any:
+        """A finder that one measurement has told a place."""
+        told = (f for f in self._finders.values() if f.at_once and f.newest is not None)
+        return next((f for f in told if self._population is None or f.best is not None), None)
+
+    def _is_due(self, sensor: Sensor, t: float) -> bool:
+        last = self._last.get(sensor.modality, -math.inf)
+        if t <= last or t < last + sensor.evidence_every:
             return False
-        # what is spread widely as a whole is not one place, and needs no search for modes
-        if np.linalg.eigvalsh(self._cloud.moments[1][:2, :2])[-1] > WIDE**2:
-            return False
-        mode = self.hypotheses[0]
-        error = self._cloud.poses - mode.pose
-        error[:, 2] = se2.wrap(error[:, 2])
-        near = np.sum(error * positive.solve(mode.covariance, error.T).T, axis=1) < REACH**2
-        return bool(self._cloud.weights[near].sum() >= CLEAR_WEIGHT and self._width(mode) <= 1.0)
+        self._last[sensor.modality] = t
+        return True
 
-    @staticmethod
-    def _width(mode: Mode) -> float:
-        """The standard deviations of a place, as a share of the largest that it may have."""
-        position = math.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1])
-        return float(max(position / WIDEST_POSITION, math.sqrt(mode.covariance[2, 2]) / WIDEST_HEADING))
-
-    def _predict(self, cloud: Cloud, start: ChainState, end: ChainState) -> None:
-        increment = self._motion.relative(start, end)
-        root = positive.root(NOISE * increment.covariance)
-        noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
-        self._cloud = replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
-
-    def _weigh(self, looks: Looks, t: float) -> None:
-        left = 1.0
-        while left > 0.0:
-            cloud = self._cloud
-            assert cloud is not None
-            likelihood = weighable(self._likelihood.log_likelihood(cloud.poses, looks), cloud.log_weights, t)
-            share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
-            weighed = cloud.log_weights + share * likelihood
-            highest = float(weighed.max())
-            self._log_evidence += highest + math.log(float(np.sum(np.exp(weighed - highest))))
-            self._cloud = replace(cloud, log_weights=normalised(weighed))
-            left -= share
-            if effective_size(self._cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
-                self._resample(self._cloud)
-
-    def _resample(self, cloud: Cloud) -> None:
-        assert self._odometry is not None
-        rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
-        rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
-        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, self._odometry)))
-        log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
-        log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
-        self._cloud = _cloud(poses, log_weights)
-
-    def _anywhere(self, count: int, now: ChainState) -> Array:
-        """Poses (N, 3) where the robot may have come to by ``now``, as far as its start tells it: else evenly over the bounds and
-        all headings, one in each layer of each axis (Latin hypercube)."""
-        if self._start is not None:
-            return self._start.drawn(self._rng, count, now)
-        layers = np.column_stack([self._rng.permutation(count) for _ in range(3)])
-        even = (layers + self._rng.random((count, 3))) / count
-        low, high = np.append(self._bounds[0], -math.pi), np.append(self._bounds[1], math.pi)
-        return np.asarray(low + even * (high - low))
+    def _new_population(self, start: KnownPosition | None) -> Population | None:
+        return None if self._bounds is None else Population(self._motion, self._bounds, self._rng, start)
 
 
-def _cloud(poses: Array, log_weights: Array) -> Cloud:
-    return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
+def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
+    error = se2.log(se2.between(pose, best.pose))
+    spread = covariance + se2.world_to_body(best.pose, best.covariance)
+    return float(error @ positive.solve(spread, error[:, None])[:, 0]) > APART
+
+
+def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
+    """The log of the probability of an observation of the pose alone, by Laplace's method: at its correction of a Gaussian, with
+    ``pose`` (3,) and body-frame ``covariance`` (3, 3)."""
+    if correction.evidence:
+        return correction.evidence
+    delta = correction.delta[:3]
+    at = se2.compose(pose, se2.exp(delta))
+    _, before = np.linalg.slogdet(covariance)
+    _, after = np.linalg.slogdet(correction.covariance[:3, :3])
+    moved = positive.squared(delta, covariance)
+    return float(observation.log_likelihood(at[None], {})[0] - 0.5 * moved + 0.5 * (after - before))

@@ -1,52 +1,20 @@
-"""The main estimator: one factor graph over the run, kept solved by iSAM2 (Kaess et al., IJRR 31(2), 2012).
+"""The main estimator: one factor graph over the run, kept solved by iSAM2.
 
 By default the whole history stays in the graph; with ``lag`` poses older than that are marginalised out, each with the estimate
-that it left the window with. GTSAM's solvers are lost after any exception in an update, so everything that is in the
-graph is also kept here, and the solver is rebuilt from it.
+that it left the window with.
 """
 
-import bisect
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from __future__ import annotations
+
 from typing import Annotated
 
-import gtsam
-import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
-from factorgraph_loc.fusion.kept import Kept
-from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.relocating import RelocatingGraph
-from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Solver, Window, read_all
-from factorgraph_loc.fusion.stalled import Stalled
-from factorgraph_loc.fusion.summary import Summary, is_missing
-from factorgraph_loc.fusion.variables import (
-    ODOMETRY_KEY,
-    SENSOR_KEY,
-    Node,
-    Values,
-    gtsam_errors,
-    index_of,
-    is_point,
-    is_pose,
-)
+from factorgraph_loc.fusion.graph import Graph
+from factorgraph_loc.fusion.graph_estimator import GraphEstimator
+from factorgraph_loc.fusion.graph_parts import GraphSettings
+from factorgraph_loc.fusion.incremental import Incremental, IncrementalSettings
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.slam.unknown_points import HORIZON
-from factors import positive, se2
-from factors.odometry.model import between_factor
-from factors.se2 import Array
-
-# s: how long images may wait for the solver; until then they update the newest pose, as a filter would
-SOLVE_INTERVAL = 0.45
-NOWHERE: Mapping[int, Array] = {}
-# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
-JUMPED = 50.0
-ITERATIONS_AFTER_FAILURE = 10
-# m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
-NEAR_POINTS = 0.02
-LOOKED_BACK = HORIZON + 1  # newest keyframes that are never forgotten: points that wait are looked for in them
 
 
 class SmootherSettings(GraphSettings):
@@ -60,328 +28,33 @@ class SmootherSettings(GraphSettings):
     smooth: bool = True
 
 
-class Smoother(RelocatingGraph):
+class Smoother(GraphEstimator):
     """The iSAM2 smoother; see the module."""
 
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
-        super().__init__(setup, settings)
         self._settings = settings
-        self._failed: list[str] = []
-        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
-        self._factorization = "QR" if self._unknown is None else "CHOLESKY"
-        self._solver = self._new_solver()
-        self._stalled: Stalled | None = None  # the last one
-        self._last = gtsam.Values()  # all estimates after the last update, where landmarks are estimated
-        # where landmarks are estimated an update takes long: what is seen between keyframes waits for the next one
-        self._waits = settings.landmarks != "known"
-        self._waiting = Addition()
-        # pixels of known points place the robot so well by themselves that the solver need not see each image at once, unless
-        # it is to learn from them how the camera is mounted
-        known = self._points.known and settings.landmarks == "known" and not self._camera_constants.names
-        self._defers = known and (settings.lag is None or settings.lag >= 2.0 * SOLVE_INTERVAL)
-        self._solved = -math.inf  # the time of the newest keyframe in the solver
-        # of each keyframe: its causal estimate, and the final one where it has left the window
-        self._filtered: Kept[tuple[Array, Array]] = Kept()
-        self._left: Kept[tuple[Array, Array]] = Kept()
+        super().__init__(setup, settings)
+
+    def _new_backend(self, graph: Graph) -> Incremental:
+        self._incremental = Incremental(graph, incremental_settings(graph, self._settings))
+        return self._incremental
 
     def forget(self, before: float) -> None:
         """Forget the trajectory before then, as far as it has left the window; a full history keeps all."""
-        t = min(before, self._t - self._settings.max_delay)
-        count = bisect.bisect_right(self._keyframe_times, t, self._keyframe_times.first) - 1
-        count = min(count, len(self._left), len(self._keyframes) - LOOKED_BACK)
-        if count > self._keyframes.first:
-            count = min(count, self._solver.oldest)  # it may have to be built anew
-        for kept in (self._keyframes, self._keyframe_times, self._filtered, self._left):
-            kept.forget(count)
-        self._ticks = [tick for tick in self._ticks if tick.keyframe >= self._keyframes.first]
+        self._incremental.forget(min(before, self._graph.t - self._settings.max_delay))
 
-    def _final(self) -> tuple[Array, Array]:
-        """Full history: the whole graph, solved to the end. With a window: each pose as it left that, the others as they are
-        now; those that wait for the solver as they were expected."""
-        waiting = self._waiting.values
-        if not self._settings.smooth:
-            estimates = list(self._filtered)
-        elif self._settings.lag is None:
-            keys = [*(k.key for k in self._keyframes), *self._constants]
-            return self._optimum(waiting | {key: self._solver.value(key) for key in keys if key not in waiting})
-        else:
-            stalled, open_ones = isinstance(self._solver, Stalled), self._keyframes[len(self._left) :]
-            try:
-                for key in () if stalled else self._constants.keys() - waiting.keys():
-                    self._constants[key], self._spreads[key] = self._marginal(key)
-                now = [
-                    self._filtered[k.index] if stalled or k.key in waiting else self._marginal(k.key) for k in open_ones
-                ]
-            except RuntimeError as error:
-                raise self._unsolved(error) from error
-            estimates = [*self._left, *now]
-        if self._waiting.nodes or self._waiting_nodes():
-            estimates[-1] = self._pose, self._covariance
-        return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
 
-    def _optimum(self, start: Values) -> tuple[Array, Array]:
-        """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the optimum next to ``start``."""
-        self._drop_astray(self._keyframes, start)
-        problem = self._problem()
-        values = problem.solve(start).values
-        return np.array([values[k.key] for k in self._keyframes]), self._settle(problem, values)
-
-    def _begin(self, first: Keyframe) -> None:
-        self._begin_again(first)
-
-    def _begin_again(self, newest: Keyframe) -> None:
-        del self._filtered[newest.index :]
-        guess = self._pose, self._covariance
-        self._filtered.append(guess)
-        summary = self._solver.summary(failed=False)
-        try:
-            with gtsam_errors():
-                summary = None if summary is None else summary.before(newest.index)
-                self._forget_landmarks(frozenset() if summary is None else summary.keys)
-                self._start_again(newest, summary)
-        except RuntimeError as error:
-            if newest.index == 0:
-                raise self._unsolved(error) from error
-            self._stall(newest, guess, summary, error)
-
-    def _guess_of(self, keyframe: int) -> Guess:
-        return self._filtered[keyframe]
-
-    def _extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        guess = addition.values[keyframe.key], spread
-        self._filtered.append(guess)
-        if self._defers and keyframe.t < self._solved + SOLVE_INTERVAL:
-            self._wait([self._odometry_node(keyframe), *addition.nodes], addition.values, guess)
-            return
-        self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
-
-    def _attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        if guess is not None and (self._waits or (self._defers and keyframe.t < self._solved + SOLVE_INTERVAL)):
-            self._wait(addition.nodes, addition.values, guess)
-            return
-        self._update(addition.nodes, addition.values)
-
-    def _wait(self, nodes: Sequence[Node], values: Values, guess: Guess) -> None:
-        """Keep what is to enter the solver with its next update; until then the newest pose is ``guess``."""
-        self._waiting.nodes += nodes
-        self._waiting.values |= values
-        self._pose, self._covariance = guess
-
-    def _current(self, key: int) -> Array:
-        return self._solver.value(key)
-
-    def _refine(self, newest: Keyframe, guess: Guess) -> None:
-        self._filtered[newest.index] = guess
-
-    def _is_open(self, keyframe: int) -> bool:
-        return super()._is_open(keyframe) and keyframe >= len(self._left)
-
-    def _update(self, nodes: Sequence[Node], values: Values) -> None:
-        newest = self._keyframes[-1]
-        nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
-        self._solved, guess = newest.t, self._filtered[newest.index]
-        if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
-            self._pose, self._covariance = guess  # the next try takes in what keyframes and constants hold
-            return
-        self._leave(newest.t, [k for k in self._constants if k not in values and not is_point(k)])
-        try:
-            with gtsam_errors():
-                self._solver.update(nodes, values, newest.t)
-                self._check_jump(newest, guess)
-                self._read(newest, {key for node in nodes for key in node.keys if key in self._constants})
-        except RuntimeError as error:
-            self.diagnostics.events.append((newest.t, f"solver rebuilt: {self._reason(error)}"))
-            self._rebuild(newest, guess)
-        while self._failed:
-            self.diagnostics.reject(f"factor: {self._failed.pop()}")
-
-    def _check_jump(self, newest: Keyframe, guess: Guess) -> None:
-        """RuntimeError if points that are estimated took the newest pose where it cannot be."""
-        if self._unknown is None:
-            return
-        pose, spread = guess
-        off = se2.log(se2.between(pose, self._solver.value(newest.key)))
-        if not positive.squared(off, spread) < JUMPED:
-            raise RuntimeError("the estimate jumped")
-        self._last = self._solver.estimates()
-
-    def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
-        """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
-
-        Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
-        """
-        self._pose, self._covariance = self._marginal(newest.key)
-        self._filtered[newest.index] = (self._pose, self._covariance)
-        for key in touched:
-            if key in (ODOMETRY_KEY, SENSOR_KEY) or is_point(key):
-                value = self._solver.value(key)
-                if not np.all(np.isfinite(value)):
-                    raise IndeterminateError(key)
-                self._constants[key] = value
-            else:
-                self._constants[key], self._spreads[key] = self._marginal(key)
-
-    def _marginal(self, key: int) -> tuple[Array, Array]:
-        value = self._solver.value(key)
-        if not np.all(np.isfinite(value)):
-            raise IndeterminateError(key)
-        try:
-            covariance = self._solver.covariance(key)
-        except RuntimeError:
-            covariance = np.full((1, 1), np.nan)
-        if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
-            found = covariances(*self._solver.linear(), (key,))
-            self._report_damping(found.damping)
-            covariance = found.by_key[key]
-        return value, positive.sound(covariance)
-
-    def _leave(self, now: float, constants: Iterable[int]) -> None:
-        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
-
-        ``constants``: those that are in the solver by now, which are brought up to date.
-        """
-        if not isinstance(self._solver, Window) or self._settings.lag is None:
-            return
-        lag, count = self._settings.lag, len(self._left)
-        if self._keyframes[count].t >= now - lag - MARGIN:
-            return
-        end = count
-        while self._keyframes[end].t < now - lag:
-            end += 1
-        leaving = self._keyframes[count:end]
-        try:
-            covariances = self._solver.covariances([k.key for k in leaving])
-            self._left += [(self._solver.value(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
-            for key in constants:
-                self._constants[key], self._spreads[key] = self._marginal(key)
-        except RuntimeError:
-            self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
-        if self._unknown is not None:
-            self._forget(self._unknown.leave(now - lag))
-
-    def _forget(self, points: Iterable[int]) -> None:
-        """Keep the estimates of points that leave the window."""
-        for key in points:
-            try:
-                self._departed[0][key], self._departed[1][key] = self._marginal(key)
-            except RuntimeError:
-                self._departed[0][key], self._departed[1][key] = self._constants[key], self._spreads[key]
-            del self._constants[key], self._spreads[key]
-
-    def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
-        """A new solver after the old one failed, from what that told before; then without what may throw, then with QR, which
-        keeps more digits, then without what the newest keyframe tells. Where nothing helps there is none for a while."""
-        failure = RuntimeError()
-        summary = self._solver.summary(failed=True)
-        near = read_all(self._last, [*(k.key for k in self._keyframes), *self._constants])
-        tries = [(True, self._factorization), (False, self._factorization), (False, "QR"), (False, "QR")]
-        for i, (throws, factorization) in enumerate(tries):
-            if i == len(tries) - 1:
-                self._drop_newest(newest)
-            elif tries[i - 1] == (throws, factorization):
-                continue
-            self._filtered[newest.index] = guess
-            try:
-                with gtsam_errors():
-                    self._start_again(newest, summary, near, throws, factorization)
-                    if summary is not None and any(node.has_pose for node in newest.nodes):
-                        self._check_jump(newest, guess)
-            except RuntimeError as error:
-                failure = error
-            else:
-                return
-        self._stall(newest, guess, summary, failure)
-
-    def _drop_newest(self, newest: Keyframe) -> None:
-        """Drop what the newest keyframe tells of poses; priors of points stay."""
-        if count := sum(node.has_pose for node in newest.nodes):
-            self.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
-            newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]
-
-    def _stall(self, newest: Keyframe, guess: Guess, summary: Summary | None, error: RuntimeError) -> None:
-        """Go on as a filter where the graph cannot be solved."""
-        self._filtered[newest.index] = self._pose, self._covariance = guess
-        self._waiting = Addition()
-        self._solver = self._stalled = Stalled(newest.t, self._known, summary, self._stalled)
-        self.diagnostics.events.append(
-            (newest.t, f"goes on without a solver until {self._solver.until:.1f} s: {self._reason(error)}")
-        )
-
-    def _known(self, key: int) -> Array:
-        """What is known of a variable without the solver."""
-        if is_pose(key):
-            return self._filtered[index_of(key)][0]
-        return self._constants[key] if key in self._constants else self._departed[0][key]
-
-    def _start_again(
-        self,
-        newest: Keyframe,
-        summary: Summary | None,
-        near: Mapping[int, Array] = NOWHERE,
-        throws: bool = False,
-        factorization: str | None = None,
-    ) -> None:
-        """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
-        throw where a point gets behind a camera, at a tenth of the time.
-
-        A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
-        begins with the priors.
-        """
-        self._solver, self._waiting, self._solved = self._new_solver(factorization), Addition(), newest.t
-        keyframes = self._keyframes[0 if summary is None else summary.oldest :]
-        guesses = {k.key: self._filtered[k.index][0] for k in keyframes} | self._constants
-        known: Collection[int] = () if summary is None else summary.keys
-        guesses |= {key: value for key, value in self._departed[0].items() if key in known}
-        guesses |= {key: value for key, value in near.items() if key in guesses}
-        self._drop_astray(keyframes[1:], guesses)
-        if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
-            guesses |= read_all(summary.at, guesses)
-        factors = self._priors() if summary is None else summary.on(guesses)
-        nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
-        if near and isinstance(self._solver, FullHistory):
-            guesses = self._problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
-        if not throws:
-            nodes = [n if n.factor is None or not n.has_pose else replace(n, native=None) for n in nodes]
-        nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
-        self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
-        self._read(newest, self._constants)
-
-    def _priors(self) -> list[gtsam.NonlinearFactor]:
-        """What is known before any measurement."""
-        assert self._prior is not None
-        noise = gtsam.noiseModel.Gaussian.Covariance(se2.world_to_body(self._prior.pose, self._prior.covariance))
-        start = gtsam.PriorFactorPose2(self._keyframes[0].key, gtsam.Pose2(*self._prior.pose), noise)
-        means, spreads = self._constant_priors()
-        return [
-            start,
-            *(
-                gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(spreads[key]))
-                for key, mean in means.items()
-            ),
-        ]
-
-    def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """The time of each variable of a window that begins; points are as if they were seen now."""
-        now = keyframes[-1].t
-        oldest = -math.inf if self._settings.lag is None else now - self._settings.lag - MARGIN
-        stamps = {key: now if key in self._constants else oldest for key in values}
-        return stamps | {k.key: k.t for k in keyframes}
-
-    def _odometry_node(self, keyframe: Keyframe) -> Node:
-        factor, keys = self._odometry_factor(keyframe)
-        if len(keys) > 2:
-            return Node(keys, factor, 3)
-        assert keyframe.from_previous is not None
-        return Node(keys, native=between_factor(keys[0], keys[1], keyframe.from_previous))
-
-    def _new_solver(self, factorization: str | None = None) -> Solver:
-        parameters = gtsam.ISAM2Params()
-        parameters.setFactorization(factorization or self._factorization)
-        # far from where a point was first taken to be its factors mean nothing
-        parameters.relinearizeSkip = self._settings.relinearize_skip if self._unknown is None else 1
-        if self._settings.lag is None:
-            return FullHistory(parameters, self._settings.relinearize_threshold)
-        threshold = self._settings.relinearize_threshold
-        parameters.setRelinearizeThreshold(threshold if self._unknown is None else min(threshold, NEAR_POINTS))
-        parameters.findUnusedFactorSlots = True
-        return Window(parameters, self._settings.lag, self._failed.append)
+def incremental_settings(graph: Graph, settings: SmootherSettings) -> IncrementalSettings:
+    """How the solver goes about a graph."""
+    # pixels of known points place the robot so well by themselves that the solver need not see each image at once, unless it is to
+    # learn from them how the camera is mounted
+    every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
+    defers = settings.landmarks == "known" and (settings.lag is None or settings.lag >= 2.0 * every)
+    return IncrementalSettings(
+        settings.lag,
+        settings.smooth,
+        settings.relinearize_threshold,
+        settings.relinearize_skip,
+        waits=settings.landmarks != "known",  # an update takes long then
+        solve_every=every if defers else 0.0,
+    )

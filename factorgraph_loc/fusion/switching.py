@@ -7,26 +7,27 @@ constants of the odometry which are uncertain count as noise in both. The final 
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.fusion.ekf import Ekf, EkfSettings
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt
-from factorgraph_loc.model.measurement import Measurement, Odometry, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.motion import Motion
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.binding import bound_motion
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
 
+TAGS = "rfid"  # the modality of scans of tags
 TAG_SENSORS = ("rfid", "rssi", "phase")
 LANDMARK_SENSORS = ("camera", "sightings", "bearing_range")
 JUMPED = 50.0  # Mahalanobis distance squared beyond which an estimate did not come from the one before
@@ -52,7 +53,7 @@ class Switching:
     """The switch; see the module."""
 
     deterministic = False
-    modalities = frozenset({"bearing_range", "rfid", "camera"})
+    modalities = EVERY
 
     def __init__(self, setup: Setup, settings: SwitchingSettings) -> None:
         self.diagnostics = Diagnostics()
@@ -74,7 +75,7 @@ class Switching:
                 setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))
         # both filters take the odometry: the second would count what is late once more
         self._vision.diagnostics.late = {}
-        self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
+        self._motion = bound_motion(setup, Diagnostics())
         self._active: Filter = self._tags if by_scans else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []
@@ -86,24 +87,24 @@ class Switching:
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
-        if isinstance(measurement, Odometry):
+        if measurement.is_motion:
             for part in (self._tags, self._vision):
                 part.process(measurement)
             self._motion.add(measurement)
             return
-        if isinstance(measurement, RfidScan) and measurement.t >= self._newest_scan:
+        if measurement.modality == TAGS and measurement.t >= self._newest_scan:
             self._newest_scan = measurement.t
-            read = any(tag in self._known for tag in measurement.tags)
+            read = any(tag in self._known for tag in cast(Any, measurement).tags)
             self._hand_over(self._tags if read else self._vision)
         if isinstance(measurement, Tick):
             self._ticks.append(measurement.t)
-        if isinstance(measurement, Tick) or isinstance(measurement, RfidScan) == (self._active is self._tags):
+        if isinstance(measurement, Tick) or (measurement.modality == TAGS) == (self._active is self._tags):
             self._active.process(measurement)
             late = self._vision.diagnostics.late
             self.diagnostics.late |= {sensor: count for sensor, count in late.items() if sensor != "odometry"}
             self._record()
-        elif isinstance(measurement, RfidScan):
-            self.diagnostics.ignore("rfid while no tag is read", len(measurement.antennas))
+        elif measurement.modality == TAGS:
+            self.diagnostics.ignore("rfid while no tag is read", measurement.count)
         else:
             self.diagnostics.ignore("landmarks while tags are read")
 

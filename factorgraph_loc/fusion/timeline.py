@@ -6,7 +6,7 @@ import bisect
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Self
 
@@ -14,17 +14,15 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics, Written
 from factorgraph_loc.model.learnt import Learnt
-from factorgraph_loc.model.measurement import Exteroceptive, Measurement, Odometry, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.odometry.motion import Motion
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.sensors.base import Sensor
+from factorgraph_loc.sensors.binding import bound_motion
 from factors import se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -42,7 +40,7 @@ class _Taken:
     """A measurement with what there was before it: the filter's state, time and odometry, and how many records and ticks; and what
     the diagnostics say of it."""
 
-    measurement: Exteroceptive | Tick
+    measurement: Measurement
     state: Any
     t: float
     odometry: ChainState
@@ -60,14 +58,15 @@ class Filter(ABC):
 
     deterministic = True
     supports_unknown_start = False
-    modalities = frozenset({"bearing_range"})  # of measurements that may update it; others are counted as ignored
+    modalities: Container[str] = EVERY  # of measurements that may update it; others are counted as ignored
 
     def __init__(self, setup: Setup, settings: FilterSettings) -> None:
         self.diagnostics = Diagnostics()
         self._max_delay = settings.max_delay
         self._smooth = settings.smooth
         calibrates = getattr(settings, "self_calibration", False)
-        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
+        self._motion = bound_motion(setup, self.diagnostics, self_calibration=calibrates)
+        self._sensors: dict[str, Sensor] = {}  # by the modality of their measurements
         self._rng: np.random.Generator | None = None  # of a filter that draws
         self._state: Any = None
         # the last one that was ahead of this one, and the state that it began with: the next tick need not go there once more
@@ -95,18 +94,22 @@ class Filter(ABC):
         """Take one measurement, in time or late by at most ``max_delay``."""
         if not isinstance(measurement, Tick):
             self._ahead = None
-        if isinstance(measurement, Odometry):
+        if measurement.is_motion:
             self._motion.add(measurement)
-        elif not isinstance(measurement, Tick) and measurement.modality not in self.modalities:
+        elif not (isinstance(measurement, Tick) or self._uses(measurement.modality)):
             self.diagnostics.ignore(measurement.modality, measurement.count)
         elif self._state is None:
-            self._begin(measurement)  # type: ignore[arg-type]
+            self._begin(measurement)
         elif measurement.t >= self._t:
-            self._take(measurement)  # type: ignore[arg-type]
+            self._take(measurement)
         elif measurement.t < self._t - self._max_delay or not self._taken:
-            self._drop_late(measurement)  # type: ignore[arg-type]
+            self._drop_late(measurement)
         else:
-            self._take_late(measurement)  # type: ignore[arg-type]
+            self._take_late(measurement)
+
+    def _uses(self, modality: str) -> bool:
+        """Whether measurements of a modality may update it."""
+        return modality in self._sensors
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; not a number before the start."""
@@ -146,14 +149,8 @@ class Filter(ABC):
         """Move the state along."""
 
     @abstractmethod
-    def _update(self, m: BearingRange) -> None:
-        """Take landmarks seen at the state's time."""
-
-    def _scan(self, m: RfidScan) -> None:  # noqa: B027
-        """Take a scan of tags at the state's time; only of those that take scans."""
-
-    def _look(self, m: PixelSightings | CameraFrame) -> None:  # noqa: B027
-        """Take what a camera saw at the state's time; only of those that take pixels."""
+    def _see(self, m: Any) -> None:
+        """Take what a sensor saw at the state's time."""
 
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
@@ -163,7 +160,7 @@ class Filter(ABC):
     def _record(self) -> Any:
         """What :meth:`trajectory` needs of this time, with its time as ``t``."""
 
-    def _seek(self, m: Exteroceptive) -> Any:
+    def _seek(self, m: Measurement) -> Any:
         """The state from a measurement alone, for an unknown start; None where it does not tell one."""
         return None
 
@@ -205,7 +202,7 @@ class Filter(ABC):
         if rng is not None and ahead._rng is not None:
             rng.bit_generator.state = ahead._rng.bit_generator.state
 
-    def _begin(self, m: Exteroceptive | Tick) -> None:
+    def _begin(self, m: Measurement) -> None:
         """Start without a prior, at the first measurement that tells something of the pose."""
         if isinstance(m, Tick):
             return
@@ -216,26 +213,22 @@ class Filter(ABC):
         elif not self.supports_unknown_start:
             self.diagnostics.ignore("before the start")
 
-    def _take(self, m: Exteroceptive | Tick) -> None:
+    def _take(self, m: Measurement) -> None:
         self._anchor()
         before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         mark = self.diagnostics.mark()
         self._move(m.t)
         if isinstance(m, Tick):
             self._ticks.append(m.t)
-        elif isinstance(m, RfidScan):
-            self._scan(m)
-        elif isinstance(m, BearingRange):
-            self._update(m)
         else:
-            self._look(m)
+            self._see(m)
         self._records.append(self._record())
         self._taken.append(_Taken(m, *before, self.diagnostics.since(mark)))
         while self._taken[0].measurement.t < m.t - self._max_delay:
             self._taken.popleft()
 
-    def _take_late(self, late: Exteroceptive | Tick) -> None:
-        again: list[Exteroceptive | Tick] = []
+    def _take_late(self, late: Measurement) -> None:
+        again: list[Measurement] = []
         while self._taken and self._t > late.t:
             last = self._taken.pop()
             again.append(last.measurement)
@@ -247,7 +240,7 @@ class Filter(ABC):
         for m in sorted(again, key=lambda m: m.t):
             self._take(m)
 
-    def _drop_late(self, m: Exteroceptive | Tick) -> None:
+    def _drop_late(self, m: Measurement) -> None:
         if not isinstance(m, Tick):
             self.diagnostics.drop_late(m.modality, m.count)
 
@@ -255,10 +248,8 @@ class Filter(ABC):
         self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry
         del self._records[taken.records :], self._ticks[taken.ticks :]
         self.diagnostics.take_back(taken.written)
-        self._went_back()
-
-    def _went_back(self) -> None:  # noqa: B027
-        """The filter went back to its time: what it took after that comes again."""
+        for sensor in self._sensors.values():
+            sensor.rewind(self._t)
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:

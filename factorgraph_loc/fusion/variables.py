@@ -18,16 +18,18 @@ from factors.se2 import Array
 
 Values = dict[int, Array]
 
-ODOMETRY_KEY = int(gtsam.symbol("c", 0))  # constants of the odometry
-SENSOR_KEY = int(gtsam.symbol("s", 0))  # constants of the sensor of landmarks
-CAMERA_KEY = int(gtsam.symbol("k", 0))  # constants of the camera
-_POSE, _POINT = ord("x"), ord("p")
+_POSE, _POINT, _LANDMARK = ord("x"), ord("p"), ord("l")
 _CHARACTER = 56  # bits of a key below its character
 
 
 def pose_key(index: int) -> int:
     """The key of the pose of keyframe ``index``."""
     return int(gtsam.symbol("x", index))
+
+
+def constants_key(index: int) -> int:
+    """The key of the constants of the sensor with number ``index``."""
+    return int(gtsam.symbol("c", index))
 
 
 def landmark_key(index: int) -> int:
@@ -45,6 +47,11 @@ def is_point(key: int) -> bool:
     return key >> _CHARACTER == _POINT
 
 
+def is_landmark(key: int) -> bool:
+    """Whether the variable is a landmark."""
+    return key >> _CHARACTER == _LANDMARK
+
+
 def is_pose(key: int) -> bool:
     """Whether the variable is a pose."""
     return key >> _CHARACTER == _POSE
@@ -58,12 +65,13 @@ def index_of(key: int) -> int:
 @dataclass(frozen=True)
 class Node:
     """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),
-    or both, which are the same."""
+    or both, which are the same. ``sensor``: the modality of what told it."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None
     rows: int = 0
     native: gtsam.NonlinearFactor | None = None
+    sensor: str = ""
 
     @property
     def has_pose(self) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.marginals import IndeterminateError
 from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import ODOMETRY_KEY, Values, landmark_key, pose_key
+from factorgraph_loc.fusion.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import Found, search
@@ -99,7 +99,7 @@ class _Way:
         self.mapped = known.copy()
         self._values: Values = {pose_key(0): np.array(prior.pose)}
         if self._constants.names:
-            self._values[ODOMETRY_KEY] = np.zeros(len(self._constants.names))
+            self._values[constants_key(0)] = np.zeros(len(self._constants.names))
         self._count = 1
 
     def extend(self, count: int) -> None:
@@ -159,7 +159,7 @@ class _Way:
     def _recalibrated(self, increment: Increment) -> Array:
         if not self._constants.names:
             return increment.delta
-        changes = self._constants.full(self._values[ODOMETRY_KEY], len(PARAMETERS))
+        changes = self._constants.full(self._values[constants_key(0)], len(PARAMETERS))
         return recalibrated(increment, changes)[0]
 
     def _problem(self) -> Problem:
@@ -167,7 +167,7 @@ class _Way:
         factors: Factors = [(PriorFactor(self._prior.pose, body), (pose_key(0),))]
         shared: tuple[int, ...] = ()
         if self._constants.names:
-            shared = (ODOMETRY_KEY,)
+            shared = (constants_key(0),)
             factors.append((VectorPriorFactor(np.zeros(len(self._constants.names)), self._constants.sigmas), shared))
         for i in range(1, self._count):
             step = OdometryFactor(self._steps[i - 1], self._constants.indices)

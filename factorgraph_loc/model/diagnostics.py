@@ -69,6 +69,11 @@ class Diagnostics:
         self._mark = None
         self.residuals.setdefault(name, []).extend(values)
 
+    def event(self, t: float, what: str) -> None:
+        """Something happened; it counts once, however often an estimator goes back in time."""
+        if (t, what) not in self.events:
+            self.events.append((t, what))
+
     def keep_last(self, rows: int) -> None:
         """Forget all but the last ``rows`` of each list."""
         self._mark = None

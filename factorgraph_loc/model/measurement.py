@@ -3,13 +3,6 @@
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.twist.measurement import Twist
-from factorgraph_loc.vision.frame import CameraFrame
-
 
 class Measurement(Protocol):
     """What a sensor reported at ``t`` [s], the time of the event, with the known offset between clocks already applied.
@@ -39,7 +32,3 @@ class Tick:
     count: ClassVar[int] = 0
     is_motion: ClassVar[bool] = False
     t: float
-
-
-Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist
-Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # what tells of the world around the robot

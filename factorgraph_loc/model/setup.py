@@ -22,3 +22,5 @@ class Setup:
 
 
 MapUse = Literal["known", "extended", "unknown"]
+# which uncertain constants of sensors an estimator learns: all, those that may differ from particle to particle, or none
+Calibration = Literal["all", "particles", "none"]

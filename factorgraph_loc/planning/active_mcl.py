@@ -15,6 +15,7 @@ of them expects, all begin anew (after sensor resetting: Lenser, Veloso, ICRA 20
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -28,13 +29,12 @@ from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, n
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
 from factorgraph_loc.maps.free_space import CELL, FreeSpace
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.proximity import ProximitySensor
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
-from factorgraph_loc.sensors.rfid.known_tags import KnownTags
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.base import NewVariable
+from factorgraph_loc.sensors.binding import bound_sensors
 from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
@@ -54,20 +54,52 @@ class ActiveMclSettings(FilterSettings):
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
 
 
+class _View:
+    """What sensors see of the filter, at its time."""
+
+    offset = None
+    newest = True
+
+    def __init__(self, owner: "ActiveMcl") -> None:
+        self._filter, self.t = owner, owner._t
+
+    @property
+    def localized(self) -> bool:
+        return self._filter._is_one_place(self._filter._state)
+
+    @property
+    def pose(self) -> Array:
+        return self._filter._state.moments[0]
+
+    @property
+    def covariance(self) -> Array:
+        return se2.world_to_body(*self._filter._state.moments)
+
+    def value(self, name: str) -> None:
+        return None
+
+    def spread(self, name: str) -> Array:
+        raise KeyError(name)
+
+    def joint(self) -> tuple[Array, dict[str, slice]]:
+        return self.covariance, {}
+
+    def poses_at(self, times: Array) -> Array:
+        return self._filter._motion.poses_at(self._filter._odometry, times, np.zeros(0))
+
+
 class ActiveMcl(Filter):
     """The particles of ActiveMCL; see the module. ``space``: where the robot may be."""
 
     deterministic = False
     supports_unknown_start = True
-    modalities = frozenset({"bearing_range", "rfid"})
     _state: Cloud
     _rng: np.random.Generator
 
     def __init__(self, setup: Setup, settings: ActiveMclSettings, space: FreeSpace) -> None:
         super().__init__(setup, settings)
         self._count, self._rng, self._space = settings.particles, setup.rng, space
-        self._tags = KnownTags(setup, self.diagnostics)
-        self._landmarks = KnownLandmarks(setup, self.diagnostics)
+        self._sensors = bound_sensors(setup, self._motion, self.diagnostics, calibration="none")
 
     def belief(self, t: float | None = None) -> Belief:
         """The particles with their weights, and their modes."""
@@ -86,10 +118,12 @@ class ActiveMcl(Filter):
     def _start(self, prior: PosePrior) -> Cloud:
         return _cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._count))
 
-    def _seek(self, m: object) -> Cloud:
+    def _seek(self, m: Measurement) -> Cloud:
         """Evenly over free space and all headings."""
-        state = self._everywhere()
-        return self._weighed(state, m) if isinstance(m, RfidScan) else state
+        self._state = self._everywhere()
+        if self._sensors[m.modality].finder is None:
+            self._see(m)
+        return self._state
 
     def _everywhere(self) -> Cloud:
         count = MORE * self._count
@@ -105,37 +139,29 @@ class ActiveMcl(Filter):
         outside = np.where(self._space.cells(poses[:, :2]) >= 0, 0.0, OUTSIDE)
         self._state = replace(self._state, poses=poses, log_weights=normalised(self._state.log_weights + outside))
 
-    def _update(self, m: BearingRange) -> None:
-        seen = self._landmarks.factor(m)
-        if seen is not None:
-            self._state = self._tempered(self._state, seen.log_likelihood)
-
-    def _scan(self, m: RfidScan) -> None:
-        self._state = self._weighed(self._state, m)
-
-    def _went_back(self) -> None:
-        self._tags.forget(math.nextafter(self._t, math.inf))
+    def _see(self, m: Measurement) -> None:
+        sensor = self._sensors[m.modality]
+        for seen in sensor.observe(m, _View(self)):
+            if isinstance(seen, NewVariable) or not seen.is_judged:  # strength and phase have many optima
+                continue
+            if seen.found and sensor.finder is None:
+                # what is read where none of the particles is: they have lost the robot
+                anywhere = self._everywhere()
+                told, else_told = (_evidence(c, seen.log_likelihood(c.poses, {})) for c in (self._state, anywhere))
+                if told < else_told + LOST:
+                    self._state = anywhere
+                    sensor.restart(-math.inf)  # silences that were taken for those of another place
+            if self._is_one_place(self._state):
+                view = _View(self)
+                correction = seen.correct(view.pose, view.covariance, {}, {}, 1)
+                if not sensor.judge(seen, correction, view):
+                    continue
+            self._state = self._tempered(self._state, partial(seen.log_likelihood, values={}))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
         """Weigh the particles by free lengths (D,) [m] that a proximity sensor has read; before the first scan there are none."""
         if self._state is not None:
             self._state = self._tempered(self._state, lambda poses: sensor.log_likelihood(poses, lengths))
-
-    def _weighed(self, cloud: Cloud, m: RfidScan) -> Cloud:
-        looks, likelihood = self._tags.looks(m), self._tags.likelihood
-        if looks is None or likelihood is None:
-            return cloud
-        known = self._is_one_place(cloud)
-        if m.tags:
-            # tags that are read where none of the particles is: they have lost the robot
-            anywhere = self._everywhere()
-            told, else_told = (_evidence(c, likelihood.log_likelihood(c.poses, looks)) for c in (cloud, anywhere))
-            if told < else_told + LOST:
-                cloud, known = anywhere, False
-                self._tags.forget(-math.inf)  # silences that were taken for those of another place
-        if known:
-            self._tags.miss(m.t, looks, cloud.moments[0], se2.world_to_body(*cloud.moments))
-        return self._tempered(cloud, lambda poses: likelihood.log_likelihood(poses, looks))
 
     def _tempered(self, cloud: Cloud, log_likelihood: Callable[[Array], Array]) -> Cloud:
         """Weighed by a likelihood, a share at a time."""

@@ -60,6 +60,9 @@ class SensorType:
     ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log; ``draw``:
     ``(log) ->`` :class:`~factorgraph_loc.sensors.marks.Marks`, what plots and viewers draw of it.
 
+    Of an estimator: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, None where a run does not use it;
+    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.motion.Motion`.
+
     Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
     together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
     diagnostics)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in the map
@@ -81,6 +84,8 @@ class SensorType:
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
     simulation: Mapping[str, Section] = field(default_factory=dict)
+    bind: Place = ""
+    predict: Place = ""
     summarize: Place = ""
     draw: Place = ""
     check: Place = ""

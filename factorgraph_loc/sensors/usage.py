@@ -1,5 +1,6 @@
 """How a run uses a sensor: what the sensors' packages are told of it, and what they make ready for it."""
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 from factorgraph_loc.files.models import FileModel
@@ -15,7 +16,7 @@ class Use:
     sensors: tuple[str, ...]
     estimator: str
     settings: FileModel
-    modalities: frozenset[str]
+    modalities: Container[str]
     estimates_points: bool
 
 

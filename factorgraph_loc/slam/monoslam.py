@@ -25,7 +25,6 @@ from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_sighting import Looker, Match
@@ -101,7 +100,7 @@ class _Record:
 class Monoslam(Filter):
     """The filter; see the module."""
 
-    modalities = frozenset({"bearing_range", "camera"})
+    modalities = frozenset({"camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
     _state: SlamState
 
@@ -217,10 +216,10 @@ class Monoslam(Filter):
         self._state = self._state.moved(step)
         self._predicted = self._state.covariance[:ROBOT, :ROBOT]
 
-    def _update(self, m: BearingRange) -> None:
-        self.diagnostics.ignore("bearing_range", len(m.landmarks))
+    def _uses(self, modality: str) -> bool:
+        return modality in self.modalities
 
-    def _look(self, m: PixelSightings | CameraFrame) -> None:
+    def _see(self, m: PixelSightings | CameraFrame) -> None:
         eye = self._looker.eye(m)
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))

@@ -7,16 +7,18 @@ astray.
 """
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
-from factorgraph_loc.fusion.variables import Node, Values, point_key
+from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.variables import Node, point_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.variable import NOTHING, Estimated
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.slam.local_bundle import bundled
@@ -61,28 +63,13 @@ class _Point:
     strikes: int = 0
 
 
-@dataclass(frozen=True)
-class GraphView:
-    """What :class:`UnknownPoints` sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
-    (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; keys of the camera's
-    constants (``shared``), and their ``changes`` (8,)."""
-
-    keyframes: Sequence[Keyframe]
-    values: Values
-    spreads: Values
-    current: Callable[[int], Array]
-    is_open: Callable[[int], bool]
-    shared: tuple[int, ...] = ()
-    changes: Array | None = None
-
-
 @dataclass
 class UnknownPoints:
     """The points of a graph by name, and those that wait. ``estimated``: constants of the camera that are variables."""
 
     model: CameraModel
     diagnostics: Diagnostics
-    estimated: tuple[int, ...] = ()
+    estimated: Estimated = NOTHING
     _points: dict[Hashable, _Point] = field(default_factory=dict)
     _astray: list[_Point] = field(default_factory=list)  # in the graph, but seen no more under their name
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
@@ -107,7 +94,9 @@ class UnknownPoints:
     ) -> Guess:
         """Turn ``rows`` of what is seen from a new keyframe into factors and variables; returned is the guess of its pose, placed
         by the points. Its covariance stays: the points are known no better than the poses that saw them."""
-        model = self.model if graph.changes is None else recalibrated(self.model, graph.changes)
+        model = self.model
+        if graph.constants is not None:
+            model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
         rows = list(rows)
         if keyframe.from_previous is not None:
             self._way += float(np.hypot(*keyframe.from_previous.delta[:2]))
@@ -321,7 +310,9 @@ class UnknownPoints:
     def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
         shared = graph.shared
         native = None if shared else self._sightings.factor(keyframe.key, key, pixel)
-        factor = ReprojectionFactor(self.model, np.zeros((1, 3)), pixel[None], estimated=self.estimated, free=True)
+        factor = ReprojectionFactor(
+            self.model, np.zeros((1, 3)), pixel[None], estimated=self.estimated.indices, free=True
+        )
         node = Node((keyframe.key, *shared, key), factor, 2, native)
         keyframe.nodes.append(node)
         addition.nodes.append(node)

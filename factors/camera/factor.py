@@ -94,10 +94,6 @@ class ReprojectionFactor:
         """The robust weight of squared whitened residuals."""
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
-    def widened(self, width: float) -> ReprojectionFactor:
-        """The same with a robust loss that is ``width`` times as wide."""
-        return replace(self, model=replace(self.model, robust=width * self.model.robust))
-
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
         if self.of_pose_alone:

@@ -44,6 +44,17 @@ class RfidFactor:
                 return phase.score(pose, reads)
         raise TypeError(f"{type(self.likelihood).__name__} is no likelihood of {type(self.seen).__name__}")
 
+    def log_likelihood(self, poses: Array) -> Array:
+        """The tempered log-likelihood (N,) of poses (N, 3)."""
+        match self.likelihood, self.seen:
+            case RfidLikelihood() as detection, Looks() as looks:
+                return detection.log_likelihood(poses, looks)
+            case RssiLikelihood() as strength, RssiReads() as reads:
+                return strength.log_likelihood(poses, reads)
+            case PhaseLikelihood() as phase, PhaseReads() as reads:
+                return phase.log_likelihood(poses, reads)
+        raise TypeError(f"{type(self.likelihood).__name__} is no likelihood of {type(self.seen).__name__}")
+
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Residual (4,) and its Jacobian (4, 3)."""
         score = self.score(values[0])

@@ -32,7 +32,7 @@ TELLING = 1e-6  # eigenvalue of an information that counts
 class TagUpdate:
     """A pose (3,) with body-frame covariance (3, 3) after looks at tags.
 
-    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``surprise`` and ``variance``: how much larger
+    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``excess_nll`` and ``variance``: how much larger
     the negative log-likelihood was there than expected, and the variance of that; ``evidence``: log-probability of the looks,
     by Laplace's method.
     """
@@ -41,7 +41,7 @@ class TagUpdate:
     covariance: Array
     nis: float
     dof: int
-    surprise: float
+    excess_nll: float
     variance: float
     evidence: float
 

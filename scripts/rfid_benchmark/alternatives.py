@@ -16,7 +16,6 @@ from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.variables import ODOMETRY_KEY, Values, pose_key
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Odometry
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.odometry.motion import Motion
@@ -160,7 +159,7 @@ def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tu
     ]
     t, before = [prior.t], None
     for m in log.measurements(SENSORS):
-        if isinstance(m, Odometry):
+        if m.is_motion:
             motion.add(m)
             before = before or motion.state(prior.t)
         elif isinstance(m, RfidScan) and before is not None and (looks := tags.looks(m)) is not None:

@@ -11,7 +11,6 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Odometry
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.odometry.motion import Motion
@@ -64,7 +63,7 @@ def optimal_filter(log: Log) -> Trajectory:
     before = None
     t, means, covariances = [], [], []
     for m in log.measurements(SENSORS):
-        if isinstance(m, Odometry):
+        if m.is_motion:
             motion.add(m)
             if before is None:
                 before = motion.state(prior.t)

@@ -97,7 +97,7 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
         close(found.pose, expected.pose, sigmas)
         close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))
         assert found.dof == expected.dof
-        for name in ("nis", "surprise", "variance", "evidence"):
+        for name in ("nis", "excess_nll", "variance", "evidence"):
             assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9, abs=1e-9)
 
 

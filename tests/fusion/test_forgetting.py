@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.model.measurement import Odometry, Tick
+from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.simulation import named_settings, simulate
 
@@ -39,7 +39,7 @@ def driven(log, name, sensors, settings, forget):
         if held is not None and m.t > held.t + 0.3:
             estimator.process(held)
             held = None
-        elif held is None and i % 7 == 0 and not isinstance(m, Odometry):
+        elif held is None and i % 7 == 0 and not m.is_motion:
             held = m
         if i % 5 == 0:
             estimator.process(Tick(m.t))

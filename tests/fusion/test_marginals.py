@@ -7,17 +7,19 @@ from landmark_world import simulate
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion import smoother
+from factorgraph_loc.fusion import incremental
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.solvers import Window
-from factorgraph_loc.fusion.variables import ODOMETRY_KEY, pose_key
+from factorgraph_loc.fusion.variables import constants_key, pose_key
 from factors.graph import VectorPriorFactor
 
 STEP = np.array(((1.0, 0.0, 0.03), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0)))
 WHITENER = np.diag((300.0, 3000.0, 200.0))
 UNIT = gtsam.noiseModel.Unit.Create(3)
 GTSAM_SAYS = "\nIndeterminate linear system detected while working near variable\n{} (Symbol: x0).\n\nThrown when"
+
+KEY = constants_key(0)
 
 
 def chain(count, anchored=True):
@@ -78,14 +80,14 @@ class Hole:
 
 
 def test_a_cost_that_is_no_number_is_not_lower():
-    solution = Problem([(Hole(), (ODOMETRY_KEY,))]).solve({ODOMETRY_KEY: np.array([3.0])})
-    assert 1.0 < solution.values[ODOMETRY_KEY][0] <= 3.0
+    solution = Problem([(Hole(), (KEY,))]).solve({KEY: np.array([3.0])})
+    assert 1.0 < solution.values[KEY][0] <= 3.0
     assert np.isfinite(solution.cost)
 
 
 def test_a_start_without_a_cost_stays_where_nothing_better_is():
-    solution = Problem([(Hole(), (ODOMETRY_KEY,))]).solve({ODOMETRY_KEY: np.array([0.5])})
-    assert solution.values[ODOMETRY_KEY][0] == 0.5
+    solution = Problem([(Hole(), (KEY,))]).solve({KEY: np.array([0.5])})
+    assert solution.values[KEY][0] == 0.5
     assert solution.cost == np.inf
 
 
@@ -93,14 +95,14 @@ def test_a_factor_of_gtsam_that_throws_is_replaced_by_ours_wherever_it_throws():
     def error(_, values, jacobians):
         if jacobians is not None:
             raise RuntimeError("")
-        return values.atVector(ODOMETRY_KEY)
+        return values.atVector(KEY)
 
-    native = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [ODOMETRY_KEY], error)
+    native = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [KEY], error)
     ours = VectorPriorFactor(np.zeros(1), np.ones(1))
-    problem = Problem([], [(ours, (ODOMETRY_KEY,), native)])
-    solution = problem.solve({ODOMETRY_KEY: np.array([3.0])})
-    assert solution.values[ODOMETRY_KEY][0] == pytest.approx(0.0, abs=1e-3)
-    assert problem.covariances(solution.values, [ODOMETRY_KEY]).by_key[ODOMETRY_KEY][0, 0] == pytest.approx(1.0)
+    problem = Problem([], [(ours, (KEY,), native)])
+    solution = problem.solve({KEY: np.array([3.0])})
+    assert solution.values[KEY][0] == pytest.approx(0.0, abs=1e-3)
+    assert problem.covariances(solution.values, [KEY]).by_key[KEY][0, 0] == pytest.approx(1.0)
 
 
 def test_the_window_survives_marginals_that_fail(monkeypatch):
@@ -122,10 +124,10 @@ def test_the_window_survives_marginals_that_fail(monkeypatch):
 
 @pytest.mark.parametrize("lag", [None, 5.0])
 def test_a_smoother_that_cannot_be_solved_says_so_in_one_line(lag, monkeypatch):
-    def failing(_, key):
+    def failing(_, key, **__):
         raise RuntimeError(GTSAM_SAYS.format(key))
 
-    monkeypatch.setattr(smoother.Smoother, "_marginal", failing)
+    monkeypatch.setattr(incremental.Incremental, "_marginal", failing)
     with pytest.raises(RunFailedError) as raised:
         run(simulate(seconds=3.0), RunConfig("smoother", {} if lag is None else {"lag": lag}))
     text = str(raised.value)

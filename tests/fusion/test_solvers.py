@@ -40,7 +40,7 @@ def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):
     sigmas = []
 
     def watch(_, estimator):
-        sigmas.append(np.sqrt(np.diag(estimator._solver.covariance(pose_key(0)))))
+        sigmas.append(np.sqrt(np.diag(estimator._incremental._solver.covariance(pose_key(0)))))
 
     run(log, RunConfig("smoother", {"landmarks": "unknown"}, prior=START), watch=watch)
     assert np.allclose(sigmas, SIGMA, rtol=1e-4)
@@ -92,7 +92,7 @@ def test_our_factors_are_linearised_where_isam2_linearises(skip, log):
     moved = set()
 
     def watch(_, estimator):
-        solver = estimator._solver
+        solver = estimator._incremental._solver
         assert isinstance(solver, FullHistory)
         at = read_all(solver._isam.getLinearizationPoint(), solver._keys)
         for key, value in solver._at.items():

@@ -30,7 +30,7 @@ def made(seed: int = 0, name: str = "office"):
 
 def test_particles_begin_evenly_over_free_space_and_headings():
     estimator, _, space = made()
-    cloud = estimator._seek(Tick(0.0))
+    cloud = estimator._everywhere()
     assert len(cloud.poses) == 20_000
     assert np.allclose(cloud.weights, 1.0 / 20_000)
     assert (space.cells(cloud.poses[:, :2]) >= 0).all()
@@ -68,7 +68,7 @@ def test_stated_errors_fit_the_real_ones():
 def test_particles_that_run_into_walls_lose_their_weight():
     estimator, _, space = made()
     estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
-    estimator._t, estimator._state = 0.0, estimator._seek(Tick(0.0))
+    estimator._t, estimator._state = 0.0, estimator._everywhere()
     estimator._odometry = estimator._motion.state(0.0)
     for k in range(20):
         estimator.process(IncrementOdometry(0.1 * (k + 1), 0.1, 0.0, 0.0))

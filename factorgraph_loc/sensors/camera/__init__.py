@@ -44,6 +44,7 @@ SENSOR = SensorType(
         "camera": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
         "camera_right": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
     },
+    bind="factorgraph_loc.sensors.camera.bound:bind",
     summarize="factorgraph_loc.sensors.camera.summary:summarize",
     prepare="factorgraph_loc.sensors.camera.prepare:prepare",
     doubts="factorgraph_loc.sensors.camera.describe:doubts",

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.known_position import KnownPosition
 from factorgraph_loc.model.belief import Mode, PosePrior
+from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.sensors.camera.sensor import KnownPoints, Pixels
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.vision.relocalization import FoundOnFloor
 from factors import positive, se2
 from factors.motion import ChainState, propagate
@@ -43,17 +43,14 @@ class _Fix:
 class PixelFinder:
     """Poses from frames; see the module."""
 
+    at_once = True
+
     def __init__(self, points: KnownPoints, motion: Motion) -> None:
         self._points, self._motion = points, motion
         self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
         self._fixes: list[_Fix] = []
         self._stamps: list[tuple[float, bool]] = []
         self._fruitless = -np.inf
-
-    @property
-    def known(self) -> bool:
-        """Whether there is a camera, and a point in the map."""
-        return self._points.known
 
     @property
     def newest(self) -> ChainState | None:
@@ -86,7 +83,10 @@ class PixelFinder:
         enough = len(poor) >= POOR_FRAMES and poor[0] - poor[-1] >= POOR_TIME
         return poor[-1] if enough else None
 
-    def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array) -> float | None:
+    def follow(self, observation: object, odometry: ChainState, view: object) -> None:
+        """Nothing: what is missed in an image tells whether a track is lost."""
+
+    def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """Since when a track must have been wrong, after a frame was taken at its ``pose`` (3,): points were missed since then, and
         the last frames agree on another place. None where they do not.
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.variable import Estimated
 from factorgraph_loc.sensors.camera.clock_check import ClockCheck
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.odometry.motion import Motion
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
@@ -27,7 +27,7 @@ from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
-from factors.update import Update, robust_update, update_state
+from factors.update import Correction, robust_update, update_state
 
 DISAGREES = "camera: does not agree with the others"  # why a sighting is rejected
 CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
@@ -164,7 +164,7 @@ class KnownPoints:
         camera = CameraPose(position, rotation, covariance)
         return on_floor(self.model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
 
-    def report(self, t: float, factor: ReprojectionFactor, update: Update) -> None:
+    def report(self, t: float, factor: ReprojectionFactor, update: Correction) -> None:
         """Record the innovation of an update at time ``t``."""
         self._diagnostics.innovation("camera", t, update.nis, update.dof)
         u, v = (-factor.model.sigma * update.residual.T).tolist()
@@ -235,7 +235,7 @@ def pixel_update(
     covariance: Array,
     constants: Array | None = None,
     spread: Array | None = None,
-) -> Update:
+) -> Correction:
     """Kalman update, up to the optimum, of ``pose`` (3,) with body-frame ``covariance`` (3, 3), then of the changes of the camera's
     constants (P,), with their ``spread`` (P, P), where they are estimated."""
     if constants is None or spread is None:

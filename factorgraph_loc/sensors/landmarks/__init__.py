@@ -16,6 +16,7 @@ SENSOR = SensorType(
     ),
     settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
     layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.map:Landmark")},
+    bind="factorgraph_loc.sensors.landmarks.bound:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",
     findable="factorgraph_loc.sensors.landmarks.describe:findable",

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.fusion.known_position import KnownPosition
-from factorgraph_loc.model.belief import PosePrior, Status
+from factorgraph_loc.model.belief import Mode, PosePrior, Status
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.window import Sighting, Window
-from factorgraph_loc.sensors.odometry.motion import Motion
 from factors import positive, se2
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import BearingRangeModel, robust_loss
@@ -48,15 +48,12 @@ FOUND_HEADING = 0.3  # rad, of a heading where the position was known: there is 
 
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """A pose (3,) with covariance (3, 3) in the world's frame, and its posterior probability.
+class Hypothesis(Mode):
+    """A mode whose weight is its posterior probability.
 
     ``explained``: how many sightings lie within the gate; ``share``: of all; ``landmarks``: of how many different ones.
     """
 
-    weight: float
-    pose: Array
-    covariance: Array
     explained: int
     share: float
     landmarks: int

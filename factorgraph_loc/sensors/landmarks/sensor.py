@@ -14,7 +14,7 @@ from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import BearingRangeModel, sigmas
 from factors.motion import Increment
 from factors.se2 import Array
-from factors.update import Update
+from factors.update import Correction
 
 EXACT = 0.1  # a survey that is so much better than the sensor (as a share of its sigma) is taken as exact
 
@@ -118,7 +118,7 @@ class KnownLandmarks:
             for name, no_range, no_bearing in lacks
         )
 
-    def report(self, t: float, factor: BearingRangeFactor, update: Update) -> None:
+    def report(self, t: float, factor: BearingRangeFactor, update: Correction) -> None:
         """Record the innovation of an update at time ``t``."""
         self._diagnostics.innovation("bearing_range", t, update.nis, update.dof)
         errors = -update.residual * sigmas(factor.model, factor.ranges)

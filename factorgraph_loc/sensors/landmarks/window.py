@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from factorgraph_loc.fusion.known_position import KnownPosition
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, robust_loss, robust_weight, sigmas
 from factors.motion import ChainState

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Odometry
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.variable import NOTHING
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factorgraph_loc.sensors.odometry.model import odometry_model
-from factorgraph_loc.sensors.twist.measurement import Twist
 from factors import se2
 from factors.motion import ChainState, Increment
+from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
+from factors.odometry.model import PARAMETERS, OdometryFactor, between_factor, recalibrated
 from factors.se2 import Array
 
 HORIZON = 5.0  # s of odometry that are kept
+UNUSED = {"imu": "yaw rate", "twist": "motion in space"}  # what is said of rows of a sensor that is not used
 TWIST_TIME = 0.1  # s over which the velocity is taken
 
 
@@ -31,6 +35,7 @@ class Motion:
     ) -> None:
         self._rig = rig
         self._constants_as_noise = not self_calibration
+        self.constants = rig.estimated("odometry") if self_calibration else NOTHING
         self._use_gyro = "imu" in sensors
         self._use_wheels = "odometry" in sensors
         self.horizon = HORIZON
@@ -45,24 +50,20 @@ class Motion:
         model = odometry_model(self._rig, use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
-    def add(self, m: Odometry) -> None:
+    def add(self, m: Measurement) -> None:
         """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
-        if isinstance(m, Twist):
-            self._diagnostics.ignore("motion in space")
-            return
-        if isinstance(m, YawRate) and not self._use_gyro:
-            self._diagnostics.ignore("yaw rate")
-        elif not isinstance(m, YawRate) and not self._use_wheels:
-            self._diagnostics.ignore("odometry")
-        elif not self._add(m):
+        match m:
+            case YawRate() if self._use_gyro:
+                kept = self._chain.add_yaw_rate(m.t, m.w)
+            case VelocityOdometry() if self._use_wheels:
+                kept = self._chain.add_velocity(m.t, m.v, m.w)
+            case IncrementOdometry() if self._use_wheels:
+                kept = self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
+            case _:
+                self._diagnostics.ignore(UNUSED.get(m.sensor, m.sensor))
+                return
+        if not kept:
             self._diagnostics.drop_late("odometry")
-
-    def _add(self, m: VelocityOdometry | IncrementOdometry | YawRate) -> bool:
-        if isinstance(m, VelocityOdometry):
-            return self._chain.add_velocity(m.t, m.v, m.w)
-        if isinstance(m, IncrementOdometry):
-            return self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
-        return self._chain.add_yaw_rate(m.t, m.w)
 
     def state(self, t: float) -> ChainState:
         return self._chain.state(t)
@@ -70,18 +71,41 @@ class Motion:
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         return self._chain.relative(start, end)
 
-    def places(self, start: ChainState, t: Array, changes: Array | None = None) -> Array:
-        """Poses (N, 3) at times (N,), before or after, in the frame of the pose at ``start``; ``changes``: of the constants
-        :data:`factors.odometry.model.PARAMETERS`, taken as :func:`factors.odometry.model.recalibrated` does."""
+    def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
+        """``delta`` (3,) of an increment under changed ``constants`` (P,), and the Jacobian (3, P) of its perturbation."""
+        delta, jacobian = recalibrated(increment, self._full(constants))
+        return delta, jacobian[:, list(self.constants.indices)]
+
+    def recalibrated(self, increment: Increment, constants: Array) -> Increment:
+        """An increment under changed ``constants`` (P,)."""
+        if not self.constants.names:
+            return increment
+        delta = kernels.recalibrated(increment.delta, increment.moving, self._full(constants))
+        return Increment(delta, increment.covariance, increment.duration, increment.still)
+
+    def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
+        """Poses (R, 3) at times (R,), before or after, in the frame of the pose at ``start``, under changed ``constants`` (P,),
+        taken as :func:`factors.odometry.model.recalibrated` does."""
         states = self._chain.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
-        if changes is None:
+        if not self.constants.names:
             return deltas
-        moved, later = se2.log(deltas), t - start.t
+        changes, moved, later = self._full(constants), se2.log(deltas), t - start.t
         ways, moving = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1]), later - (states[:, 7] - start.still)
         moved[:, :2] *= 1.0 + changes[0]
         moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
         return np.asarray(se2.exp(moved))
+
+    def factor(self, increment: Increment) -> OdometryFactor:
+        """An increment as a factor on two poses, and on the constants where there are any."""
+        return OdometryFactor(increment, self.constants.indices)
+
+    def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
+        """An increment without constants as a factor of GTSAM's on two poses."""
+        return between_factor(*keys, increment)
+
+    def _full(self, constants: Array) -> Array:
+        return self.constants.full(constants, len(PARAMETERS))
 
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in its own frame."""

@@ -37,6 +37,7 @@ SENSOR = SensorType(
             suffix=".tags.csv",
         )
     },
+    bind="factorgraph_loc.sensors.rfid.bound:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
     findable="factorgraph_loc.sensors.rfid.describe:findable",

@@ -103,7 +103,7 @@ def test_strengths_place_the_robot_but_are_no_evidence():
         found[sensors] = scans.update(m, looks, pose, covariance)
     without, with_strength = found.values()
     assert with_strength.evidence == pytest.approx(without.evidence)
-    assert with_strength.surprise == pytest.approx(without.surprise)
+    assert with_strength.excess_nll == pytest.approx(without.excess_nll)
     # twice as strong as from where the robot was thought to be: nearer to the tag
     assert with_strength.pose[0] > without.pose[0] + 1e-3
 

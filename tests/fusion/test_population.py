@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.search import Seeker
+from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.odometry.motion import Motion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.rfid.bound import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
 from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.factor import RfidFactor
 
 NOISE = OdometryNoise(
     along=GrowthSettings(per_distance=0.01),
@@ -36,6 +38,7 @@ class World:
         self.rng = np.random.default_rng(seed)
         points = np.column_stack((points, np.full(len(points), 1.2)))
         self.likelihood = RfidLikelihood(rfid.model(), TagArray(points, np.full(len(points), np.nan)))
+        self.told = self.likelihood  # what the seeker believes
         self.motion = Motion(RIG, ("odometry", "rfid"), Diagnostics())
         self.motion.add(VelocityOdometry(0.0, SPEED, turn))
         self.truth = START
@@ -43,14 +46,15 @@ class World:
         self.silent = False
 
     def seeker(self):
-        return Seeker(self.likelihood, self.motion, BOUNDS, np.random.default_rng(self.rng.integers(2**32)))
+        return Population(self.motion, BOUNDS, np.random.default_rng(self.rng.integers(2**32)))
 
     def scan(self, seeker):
         if self.t > 0.0:
             self.motion.add(VelocityOdometry(self.t, SPEED, self.turn))
         n = self.antennas
         looks = Looks(np.zeros((n, 3)), np.arange(n), np.ones(n, dtype=np.int64), self.hits())
-        seeker.add(self.motion.state(self.t), looks)
+        factor = RfidFactor(self.told, looks)
+        seeker.add(self.motion.state(self.t), TagObservation(self.t, factor, int(looks.hits.sum()), looks))
         at, self.t = self.truth, self.t + STEP
         self.truth = se2.compose(at, se2.exp(np.array((SPEED, 0.0, self.turn)) * STEP))
         return at
@@ -89,7 +93,8 @@ def test_evidence_favours_a_world_that_fits():
         other = RfidLikelihood(
             RIG.rfid.model(), TagArray(np.column_stack((points, np.full(25, 1.2))), np.full(25, np.nan))
         )
-        seeker = Seeker(other, world.motion, BOUNDS, np.random.default_rng(3))
+        seeker = Population(world.motion, BOUNDS, np.random.default_rng(3))
+        world.told = other
         for _ in range(6):
             world.scan(seeker)
         found.append(seeker.log_evidence)
@@ -136,14 +141,14 @@ def test_found_after_silence():
     assert np.linalg.norm(seeker.best.pose[:2] - at[:2]) < 0.5
 
 
-def test_a_scan_that_comes_again_is_left_out():
+def test_a_scan_that_is_older_than_the_last_is_left_out():
     world = World(scattered(0), 0)
     seeker = world.seeker()
     world.scan(seeker)
     before = seeker.log_evidence
-    assert not seeker.add(
-        world.motion.state(0.0), Looks(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, 25), int))
-    )
+    looks = Looks(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, 25), int))
+    older = TagObservation(-0.1, RfidFactor(world.likelihood, looks), 25, looks)
+    assert not seeker.add(world.motion.state(-0.1), older)
     assert seeker.log_evidence == before
 
 

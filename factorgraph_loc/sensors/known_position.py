@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.cloud import gaussian
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.model.motion import Motion
 from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
@@ -63,10 +62,10 @@ class KnownPosition:
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
         """Present poses (N, 3), drawn; of their headings one in each of ``count`` equal parts."""
         moved = self.motion.relative(self.odometry, now)
-        positions = self.prior.pose[:2] + gaussian(self.prior.covariance[:2, :2], count, rng)
+        positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
         poses = se2.compose(np.column_stack((positions, headings)), moved.delta)
-        return se2.compose(poses, se2.exp(gaussian(moved.covariance, count, rng)))
+        return se2.compose(poses, se2.exp(positive.draws(moved.covariance, count, rng)))
 
     def loss(self, poses: Array, now: ChainState, spread: Array | None = None) -> Array:
         """Half the squared Mahalanobis distance (N,) of present poses (N, 3) from it. ``spread`` (3, 3): body-frame covariance by

@@ -1,0 +1,271 @@
+"""Turns measurements into a graph: where keyframes stand, and what becomes a factor on them.
+
+A keyframe stands at each stamp of a sensor, unless the one before is nearer than its interval, and at least every
+``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one, displaced by
+the odometry since.
+
+Sensors that gather, as RFID readers do, come many times a second and each time tell little. Their observations from one keyframe to
+the next make few factors, which enter the graph with the next keyframe; until then the newest pose is updated by them alone, as a
+filter would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from factorgraph_loc.fusion.graph import MOTION, Graph
+from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
+from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.search import Search, laplace_evidence
+from factorgraph_loc.fusion.variables import Node
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.sensors.base import NewVariable, Observation, Sensor
+from factors import se2
+from factors.motion import Increment, propagate
+from factors.se2 import Array
+
+ITERATIONS_OF_GUESS = 1
+MAPPING_KEYFRAME_INTERVAL = 0.5  # s, where landmarks are estimated too
+
+
+class Backend(Protocol):
+    """What keeps a graph solved, or its guess; it brings pose and covariance of the newest keyframe up to date."""
+
+    def extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
+        """Take a new keyframe and what came with it. The guess of its pose is in ``addition``, its body-frame covariance is
+        ``spread`` (3, 3)."""
+
+    def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        """Take what was added to a keyframe that is in the graph. ``guess``: pose and covariance of the newest keyframe after the
+        update, where it is that."""
+
+    def refine(self, newest: Keyframe, guess: Guess) -> None:
+        """Take pose and covariance of the newest keyframe from observations that are not yet in the graph."""
+
+    def guess_of(self, keyframe: int) -> Guess:
+        """The causal estimate of a keyframe."""
+
+    def current(self, key: int) -> Array:
+        """The newest estimate of a variable that is in the graph."""
+
+    def is_open(self, keyframe: int) -> bool:
+        """Whether factors may still be added to a keyframe."""
+
+
+@dataclass
+class _View:
+    """What sensors see of the graph: the ``guess`` of one keyframe."""
+
+    graph: Graph
+    keyframe: Keyframe
+    guess: Guess
+    offset: Increment | None
+    newest: bool
+    localized: bool = True
+
+    @property
+    def t(self) -> float:
+        return self.keyframe.t
+
+    @property
+    def pose(self) -> Array:
+        return self.guess[0]
+
+    @property
+    def covariance(self) -> Array:
+        return self.guess[1]
+
+    def value(self, name: str) -> Array | None:
+        return self.graph.values[self.graph.keys[name]] if name in self.graph.keys else None
+
+    def spread(self, name: str) -> Array:
+        return self.graph.spreads[self.graph.keys[name]]
+
+    def joint(self) -> tuple[Array, Mapping[str, slice]]:
+        return self.guess[1], {}
+
+    def poses_at(self, times: Array) -> Array:
+        constants = self.graph.value(MOTION, np.zeros(0))
+        return self.graph.motion.poses_at(self.keyframe.odometry, times, constants)
+
+    def on_pose(self, observation: Observation) -> Observation:
+        """An observation of the pose alone, with its blocks where they are estimated to be."""
+        values = {name: self.graph.value(name) for name in observation.blocks}
+        return observation.on_pose(values, {name: self.spread(name) for name in observation.blocks})
+
+
+class Builder:
+    """Builds a graph as measurements come; see the module."""
+
+    def __init__(self, graph: Graph, backend: Backend, search: Search, settings: GraphSettings) -> None:
+        self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
+        self._waiting: list[Observation] = []  # on the newest keyframe
+        self._gatherer: Sensor | None = None  # whose they are
+
+    def pass_time(self, t: float) -> None:
+        """A tick."""
+        graph = self._graph
+        graph.t = max(graph.t, t)
+        if t - graph.newest.t >= self._settings.keyframe_max_interval:
+            self._add_keyframe(t, None)
+        before = graph.before(t)
+        since = graph.motion.relative(before.odometry, graph.motion.state(t))
+        graph.ticks.append(TickAt(t, before.index, since))
+
+    def take(self, m: Measurement) -> bool:
+        """Take a measurement; False where it is too late."""
+        graph, sensor = self._graph, self._graph.sensors[m.modality]
+        graph.t = max(graph.t, m.t)
+        due = any(mapper.is_due(m) for mapper in graph.mappers) and m.t > graph.newest.t
+        if m.t - graph.newest.t >= self._interval(sensor) or due:
+            self._add_keyframe(m.t, None if sensor.gathers else m)
+            if not sensor.gathers:
+                return True
+        before, newest = graph.before(m.t), graph.newest
+        if before is not newest and not self._backend.is_open(before.index):
+            return False
+        offset = graph.since(before, m.t) if m.t > before.t else None
+        if sensor.gathers and before is newest:
+            self._gather_from(sensor, m, offset)
+            return True
+        addition = Addition(self.gather())
+        guess = self._see(before, m, offset, (graph.pose, graph.covariance) if before is newest else None, addition)
+        if addition.nodes:
+            self._backend.attach(before, addition, guess)
+        return True
+
+    def gather(self) -> list[Node]:
+        """What waits on the newest keyframe becomes factors of it."""
+        nodes = self.waiting()
+        self._graph.newest.nodes += nodes
+        self._waiting = []
+        return nodes
+
+    def waiting(self) -> list[Node]:
+        """What waits on the newest keyframe and is in no graph yet, as factors."""
+        if self._gatherer is None:
+            return []
+        terms = self._gatherer.gathered(self._waiting)
+        return [self._graph.node(self._graph.newest, term, self._gatherer.modality) for term in terms]
+
+    def clear(self) -> None:
+        """A new track begins: nothing waits."""
+        self._waiting = []
+
+    def _interval(self, sensor: Sensor) -> float:
+        """How far [s] keyframes for a sensor are apart."""
+        if sensor.gathers:
+            return sensor.keyframe_every
+        if self._settings.keyframe_interval is not None:
+            return self._settings.keyframe_interval
+        return sensor.keyframe_every if self._settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
+
+    def _gather_from(self, sensor: Sensor, m: Measurement, offset: Increment | None) -> None:
+        """Update the newest pose by what a sensor tells, which waits from now on."""
+        graph = self._graph
+        if self._gatherer is not sensor:
+            nodes = self.gather()
+            if nodes:
+                self._backend.attach(graph.newest, Addition(nodes), (graph.pose, graph.covariance))
+            self._gatherer = sensor
+        odometry = graph.motion.state(m.t)
+        view = _View(graph, graph.newest, (graph.pose, graph.covariance), offset, newest=True)
+        for seen in sensor.observe(m, view):
+            if isinstance(seen, NewVariable):
+                continue
+            correction = seen.correct(*view.guess, {}, {}, seen.iterations or ITERATIONS_OF_GUESS)
+            if seen.is_judged and not sensor.judge(seen, correction, view):
+                continue
+            evidence = laplace_evidence(seen, *view.guess, correction)
+            self._waiting.append(seen)
+            graph.pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
+            graph.covariance = correction.covariance
+            view.guess = graph.pose, graph.covariance
+            self._backend.refine(graph.newest, view.guess)
+            self._search.keep(sensor, seen, odometry, evidence)
+
+    def _add_keyframe(self, t: float, m: Measurement | None) -> None:
+        graph = self._graph
+        newest, odometry = graph.newest, graph.motion.state(t)
+        increment = graph.motion.relative(newest.odometry, odometry)
+        moved = graph.recalibrated(increment)
+        keyframe = Keyframe(newest.index + 1, t, odometry, increment)
+        guess: Guess | None = (se2.compose(graph.pose, moved.delta), propagate(graph.covariance, moved))
+        addition = Addition(self.gather())
+        graph.append(keyframe)
+        if m is not None:
+            guess = self._see(keyframe, m, None, guess, addition, is_new=True)
+        assert guess is not None
+        addition.values[keyframe.key] = guess[0]
+        self._backend.extend(keyframe, addition, guess[1])
+
+    def _see(
+        self,
+        keyframe: Keyframe,
+        m: Measurement,
+        offset: Increment | None,
+        guess: Guess | None,
+        addition: Addition,
+        *,
+        is_new: bool = False,
+    ) -> Guess | None:
+        """Turn a measurement into factors of ``keyframe``; returned is the guess of its pose, updated by them.
+
+        The guess is where the graph linearises first, and what the robust weights are computed at. Without one the keyframe is an
+        older one: what is not yet in the graph stays out, and the innovation is that of its causal estimate.
+        """
+        graph, sensor = self._graph, self._graph.sensors[m.modality]
+        odometry = graph.motion.state(m.t)
+        expected = self._backend.guess_of(keyframe.index) if guess is None else guess
+        view = _View(graph, keyframe, expected, offset, newest=guess is not None)
+        for seen in sensor.observe(m, view):
+            if isinstance(seen, NewVariable):
+                self._add_block(seen, sensor, view, addition)
+                continue
+            here = view.on_pose(seen)
+            correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
+            if seen.is_judged and not sensor.judge(here, correction, view):
+                continue
+            nodes = [graph.node(keyframe, term, sensor.modality) for term in seen.terms]
+            keyframe.nodes += nodes
+            addition.nodes += nodes
+            if guess is not None:
+                self._search.expect(sensor, here, odometry, view)
+                evidence = laplace_evidence(here, *view.guess, correction) if self._search.weighs else 0.0
+                self._search.keep(sensor, here, odometry, evidence)
+                pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
+                view.guess = pose, correction.covariance[:3, :3]
+        if guess is None:
+            return None
+        guess = view.guess
+        for mapper in graph.mappers:
+            if keyframe is graph.newest and m.t == keyframe.t:
+                guess = mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
+        return guess
+
+    def _graph_view(self, sensor: Sensor) -> GraphView:
+        graph, backend = self._graph, self._backend
+
+        def between(first: Keyframe, last: Keyframe) -> Increment:
+            return graph.recalibrated(graph.motion.relative(first.odometry, last.odometry))
+
+        estimates = graph.values, graph.spreads, backend.current, backend.is_open
+        key = graph.keys.get(sensor.modality)
+        shared = () if key is None else (key,)
+        constants = None if key is None else graph.values[key]
+        return GraphView(graph.keyframes, *estimates, between, shared, constants)
+
+    def _add_block(self, new: NewVariable, sensor: Sensor, view: _View, addition: Addition) -> None:
+        """A landmark comes into the graph, with the sightings that told it."""
+        key = self._graph.new_block(new, view.covariance)
+        addition.values[key] = new.mean
+        for t, seen in new.sightings:
+            keyframe = self._graph.before(t)
+            if self._backend.is_open(keyframe.index):
+                nodes = [self._graph.node(keyframe, term, sensor.modality) for term in seen.terms]
+                keyframe.nodes += nodes
+                addition.nodes += nodes

@@ -1,0 +1,276 @@
+"""An estimator that is a graph: it takes measurements, finds its place, and tells what it believes.
+
+Before the start the last measurements are kept until they tell one place; then they are taken in from their first on. So they are
+where the start is known but for its heading; the graph then begins at that start. On the way, when what is seen refutes the track
+and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from factorgraph_loc.fusion.base import EVERY
+from factorgraph_loc.fusion.builder import Backend, Builder
+from factorgraph_loc.fusion.graph import Graph
+from factorgraph_loc.fusion.graph_parts import GraphSettings, Keyframe
+from factorgraph_loc.fusion.mapping import Mapper
+from factorgraph_loc.fusion.search import DURATION, Search
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status, gaussian_belief
+from factorgraph_loc.model.diagnostics import NOTHING_WRITTEN, Diagnostics, Written
+from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.setup import Calibration, Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.plugins import MAPPERS
+from factorgraph_loc.sensors.binding import bound_motion, bound_sensors
+from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
+from factors import se2
+from factors.motion import Increment, propagate
+from factors.se2 import Array
+
+# m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
+UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
+
+
+class SolvingBackend(Backend, Protocol):
+    """A backend of an estimator."""
+
+    def begin(self, newest: Keyframe) -> None:
+        """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
+
+    def final(self, graph: Graph) -> tuple[Array, Array]:
+        """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3).
+
+        ``graph`` is a copy, which may be changed; all else may only be read.
+        """
+
+
+@dataclass(frozen=True)
+class _Conclusion:
+    """A graph that is solved to its end: poses (M, 3) and body-frame covariances (M, 3, 3) of all its keyframes."""
+
+    graph: Graph
+    poses: Array
+    covariances: Array
+
+
+class GraphEstimator(ABC):
+    """A graph with the backend that solves it; see the module."""
+
+    deterministic = True
+    modalities = EVERY
+    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
+
+    def __init__(self, setup: Setup, settings: GraphSettings) -> None:
+        self.diagnostics = Diagnostics()
+        self._max_delay = settings.max_delay
+        calibration: Calibration = "all" if settings.self_calibration else "none"
+        self._motion = bound_motion(setup, self.diagnostics, self_calibration=settings.self_calibration)
+        sensors = bound_sensors(setup, self._motion, self.diagnostics, use=settings.landmarks, calibration=calibration)
+        mappers: list[Mapper] = []
+        for bind in MAPPERS.values():
+            found = bind(sensors, self.diagnostics, settings)
+            if found is not None:
+                mappers.append(found)
+        self._graph = Graph(self._motion, sensors, mappers, self.diagnostics)
+        self._search = Search(sensors, self._motion, setup.rng)
+        self._search.remember()
+        # where landmarks are estimated too, they cannot tell the place
+        self.supports_unknown_start = settings.landmarks == "known"
+        self._backend = self._new_backend(self._graph)
+        self._builder = Builder(self._graph, self._backend, self._search, settings)
+        # the last measurements, in the order in which they were taken, with what the diagnostics say of them
+        self._recent: deque[tuple[Measurement, Written]] = deque()
+        self._conclusion: _Conclusion | None = None  # the end, until something is taken
+
+    @abstractmethod
+    def _new_backend(self, graph: Graph) -> SolvingBackend:
+        """What solves the graph."""
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian; without a heading, once what is seen tells it."""
+        if not prior.has_heading:
+            self._graph.t = prior.t
+            self._search.begin(KnownPosition(prior, self._motion))
+            return
+        self._search.begin_track(found=False)
+        self._backend.begin(self._graph.begin(prior))
+
+    def process(self, measurement: Measurement) -> None:
+        """Take one measurement, in time or late by at most ``max_delay``."""
+        self._conclusion = None
+        graph = self._graph
+        if measurement.is_motion:
+            self._motion.add(measurement)
+        elif not (isinstance(measurement, Tick) or measurement.modality in graph.sensors):
+            self.diagnostics.ignore(measurement.modality, measurement.count)
+        elif graph.prior is None:
+            self._seek(measurement)
+        elif measurement.t < max(graph.t - self._max_delay, graph.prior.t):
+            self._drop_late(measurement)
+        else:
+            on_time = measurement.t >= graph.t
+            self._take(measurement)
+            if on_time and not isinstance(measurement, Tick):
+                self._doubt(measurement)
+
+    def estimate(self, t: float | None = None) -> PoseEstimate:
+        """The newest keyframe, moved along the odometry since, to the newest time or to ``t`` if that is later; before the start
+        the likeliest place, if there is any.
+
+        ``ambiguous`` before one place is clear, and while what is seen is not what is expected.
+        """
+        graph = self._graph
+        at = graph.t if t is None else max(t, graph.t)
+        if graph.prior is None:
+            modes = self._search.modes(at)
+            if not modes:
+                return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+            return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
+        pose, covariance = self._pose_at(at)
+        status: Status = "ambiguous" if self._search.doubts else "localized"
+        return PoseEstimate(at, pose, se2.body_to_world(pose, covariance), status)
+
+    def belief(self, t: float | None = None) -> Belief:
+        """The belief behind :meth:`estimate`; before the start all places that what was seen allows, and the particles of a search
+        that has them."""
+        if self._graph.prior is not None:
+            return gaussian_belief(self.estimate(t))
+        at = self._graph.t if t is None else max(t, self._graph.t)
+        particles = self._search.particles(at)
+        return Belief(tuple(self._search.modes(at)), *(() if particles is None else particles))
+
+    def learnt(self) -> Learnt:
+        """The constants and landmarks that are estimated, as the final trajectory has them."""
+        return self._graph.learnt() if self._graph.prior is None else self._concluded().graph.learnt()
+
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
+        if self._graph.prior is None:
+            return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+        end = self._concluded()
+        return end.graph.between(end.poses, end.covariances)
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, and what the final trajectory adds to them."""
+        return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
+
+    def _concluded(self) -> _Conclusion:
+        """The graph as it is at its end, which is solved beside it: nothing that comes later shall depend on who asked."""
+        if self._conclusion is None:
+            graph = self._graph.copy()
+            graph.keyframes[-1].nodes += self._builder.waiting()
+            self._conclusion = _Conclusion(graph, *self._backend.final(graph))
+        return self._conclusion
+
+    def _pose_at(self, t: float) -> tuple[Array, Array]:
+        """The newest pose (3,) with its body-frame covariance (3, 3), moved along the odometry to ``t``."""
+        graph = self._graph
+        if t <= graph.newest.t:
+            return graph.pose, graph.covariance
+        since = graph.since(graph.newest, t)
+        return se2.compose(graph.pose, since.delta), propagate(graph.covariance, since)
+
+    def _drop_late(self, m: Measurement) -> None:
+        if not isinstance(m, Tick):
+            self.diagnostics.drop_late(m.modality, m.count)
+
+    def _take(self, m: Measurement) -> None:
+        mark = self.diagnostics.mark()
+        self._graph.anchor()
+        if isinstance(m, Tick):
+            self._builder.pass_time(m.t)
+        elif not self._builder.take(m):
+            self._drop_late(m)
+        self._remember(m, self.diagnostics.since(mark))
+
+    def _remember(self, m: Measurement, written: Written = NOTHING_WRITTEN) -> None:
+        self._recent.append((m, written))
+        while self._recent[0][0].t < m.t - (DURATION if self._search.start is None else START_KEPT):
+            self._recent.popleft()
+
+    def _take_back(self, t: float) -> list[Measurement]:
+        """The last measurements from ``t`` on, by their times: forgotten, as they are taken once more."""
+        again = [(m, written) for m, written in self._recent if m.t >= t]
+        self._recent = deque((m, written) for m, written in self._recent if m.t < t)
+        for _, written in reversed(again):
+            self.diagnostics.take_back(written)
+        return sorted((m for m, _ in again), key=lambda m: m.t)
+
+    def _seek(self, m: Measurement) -> None:
+        """Before the start: see whether what was seen tells one place by now, and start there."""
+        graph, start = self._graph, self._search.start
+        if start is not None:
+            start.settle()
+            if m.t < max(start.t, graph.t - self._max_delay):
+                self._drop_late(m)
+                return
+        graph.t = max(graph.t, m.t)
+        told = not isinstance(m, Tick) and self._search.look(m, self._motion.state(m.t))
+        if not told and self._search.newest is None and start is None:
+            return  # the run begins with the first measurement that tells something
+        self._remember(m)
+        best = self._search.best if told else None
+        if best is None:
+            return
+        replay = self._take_back(-math.inf)
+        self.diagnostics.events.append((m.t, "localized"))
+        t = replay[0].t
+        prior = PosePrior(t, self._placed(t, best), UNKNOWN)
+        if start is not None and graph.t <= start.t + START_KEPT:
+            prior = start.facing(float(self._placed(start.t, best)[2]))
+        self.initialize(prior)
+        self._replay(replay)
+
+    def _doubt(self, m: Measurement) -> None:
+        """See whether what is seen refutes the track, and go on at the place that it tells."""
+        pose, covariance = self._pose_at(m.t)
+
+        def back(t: float, here: Array) -> Array:
+            return self._placed(t, PosePrior(m.t, here, covariance))
+
+        refuted = self._search.refuted(m, self._motion.state(m.t), pose, covariance, back)
+        best = None if refuted is None else self._search.best
+        if refuted is not None and best is not None:
+            what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
+            self.diagnostics.events.append((self._graph.t, what))
+            self._go_on(refuted.since, best)
+
+    def _go_on(self, since: float, best: PosePrior) -> None:
+        """Take back what was added since then, and add it once more at the ``best`` place."""
+        graph = self._graph
+        index = max(1, bisect.bisect_left(graph.times, since, graph.times.first))
+        while not self._backend.is_open(index - 1):
+            index += 1
+        replay = self._take_back(max(since, graph.keyframes[index - 1].t))
+        t = replay[0].t
+        del graph.keyframes[index:], graph.times[index:]
+        graph.ticks = [tick for tick in graph.ticks if tick.keyframe < index and tick.t < t]
+        pose = self._placed(t, best)
+        jump = Increment(se2.between(self._backend.guess_of(index - 1)[0], pose), UNKNOWN, t - graph.newest.t)
+        keyframe = Keyframe(index, t, self._motion.state(t), jump)
+        graph.append(keyframe)
+        graph.pose, graph.covariance = pose, UNKNOWN
+        self._builder.clear()
+        for sensor in graph.sensors.values():
+            sensor.restart(t)
+        graph.forget_points()
+        self._backend.begin(keyframe)
+        self._replay(replay)
+
+    def _placed(self, t: float, best: PosePrior) -> Array:
+        """Where the robot was at ``t``, from the place that was found and the odometry since."""
+        moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
+        return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
+
+    def _replay(self, measurements: list[Measurement]) -> None:
+        self._search.begin_track(found=True)
+        for m in measurements:
+            self._take(m)

@@ -1,0 +1,403 @@
+"""A graph kept solved by iSAM2 (Kaess et al., IJRR 31(2), 2012), with its full history or with a window.
+
+GTSAM's solvers are lost after any exception in an update, so everything that is in the graph is also kept beside them, and a solver
+is rebuilt from that.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factorgraph_loc.fusion.graph import Graph
+from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.fusion.kept import Kept
+from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
+from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Solver, Window, read_all
+from factorgraph_loc.fusion.stalled import Stalled
+from factorgraph_loc.fusion.summary import Summary, is_missing
+from factorgraph_loc.fusion.variables import (
+    Node,
+    Values,
+    gtsam_errors,
+    index_of,
+    is_landmark,
+    is_point,
+    is_pose,
+)
+from factors import positive, se2
+from factors.se2 import Array
+
+NOWHERE: Mapping[int, Array] = {}
+# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
+JUMPED = 50.0
+ITERATIONS_AFTER_FAILURE = 10
+# m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
+NEAR_POINTS = 0.02
+
+
+@dataclass(frozen=True)
+class IncrementalSettings:
+    """``lag`` [s] of a window, None for the full history; ``smooth`` off: the end repeats what was believed on the way.
+
+    ``relinearize_*``: see :class:`~factorgraph_loc.fusion.smoother.SmootherSettings`. ``waits``: what is seen between keyframes
+    waits for the next one; ``solve_every`` [s]: how long measurements may wait for the solver.
+    """
+
+    lag: float | None
+    smooth: bool
+    relinearize_threshold: float
+    relinearize_skip: int
+    waits: bool
+    solve_every: float
+
+
+class Incremental:
+    """The backend of the smoother; see the module."""
+
+    def __init__(self, graph: Graph, settings: IncrementalSettings) -> None:
+        self._graph, self._settings = graph, settings
+        self._maps = any(mapper.estimates for mapper in graph.mappers)
+        self._failed: list[str] = []
+        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
+        self._factorization = "CHOLESKY" if self._maps else "QR"
+        self._solver = self._new_solver()
+        self._stalled: Stalled | None = None  # the last one
+        self._last = gtsam.Values()  # all estimates after the last update, where landmarks are estimated
+        self._waiting = Addition()
+        self._solved = -math.inf  # the time of the newest keyframe in the solver
+        # of each keyframe: its causal estimate, and the final one where it has left the window
+        self._filtered: Kept[Guess] = Kept()
+        self._left: Kept[Guess] = Kept()
+
+    def forget(self, before: float) -> None:
+        """Forget keyframes before then, as far as they have left the window; a full history keeps all."""
+        graph = self._graph
+        count = bisect.bisect_right(graph.times, before, graph.times.first) - 1
+        # points that wait are looked for in the newest ones
+        looked_back = 1 + max((mapper.horizon for mapper in graph.mappers), default=0)
+        count = min(count, len(self._left), len(graph.keyframes) - looked_back)
+        if count > graph.keyframes.first:
+            count = min(count, self._solver.oldest)  # it may have to be built anew
+        for kept in (graph.keyframes, graph.times, self._filtered, self._left):
+            kept.forget(count)
+        graph.ticks = [tick for tick in graph.ticks if tick.keyframe >= graph.keyframes.first]
+
+    def final(self, graph: Graph) -> tuple[Array, Array]:
+        """Full history: the whole graph, solved to the end. With a window: each pose as it left that, the others as they are
+        now; those that wait for the solver as they were expected."""
+        waiting = self._waiting.values
+        if not self._settings.smooth:
+            estimates = list(self._filtered)
+        elif self._settings.lag is None:
+            return self._optimum(graph, self.solved(graph))
+        else:
+            stalled, open_ones = isinstance(self._solver, Stalled), graph.keyframes[len(self._left) :]
+            try:
+                for key in () if stalled else graph.values.keys() - waiting.keys():
+                    graph.values[key], graph.spreads[key] = self._marginal(key, graph=graph)
+                now = [
+                    self._filtered[k.index] if stalled or k.key in waiting else self._marginal(k.key, graph=graph)
+                    for k in open_ones
+                ]
+            except RuntimeError as error:
+                raise graph.unsolved(error) from error
+            estimates = [*self._left, *now]
+        if self._waiting.nodes or len(graph.newest.nodes) > len(self._graph.newest.nodes):
+            estimates[-1] = graph.pose, graph.covariance
+        return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
+
+    def solved(self, graph: Graph) -> Values:
+        """The newest estimates of all variables of a copy of the graph."""
+        keys = [*(k.key for k in graph.keyframes), *graph.values]
+        waiting = self._waiting.values
+        return waiting | {key: self._solver.value(key) for key in keys if key not in waiting}
+
+    @staticmethod
+    def _optimum(graph: Graph, start: Values) -> tuple[Array, Array]:
+        """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the optimum next to ``start``."""
+        graph.drop_astray(graph.keyframes, start)
+        problem = graph.problem()
+        values = problem.solve(start).values
+        return np.array([values[k.key] for k in graph.keyframes]), graph.settle(problem, values)
+
+    def begin(self, newest: Keyframe) -> None:
+        """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
+        del self._filtered[newest.index :]
+        guess = self._graph.pose, self._graph.covariance
+        self._filtered.append(guess)
+        summary = self._solver.summary(failed=False)
+        try:
+            with gtsam_errors():
+                summary = None if summary is None else summary.before(newest.index)
+                self._graph.forget_landmarks(frozenset() if summary is None else summary.keys)
+                self._start_again(newest, summary)
+        except RuntimeError as error:
+            if newest.index == 0:
+                raise self._graph.unsolved(error) from error
+            self._stall(newest, guess, summary, error)
+
+    def guess_of(self, keyframe: int) -> Guess:
+        """The causal estimate of a keyframe."""
+        return self._filtered[keyframe]
+
+    def extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
+        """Take a new keyframe and what came with it."""
+        guess = addition.values[keyframe.key], spread
+        self._filtered.append(guess)
+        if keyframe.t < self._solved + self._settings.solve_every:
+            self._wait([self._odometry_node(keyframe), *addition.nodes], addition.values, guess)
+            return
+        self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
+
+    def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
+        """Take what was added to a keyframe that is in the graph."""
+        if guess is not None and (self._settings.waits or keyframe.t < self._solved + self._settings.solve_every):
+            self._wait(addition.nodes, addition.values, guess)
+            return
+        self._update(addition.nodes, addition.values)
+
+    def _wait(self, nodes: Sequence[Node], values: Values, guess: Guess) -> None:
+        """Keep what is to enter the solver with its next update; until then the newest pose is ``guess``."""
+        self._waiting.nodes += nodes
+        self._waiting.values |= values
+        self._graph.pose, self._graph.covariance = guess
+
+    def current(self, key: int) -> Array:
+        """The newest estimate of a variable that is in the graph."""
+        return self._solver.value(key)
+
+    def refine(self, newest: Keyframe, guess: Guess) -> None:
+        """Take pose and covariance of the newest keyframe from observations that are not yet in the graph."""
+        self._filtered[newest.index] = guess
+
+    def is_open(self, keyframe: int) -> bool:
+        """Whether factors may still be added to a keyframe."""
+        return max(0, len(self._left)) <= keyframe < len(self._graph.keyframes)
+
+    def _update(self, nodes: Sequence[Node], values: Values) -> None:
+        newest = self._graph.keyframes[-1]
+        nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
+        self._solved, guess = newest.t, self._filtered[newest.index]
+        if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
+            self._graph.pose, self._graph.covariance = guess  # the next try takes in what keyframes and constants hold
+            return
+        self._leave(newest.t, [k for k in self._graph.values if k not in values and not is_point(k)])
+        try:
+            with gtsam_errors():
+                self._solver.update(nodes, values, newest.t)
+                self._check_jump(newest, guess)
+                self._read(newest, {key for node in nodes for key in node.keys if key in self._graph.values})
+        except RuntimeError as error:
+            self._graph.diagnostics.events.append((newest.t, f"solver rebuilt: {self._graph.reason(error)}"))
+            self._rebuild(newest, guess)
+        while self._failed:
+            self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
+
+    def _check_jump(self, newest: Keyframe, guess: Guess) -> None:
+        """RuntimeError if points that are estimated took the newest pose where it cannot be."""
+        if not self._maps:
+            return
+        pose, spread = guess
+        off = se2.log(se2.between(pose, self._solver.value(newest.key)))
+        if not positive.squared(off, spread) < JUMPED:
+            raise RuntimeError("the estimate jumped")
+        self._last = self._solver.estimates()
+
+    def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
+        """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
+
+        Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
+        """
+        sensors = self._graph.sensors
+        followed = {
+            key
+            for name, key in self._graph.keys.items()
+            if is_landmark(key) or (name in sensors and sensors[name].follows_constants)
+        }
+        self._graph.pose, self._graph.covariance = self._marginal(newest.key)
+        self._filtered[newest.index] = (self._graph.pose, self._graph.covariance)
+        for key in touched:
+            if key not in followed:
+                value = self._solver.value(key)
+                if not np.all(np.isfinite(value)):
+                    raise IndeterminateError(key)
+                self._graph.values[key] = value
+            else:
+                self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
+
+    def _marginal(self, key: int, graph: Graph | None = None) -> tuple[Array, Array]:
+        """Estimate and covariance of a variable; ``graph``: where to report, of a copy."""
+        value = self._solver.value(key)
+        if not np.all(np.isfinite(value)):
+            raise IndeterminateError(key)
+        try:
+            covariance = self._solver.covariance(key)
+        except RuntimeError:
+            covariance = np.full((1, 1), np.nan)
+        if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
+            found = covariances(*self._solver.linear(), (key,))
+            (graph or self._graph).report_damping(found.damping)
+            covariance = found.by_key[key]
+        return value, positive.sound(covariance)
+
+    def _leave(self, now: float, constants: Iterable[int]) -> None:
+        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
+
+        ``constants``: those that are in the solver by now, which are brought up to date.
+        """
+        if not isinstance(self._solver, Window) or self._settings.lag is None:
+            return
+        lag, count = self._settings.lag, len(self._left)
+        if self._graph.keyframes[count].t >= now - lag - MARGIN:
+            return
+        end = count
+        while self._graph.keyframes[end].t < now - lag:
+            end += 1
+        leaving = self._graph.keyframes[count:end]
+        try:
+            covariances = self._solver.covariances([k.key for k in leaving])
+            self._left += [(self._solver.value(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
+            for key in constants:
+                self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
+        except RuntimeError:
+            self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
+        for mapper in self._graph.mappers:
+            self._forget(mapper.leave(now - lag))
+
+    def _forget(self, points: Iterable[int]) -> None:
+        """Keep the estimates of points that leave the window."""
+        for key in points:
+            try:
+                self._graph.departed[0][key], self._graph.departed[1][key] = self._marginal(key)
+            except RuntimeError:
+                self._graph.departed[0][key], self._graph.departed[1][key] = (
+                    self._graph.values[key],
+                    self._graph.spreads[key],
+                )
+            del self._graph.values[key], self._graph.spreads[key]
+
+    def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
+        """A new solver after the old one failed, from what that told before; then without what may throw, then with QR, which
+        keeps more digits, then without what the newest keyframe tells. Where nothing helps there is none for a while."""
+        failure = RuntimeError()
+        summary = self._solver.summary(failed=True)
+        near = read_all(self._last, [*(k.key for k in self._graph.keyframes), *self._graph.values])
+        tries = [(True, self._factorization), (False, self._factorization), (False, "QR"), (False, "QR")]
+        for i, (throws, factorization) in enumerate(tries):
+            if i == len(tries) - 1:
+                self._drop_newest(newest)
+            elif tries[i - 1] == (throws, factorization):
+                continue
+            self._filtered[newest.index] = guess
+            try:
+                with gtsam_errors():
+                    self._start_again(newest, summary, near, throws, factorization)
+                    if summary is not None and any(node.has_pose for node in newest.nodes):
+                        self._check_jump(newest, guess)
+            except RuntimeError as error:
+                failure = error
+            else:
+                return
+        self._stall(newest, guess, summary, failure)
+
+    def _drop_newest(self, newest: Keyframe) -> None:
+        """Drop what the newest keyframe tells of poses; priors of points stay."""
+        if count := sum(node.has_pose for node in newest.nodes):
+            self._graph.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
+            newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]
+
+    def _stall(self, newest: Keyframe, guess: Guess, summary: Summary | None, error: RuntimeError) -> None:
+        """Go on as a filter where the graph cannot be solved."""
+        self._filtered[newest.index] = self._graph.pose, self._graph.covariance = guess
+        self._waiting = Addition()
+        self._solver = self._stalled = Stalled(newest.t, self._known, summary, self._stalled)
+        self._graph.diagnostics.events.append(
+            (newest.t, f"goes on without a solver until {self._solver.until:.1f} s: {self._graph.reason(error)}")
+        )
+
+    def _known(self, key: int) -> Array:
+        """What is known of a variable without the solver."""
+        if is_pose(key):
+            return self._filtered[index_of(key)][0]
+        return self._graph.values[key] if key in self._graph.values else self._graph.departed[0][key]
+
+    def _start_again(
+        self,
+        newest: Keyframe,
+        summary: Summary | None,
+        near: Mapping[int, Array] = NOWHERE,
+        throws: bool = False,
+        factorization: str | None = None,
+    ) -> None:
+        """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
+        throw where a point gets behind a camera, at a tenth of the time.
+
+        A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
+        begins with the priors.
+        """
+        self._solver, self._waiting, self._solved = self._new_solver(factorization), Addition(), newest.t
+        keyframes = self._graph.keyframes[0 if summary is None else summary.oldest :]
+        guesses = {k.key: self._filtered[k.index][0] for k in keyframes} | self._graph.values
+        known: Collection[int] = () if summary is None else summary.keys
+        guesses |= {key: value for key, value in self._graph.departed[0].items() if key in known}
+        guesses |= {key: value for key, value in near.items() if key in guesses}
+        self._graph.drop_astray(keyframes[1:], guesses)
+        if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
+            guesses |= read_all(summary.at, guesses)
+        factors = self._priors() if summary is None else summary.on(guesses)
+        nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
+        if near and isinstance(self._solver, FullHistory):
+            guesses = self._graph.problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
+        if not throws:
+            nodes = [n if n.factor is None or not n.has_pose else replace(n, native=None) for n in nodes]
+        nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
+        self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
+        self._read(newest, self._graph.values)
+
+    def _priors(self) -> list[gtsam.NonlinearFactor]:
+        """What is known before any measurement."""
+        assert self._graph.prior is not None
+        noise = gtsam.noiseModel.Gaussian.Covariance(
+            se2.world_to_body(self._graph.prior.pose, self._graph.prior.covariance)
+        )
+        start = gtsam.PriorFactorPose2(self._graph.keyframes[0].key, gtsam.Pose2(*self._graph.prior.pose), noise)
+        means, spreads = self._graph.constant_priors()
+        return [
+            start,
+            *(
+                gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(spreads[key]))
+                for key, mean in means.items()
+            ),
+        ]
+
+    def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
+        """The time of each variable of a window that begins; points are as if they were seen now."""
+        now = keyframes[-1].t
+        oldest = -math.inf if self._settings.lag is None else now - self._settings.lag - MARGIN
+        stamps = {key: now if key in self._graph.values else oldest for key in values}
+        return stamps | {k.key: k.t for k in keyframes}
+
+    def _odometry_node(self, keyframe: Keyframe) -> Node:
+        factor, keys = self._graph.odometry_factor(keyframe)
+        if len(keys) > 2:
+            return Node(keys, factor, 3)
+        assert keyframe.from_previous is not None
+        return Node(keys, native=self._graph.motion.native((keys[0], keys[1]), keyframe.from_previous))
+
+    def _new_solver(self, factorization: str | None = None) -> Solver:
+        parameters = gtsam.ISAM2Params()
+        parameters.setFactorization(factorization or self._factorization)
+        # far from where a point was first taken to be its factors mean nothing
+        parameters.relinearizeSkip = 1 if self._maps else self._settings.relinearize_skip
+        if self._settings.lag is None:
+            return FullHistory(parameters, self._settings.relinearize_threshold)
+        threshold = self._settings.relinearize_threshold
+        parameters.setRelinearizeThreshold(min(threshold, NEAR_POINTS) if self._maps else threshold)
+        parameters.findUnusedFactorSlots = True
+        return Window(parameters, self._settings.lag, self._failed.append)

@@ -1,0 +1,40 @@
+"""Where named blocks stand in the error state of a filter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from factors.se2 import Array
+
+POSE = 3  # components of the error state that are the pose's
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The blocks of a state after its pose, by name, in their order: ``sizes``."""
+
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+    @staticmethod
+    def of(blocks: Iterable[tuple[str, int]]) -> Layout:
+        """Blocks of these sizes; those of size 0 are left out."""
+        return Layout({name: size for name, size in blocks if size})
+
+    @cached_property
+    def columns(self) -> Mapping[str, slice]:
+        """The columns of each block in the error state."""
+        found, start = {}, POSE
+        for name, size in self.sizes.items():
+            found[name] = slice(start, start + size)
+            start += size
+        return found
+
+    def plus(self, name: str, size: int) -> Layout:
+        """With one more block, which comes last."""
+        return Layout({**self.sizes, name: size})
+
+    def values(self, rest: Array) -> dict[str, Array]:
+        """The blocks of a state of which ``rest`` (R,) is all but the pose."""
+        return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}

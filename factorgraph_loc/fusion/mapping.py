@@ -1,0 +1,66 @@
+"""What maps points while a graph localizes, as the graph knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.fusion.variables import Node, Values
+from factorgraph_loc.maps.points import PointMap
+from factors.motion import Increment
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class GraphView:
+    """What a mapper sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
+    (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
+    two of them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
+
+    keyframes: Sequence[Keyframe]
+    values: Values
+    spreads: Values
+    current: Callable[[int], Array]
+    is_open: Callable[[int], bool]
+    between: Callable[[Keyframe, Keyframe], Increment]
+    shared: tuple[int, ...] = ()
+    constants: Array | None = None
+
+
+class Mapper(Protocol):
+    """Makes variables of points that a sensor sees and no map has.
+
+    ``fewest``: sightings that a point of the graph needs; ``horizon``: keyframes back that it may look at; ``rejected``: what is
+    said of sightings that turn out to be of something else; ``estimates``: whether points become variables.
+    """
+
+    fewest: int
+    horizon: int
+    rejected: str
+    estimates: bool
+
+    def is_due(self, m: Any) -> bool:
+        """Whether a measurement needs a keyframe of its own."""
+
+    def take(
+        self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
+    ) -> Guess:
+        """Add what a measurement from the newest keyframe tells to an ``addition``; returned is the guess of its pose, placed by
+        it. ``is_new``: whether the keyframe was made for it."""
+
+    def is_astray(self, node: Node, values: Values) -> bool:
+        """Whether a node is a sighting that cannot be of its point."""
+
+    def point(self, node: Node) -> int | None:
+        """The key of the point that a node is a sighting of."""
+
+    def leave(self, t: float) -> Sequence[int]:
+        """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+
+    def keep_only(self, keys: set[int]) -> None:
+        """Give up all points but those with these ``keys``."""
+
+    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
+        """All points that ever were in the graph."""

@@ -1,0 +1,191 @@
+"""Where the robot may be, from what all sensors see, as particles that begin anywhere.
+
+A particle filter over pose: evenly over the map's bounds at first, or with any heading where the start's position
+is known. Each observation is weighed a share at a time, with resampling from a kernel density in between (progressive correction:
+Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4), so that few particles find
+narrow places. Their number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each
+resampling some are drawn anywhere once more,
+with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.fusion import kld
+from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
+from factorgraph_loc.model.belief import Mode, PosePrior
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.sensors.base import Observation
+from factorgraph_loc.sensors.known_position import KnownPosition
+from factors import positive, se2
+from factors.motion import ChainState
+from factors.se2 import Array
+
+DENSITY = 25.0  # particles per m^2 and rad at first
+FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
+GROWTH = 4  # times as many particles, at most, after a resampling
+RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
+FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anywhere at a resampling, and their weight together
+# Variance of the odometry, times this: the constants of the odometry, which are not estimated here, err as well.
+NOISE = 2.0
+
+NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2  # weight of a place that is denied; m, m, rad
+
+# the weight of a clear place, within so many standard deviations of it, and how large those may be at most: m, rad
+CLEAR_WEIGHT, REACH = 0.99, 5.0
+WIDEST_POSITION, WIDEST_HEADING = 0.45, 0.3
+CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2  # of something, and of different things
+WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CLEAR_WEIGHT may be anywhere
+# s that a place must have been clear, where its standard deviations are at most this share of the largest, and where not
+NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
+
+
+class Population:
+    """Places where the robot may be; see the module. ``bounds`` (2, 2): lower and upper corner [m] of where it may be, unless
+    ``start`` tells that."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        bounds: Array,
+        rng: np.random.Generator,
+        start: KnownPosition | None = None,
+    ) -> None:
+        self._motion, self._bounds, self._rng, self._start = motion, bounds, rng, start
+        self._cloud: Cloud | None = None
+        self._odometry: ChainState | None = None
+        self._hypotheses: tuple[Mode, ...] | None = ()
+        self._log_evidence = 0.0
+        self._telling = 0  # observations of things that were there
+        self._things: set[Hashable] = set()
+        self._clear_since = math.inf
+
+    @property
+    def hypotheses(self) -> tuple[Mode, ...]:
+        """Those at the time of the last observation, the likeliest first."""
+        if self._hypotheses is None:
+            self._hypotheses = self._cloud.modes() if self._cloud is not None else ()
+        return self._hypotheses
+
+    @property
+    def best(self) -> PosePrior | None:
+        """The pose at the last observation if one hypothesis has been clear for a while, else None."""
+        if self._odometry is None or not math.isfinite(self._clear_since):
+            return None
+        mode = self.hypotheses[0]
+        needed = CLEAR_FOR if self._width(mode) <= NARROW else CLEAR_FOR_WIDE
+        if self._odometry.t < self._clear_since + needed:
+            return None
+        return PosePrior(self._odometry.t, mode.pose, mode.covariance)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log-probability of all observations so far for a robot that began anywhere."""
+        return self._log_evidence
+
+    def add(self, odometry: ChainState, observation: Observation) -> bool:
+        """Take an observation made when the odometry was at ``odometry``; False if it is left out, as it is older than the last."""
+        if self._odometry is not None and odometry.t < self._odometry.t:
+            return False
+        if self._cloud is None or self._odometry is None:
+            area = float(np.prod(self._bounds[1] - self._bounds[0]))
+            count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
+            self._cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
+        elif odometry.t > self._odometry.t:
+            self._predict(self._cloud, self._odometry, odometry)
+        self._odometry = odometry
+        self._weigh(observation, odometry.t)
+        self._hypotheses = None
+        self._telling += observation.found > 0
+        self._things.update(observation.things)
+        self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
+        return True
+
+    @property
+    def particles(self) -> tuple[Array, Array]:
+        """Poses (N, 3) at the last observation and their weights (N,), of all hypotheses; none before the first observation."""
+        return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Poses (N, 3) at the last observation, drawn from all hypotheses; none before the first observation."""
+        if self._cloud is None:
+            return np.empty((0, 3))
+        rows = systematic(self._cloud.weights, rng, count)
+        return kld.jittered(self._cloud.poses, rows, rng)
+
+    def _is_clear(self) -> bool:
+        if self._telling < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
+            return False
+        # what is spread widely as a whole is not one place, and needs no search for modes
+        if np.linalg.eigvalsh(self._cloud.moments[1][:2, :2])[-1] > WIDE**2:
+            return False
+        mode = self.hypotheses[0]
+        return self._weight_near(mode.pose, mode.covariance) >= CLEAR_WEIGHT and self._width(mode) <= 1.0
+
+    def denies(self, place: PosePrior) -> bool:
+        """Whether enough was seen to say that the robot is not at a place, at the time of the last observation."""
+        if self._telling < CLEAR_OBSERVATIONS or self._odometry is None or place.t != self._odometry.t:
+            return False
+        return self._weight_near(place.pose, place.covariance + WIDENED) < NEGLIGIBLE
+
+    def _weight_near(self, pose: Array, covariance: Array) -> float:
+        assert self._cloud is not None
+        error = self._cloud.poses - pose
+        error[:, 2] = se2.wrap(error[:, 2])
+        near = np.sum(error * positive.solve(covariance, error.T).T, axis=1) < REACH**2
+        return float(self._cloud.weights[near].sum())
+
+    @staticmethod
+    def _width(mode: Mode) -> float:
+        """The standard deviations of a place, as a share of the largest that it may have."""
+        position = math.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1])
+        return float(max(position / WIDEST_POSITION, math.sqrt(mode.covariance[2, 2]) / WIDEST_HEADING))
+
+    def _predict(self, cloud: Cloud, start: ChainState, end: ChainState) -> None:
+        increment = self._motion.relative(start, end)
+        root = positive.root(NOISE * increment.covariance)
+        noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
+        self._cloud = replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
+
+    def _weigh(self, observation: Observation, t: float) -> None:
+        left = 1.0
+        while left > 0.0:
+            cloud = self._cloud
+            assert cloud is not None
+            likelihood = weighable(observation.log_likelihood(cloud.poses, {}), cloud.log_weights, t)
+            share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
+            weighed = cloud.log_weights + share * likelihood
+            highest = float(weighed.max())
+            self._log_evidence += highest + math.log(float(np.sum(np.exp(weighed - highest))))
+            self._cloud = replace(cloud, log_weights=normalised(weighed))
+            left -= share
+            if effective_size(self._cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
+                self._resample(self._cloud)
+
+    def _resample(self, cloud: Cloud) -> None:
+        assert self._odometry is not None
+        rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
+        rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
+        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, self._odometry)))
+        log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
+        log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
+        self._cloud = _cloud(poses, log_weights)
+
+    def _anywhere(self, count: int, now: ChainState) -> Array:
+        """Poses (N, 3) where the robot may have come to by ``now``, as far as its start tells it: else evenly over the bounds and
+        all headings, one in each layer of each axis (Latin hypercube)."""
+        if self._start is not None:
+            return self._start.drawn(self._rng, count, now)
+        layers = np.column_stack([self._rng.permutation(count) for _ in range(3)])
+        even = (layers + self._rng.random((count, 3))) / count
+        low, high = np.append(self._bounds[0], -math.pi), np.append(self._bounds[1], math.pi)
+        return np.asarray(low + even * (high - low))
+
+
+def _cloud(poses: Array, log_weights: Array) -> Cloud:
+    return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)

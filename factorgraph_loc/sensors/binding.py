@@ -1,0 +1,25 @@
+"""The sensors of a run, bound to it."""
+
+from typing import cast
+
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.setup import Calibration, MapUse, Setup
+from factorgraph_loc.sensors.base import Binding, Sensor
+from factorgraph_loc.sensors.registry import functions
+
+
+def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bool = False) -> Motion:
+    """The sensor of a run that predicts."""
+    _, predict = next(functions("predict"))
+    return cast(Motion, predict(setup.rig, setup.sensors, diagnostics, self_calibration=self_calibration))
+
+
+def bound_sensors(
+    setup: Setup, motion: Motion, diagnostics: Diagnostics, *, use: MapUse = "known", calibration: Calibration = "all"
+) -> dict[str, Sensor]:
+    """The sensors of a run that see the world around the robot, by the modality of their measurements. ``use``: what the map is
+    taken for."""
+    binding = Binding(setup, motion, diagnostics, use, calibration)
+    sensors: list[Sensor | None] = [bind(binding) for _, bind in functions("bind")]
+    return {sensor.modality: sensor for sensor in sensors if sensor is not None}

@@ -1,0 +1,224 @@
+"""Identified landmarks as a sensor of a run."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Self, cast
+
+import numpy as np
+
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.variable import Estimated
+from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.monitor import TrackMonitor
+from factorgraph_loc.sensors.landmarks.pending import NewLandmarks
+from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factors.graph import Factor
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET
+from factors.motion import ChainState
+from factors.se2 import Array
+from factors.update import Correction
+
+GOING_BACK = 5.0  # s that an estimator may go back in time
+SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
+
+
+@dataclass(frozen=True)
+class LandmarkObservation(ResidualObservation):
+    """Landmarks that were seen at one time: those of the map as one term, and each other one as a term."""
+
+    @property
+    def measured(self) -> BearingRangeFactor:
+        """All of them as one factor, wherever they are."""
+        return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
+
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+        factor = self.measured
+        parameters = None
+        if factor.estimated and self.blocks[0] in values:
+            parameters = np.zeros((len(poses), len(PARAMETERS)))
+            parameters[:, list(factor.estimated)] = values[self.blocks[0]]
+        return factor.log_likelihood(poses, parameters)
+
+    @property
+    def things(self) -> frozenset[Hashable]:
+        return frozenset(map(tuple, self.measured.points.tolist()))
+
+    def at_its_time(self) -> Self | None:
+        """Those of the map at the time that they were seen."""
+        factor = self.measured
+        if factor.free or self.blocks:
+            return None
+        return replace(
+            self, terms=(replace(self.terms[0], factor=replace(factor, offset=None, offset_covariance=None)),)
+        )
+
+    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+        """The same on the pose alone: constants of the sensor are held, other landmarks are as uncertain as ``spreads`` say."""
+        fixed = []
+        for term in self.terms:
+            factor = cast(BearingRangeFactor, term.factor)
+            shared = [values[name] for name in term.blocks[: len(term.blocks) - factor.free]]
+            own = term.blocks[-1] if factor.free else None
+            here = factor.fixed(shared, None if own is None else values[own])
+            fixed.append(here if own is None else replace(here, point_covariances=spreads[own][None]))
+        factor = together(fixed)
+        return replace(self, terms=(Term(factor, (), 2 * len(factor.points)),))
+
+
+class LandmarkSensor(Sensor):
+    """Landmarks as all estimators take them in. ``use`` of the map: see :class:`KnownLandmarks`; what is not of the map becomes a
+    block ``bearing_range/NAME`` once two sightings agree where it is."""
+
+    modality = "bearing_range"
+    lost = "landmarks were not where they were expected"
+
+    def __init__(self, binding: Binding, constants: Estimated) -> None:
+        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
+        self.constants, self._motion = constants, motion
+        self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices)
+        self._sought = KnownLandmarks(
+            setup, Diagnostics()
+        )  # what is seen before the start is counted when it is taken in
+        self._shared = (self.modality,) if constants.names else ()
+        self._new: NewLandmarks[tuple[float, LandmarkObservation]] = NewLandmarks()
+        self._before: deque[tuple[float, NewLandmarks[tuple[float, LandmarkObservation]]]] = deque()
+        self._finder: LandmarkFinder | None = None
+        if use == "known" and self._landmarks.known:
+            self.finder = self._finder = LandmarkFinder(self._sought, motion, setup.world.positions())
+
+    def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
+        twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
+        known = self._landmarks.factor(m, view.offset, twist)
+        terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
+        met: list[tuple[str, Term]] = []
+        for name, factor in self._landmarks.others(m, view.offset, twist):
+            block = f"{self.modality}/{name}"
+            term = Term(factor, (*self._shared, block), 2)
+            if view.value(block) is None:
+                met.append((block, term))
+            else:
+                terms.append(term)
+        if terms:
+            yield LandmarkObservation(m.t, tuple(terms))
+        for block, term in met if view.newest else ():
+            new = self._proposed(m.t, block, term, view)
+            if new is not None:
+                yield new
+
+    def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
+        """A landmark that no block stands for: it comes in when an earlier sighting agrees, at where it is seen now."""
+        shared = [value for name in self._shared if (value := view.value(name)) is not None]
+        point, (by_pose, *others), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
+        here = (view.t, LandmarkObservation(t, (term,)))
+        new = NewVariable(block, point, by_pose, dict(zip(self._shared, others, strict=True)), noise, (here,))
+        _, spread = new.joint(*view.joint())
+        self._before.append((t, self._new))
+        while self._before[0][0] < t - GOING_BACK:
+            self._before.popleft()
+        self._new, earlier = self._new.propose(block, point, spread, here)
+        return None if earlier is None else replace(new, sightings=(earlier, here))
+
+    def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
+        self._landmarks.report(observation.t, observation.measured, correction)
+        return True
+
+    @property
+    def suspicious_since(self) -> float | None:
+        return None if self._finder is None else self._finder.suspicious_since
+
+    def evidence(self, m: BearingRange) -> LandmarkObservation | None:
+        seen = self._sought.factor(m)
+        return None if seen is None else LandmarkObservation(m.t, (Term(seen, (), 2 * len(seen.points)),))
+
+    def at_end(self, factor: Factor, width: float) -> Factor:
+        return cast(BearingRangeFactor, factor).widened(width)
+
+    def rewind(self, t: float) -> None:
+        while self._before and self._before[-1][0] > t:
+            _, self._new = self._before.pop()
+
+    def restart(self, t: float) -> None:
+        self._new = NewLandmarks()
+        self._before.clear()
+
+
+class LandmarkFinder:
+    """A :class:`~factorgraph_loc.sensors.base.Finder` by landmarks: hypotheses from the last minute, and a monitor of the track."""
+
+    at_once = False
+
+    def __init__(self, landmarks: KnownLandmarks, motion: Motion, positions: Array) -> None:
+        self._landmarks = landmarks
+        self._relocalizer = Relocalizer(motion, positions)
+        self._monitor = TrackMonitor()
+        self.newest: ChainState | None = None
+
+    @property
+    def start(self) -> KnownPosition | None:
+        return self._relocalizer.start
+
+    @start.setter
+    def start(self, start: KnownPosition | None) -> None:
+        self._relocalizer.start = start
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        return self._relocalizer.hypotheses
+
+    @property
+    def best(self) -> PosePrior | None:
+        return self._relocalizer.best
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """Since when most landmarks are not where they are expected."""
+        return self._monitor.suspicious_since
+
+    def look(self, m: BearingRange, odometry: ChainState) -> bool:
+        seen = self._landmarks.factor(m)
+        if seen is None:
+            return False
+        self._relocalizer.add(odometry, seen)
+        self._relocalizer.search()
+        self.newest = odometry
+        return True
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        return self._relocalizer.sample(rng, count)
+
+    def follow(self, observation: LandmarkObservation, odometry: ChainState, view: View) -> None:
+        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
+        self._relocalizer.add(odometry, seen)
+        self._monitor.add(observation.t, seen, view.pose, view.covariance)
+
+    def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
+        since = self._monitor.suspicious_since
+        if since is None or (self.newest is not None and odometry.t < self.newest.t + SEARCH_INTERVAL):
+            return None
+        self._relocalizer.forget(since)
+        self._relocalizer.search()
+        self.newest = odometry
+        return since if self._relocalizer.refutes(pose, covariance) else None
+
+    def clear(self) -> None:
+        self._monitor.clear()
+
+
+def bind(binding: Binding) -> LandmarkSensor | None:
+    """The sensor of a run, None where it is not used; its time offset cannot differ from particle to particle."""
+    settings = binding.setup.rig.find(BearingRangeSettings)
+    if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
+        return None
+    names = PARAMETERS[:TIME_OFFSET] if binding.calibration == "particles" else PARAMETERS
+    uncertainty = None if binding.calibration == "none" else settings.uncertainty
+    return LandmarkSensor(binding, Estimated.of(names, uncertainty))

@@ -1,0 +1,11 @@
+"""The measurements that this project's own sensors report."""
+
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.twist.measurement import Twist
+from factorgraph_loc.vision.frame import CameraFrame
+
+Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist
+Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # what tells of the world around the robot

@@ -1,0 +1,198 @@
+"""An RFID reader as a sensor of a run: what its antennas read and did not read, how strongly, and with which phase."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self, cast
+
+import numpy as np
+
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, Silence
+from factorgraph_loc.sensors.rfid.signals import TagSignals
+from factorgraph_loc.sensors.rfid.tag_map import extent
+from factors import positive, se2
+from factors.graph import Factor
+from factors.rfid import update as rfid_update
+from factors.rfid.detection import Looks, together
+from factors.rfid.factor import ROWS, RfidFactor
+from factors.se2 import Array
+from factors.update import Correction
+
+NO_RESIDUAL = np.empty((0, 1))
+
+
+@dataclass(frozen=True)
+class TagObservation:
+    """A likelihood of what was read, of the pose alone. ``found``: how many reads."""
+
+    t: float
+    factor: RfidFactor
+    found: int
+    here: Looks | None = None  # what was read and not read, from the pose at the scan's time
+    rounds: int = 0  # of antennas, of what was read and not read
+    blocks: tuple[str, ...] = ()
+    iterations: ClassVar[int] = rfid_update.ITERATIONS
+
+    @property
+    def is_judged(self) -> bool:
+        """What was read and not read."""
+        return self.here is not None
+
+    @property
+    def things(self) -> frozenset[Hashable]:
+        """The tags that were read, by their places in the map."""
+        looks = self.factor.seen
+        return frozenset(np.flatnonzero(looks.hits.any(axis=0)).tolist()) if isinstance(looks, Looks) else frozenset()
+
+    def at_its_time(self) -> Self | None:
+        """Only of what was read and not read: strength and phase have many optima."""
+        return None if self.here is None else replace(self, factor=replace(self.factor, seen=self.here))
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return (Term(self.factor, (), ROWS),)
+
+    def correct(
+        self,
+        pose: Array,
+        covariance: Array,
+        values: Mapping[str, Array],
+        columns: Mapping[str, slice],
+        iterations: int = 1,
+    ) -> Correction:
+        """The most likely pose, by Fisher scoring; what else is in the state follows by correlation."""
+        own = np.ascontiguousarray(covariance[:3, :3])
+        found = rfid_update.updated([self.factor], pose, own, iterations)
+        delta, after = se2.log(se2.between(pose, found.pose)), found.covariance
+        if len(covariance) > 3:
+            gain = positive.solve(own, covariance[:3]).T
+            after = covariance - gain @ (own - found.covariance) @ gain.T
+            delta = gain @ delta
+        told = found.excess_nll, found.variance, found.evidence
+        return Correction(delta, after, NO_RESIDUAL, found.nis, found.dof, *told)
+
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+        return self.factor.log_likelihood(poses)
+
+    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+        return self
+
+
+class TagSensor(Sensor):
+    """Scans of tags as all estimators take them in.
+
+    Each tells what was read and not read, then the strengths of the reads, and once a second the phases of the last ones. A silence
+    of the reader (:class:`~factorgraph_loc.sensors.rfid.monitor.Silence`) is no evidence. Only what was read and not read tells of
+    other places: strength and phase have many optima there.
+    """
+
+    modality = "rfid"
+    lost = "tags were not read as they were expected"
+    keyframe_every = 0.45
+    gathers = True
+    evidence_every = 0.0
+
+    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+        self.tags = KnownTags(setup, diagnostics)
+        self.bounds = extent(setup.world, self.tags.map.tags) if self.tags.likelihood is not None else None
+        self._diagnostics = diagnostics
+        self._signals = TagSignals(setup, self.tags)
+        self._monitor, self._silence = ScanMonitor(), Silence()
+        self._heard = -math.inf  # the last scan that counted for a silence
+
+    def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
+        looks, likelihood = self.tags.looks(m), self.tags.likelihood
+        if looks is None or likelihood is None:
+            return
+        here = looks if view.offset is None else looks.moved(view.offset.delta)
+        yield self._detection(m, here, looks)
+        if self._silence.lasts and view.newest:
+            return
+        strengths = self._signals.strengths(m)
+        if strengths is not None and self._signals.strength is not None:
+            yield TagObservation(
+                m.t, RfidFactor(self._signals.strength, strengths.moved(here.offsets[0])), len(strengths.rssi)
+            )
+        if view.newest and view.localized:
+            self._signals.forget(m.t)
+            if self._signals.keep(m):
+                window = self._signals.phases(view.poses_at(self._signals.times()), view.pose)
+                if window is not None:
+                    yield TagObservation(m.t, window, 1)
+
+    def _detection(self, m: RfidScan, moved: Looks, looks: Looks) -> TagObservation:
+        assert self.tags.likelihood is not None
+        factor = RfidFactor(self.tags.likelihood, moved)
+        return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas))
+
+    def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
+        looks, t = observation.factor.seen, observation.t
+        assert isinstance(looks, Looks)
+        self._diagnostics.innovation("rfid", t, correction.nis, correction.dof)
+        if view.newest and not self._is_evidence(observation, correction.evidence):
+            self._diagnostics.reject(Silence.REJECTED, observation.rounds)
+            return False
+        if view.newest:
+            self._monitor.add(t, correction.excess_nll, correction.variance)
+        if view.localized and self.suspicious_since is None:
+            self.tags.miss(t, looks, view.pose, view.covariance)
+        return True
+
+    def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
+        # a scan without reads that comes again, as the estimator went back, counts once
+        if observation.found or observation.t > self._heard:
+            lasted = self._silence.lasts
+            if self._silence.add(observation.found, evidence) and not lasted:
+                self._diagnostics.event(observation.t, Silence.EVENT)
+                self.tags.silent()
+            self._heard = max(self._heard, observation.t)
+        return not self._silence.lasts
+
+    def evidence(self, m: RfidScan) -> TagObservation | None:
+        looks = self.tags.looks(m, count=False)
+        return None if looks is None or self.tags.likelihood is None else self._detection(m, looks, looks)
+
+    @property
+    def suspicious_since(self) -> float | None:
+        return self._monitor.suspicious_since
+
+    @property
+    def silent(self) -> bool:
+        return self._silence.lasts
+
+    def accept(self) -> None:
+        self._monitor.accept()
+
+    def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
+        """All reads and misses as one factor."""
+        looks = [seen for o in observations if isinstance(seen := o.factor.seen, Looks)]
+        factors = [o.factor for o in observations if not isinstance(o.factor.seen, Looks)]
+        if looks and self.tags.likelihood is not None:
+            factors.append(RfidFactor(self.tags.likelihood, together(looks)))
+        return [Term(factor, (), ROWS) for factor in factors]
+
+    def at_end(self, factor: Factor, width: float) -> Factor | None:
+        """Tags count by what is known of their states at the end, and not by what was known at each scan."""
+        tags = cast(RfidFactor, factor)
+        return None if tags.is_phase and width > 1.0 else tags.with_odds(self.tags.states.odds)
+
+    def rewind(self, t: float) -> None:
+        self.tags.forget(math.nextafter(t, math.inf))
+
+    def restart(self, t: float) -> None:
+        self._monitor.clear()
+        self._signals.clear()
+        self.tags.forget(t)
+
+
+def bind(binding: Binding) -> TagSensor | None:
+    """The sensor of a run; None where it is not used."""
+    sensor = TagSensor(binding.setup, binding.diagnostics)
+    return sensor if sensor.tags.likelihood is not None else None

@@ -1,0 +1,109 @@
+"""What a graph makes of an image beside the points of its map: points that it estimates, and the motion since the image before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+
+from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.variables import Node, Values
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.sensors.base import Sensor
+from factorgraph_loc.sensors.camera.bound import CameraSensor
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.slam.frame_pairs import FramePairs
+from factorgraph_loc.slam.new_points import FEWEST
+from factorgraph_loc.slam.unknown_points import HORIZON, UnknownPoints
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
+
+
+class PointMapper:
+    """A :class:`~factorgraph_loc.fusion.mapping.Mapper` of points in images."""
+
+    fewest, horizon = FEWEST, HORIZON
+    rejected = "camera: not where it was seen"
+
+    def __init__(
+        self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics, settings: GraphSettings
+    ) -> None:
+        self._camera = camera
+        self._interval = KEYFRAME_INTERVAL if settings.keyframe_interval is None else settings.keyframe_interval
+        self._unknown: UnknownPoints | None = None
+        if settings.landmarks != "known":
+            self._unknown = UnknownPoints(model, diagnostics, camera.constants)
+        self._pairs = FramePairs(model) if settings.visual_odometry else None
+        self._taken = -math.inf
+
+    @property
+    def estimates(self) -> bool:
+        """Whether points become variables."""
+        return self._unknown is not None
+
+    def is_due(self, m: Pixels) -> bool:
+        # unknown points need keyframes of their own, whatever others stand there for other sensors
+        return self._unknown is not None and m.modality == self._camera.modality and m.t - self._taken >= self._interval
+
+    def take(
+        self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
+    ) -> Guess:
+        if m.modality != self._camera.modality:
+            return guess
+        points = self._camera.points
+        if isinstance(m, PixelSightings):
+            names: list[Hashable] = list(m.points)
+            used = {i for i, name in enumerate(m.points) if name in points.map.index}
+        else:
+            names, used = m.tracks.tolist(), set(points.used.tolist())
+        if self._unknown is not None:
+            self._taken = m.t
+            rows = [i for i in range(len(names)) if i not in used]
+            guess = self._unknown.take(m, rows, keyframe, guess, graph, addition)
+        if self._pairs is not None and is_new:
+            if self._unknown is not None:
+                used |= {i for i, name in enumerate(names) if self._unknown.uses(name)}
+            rows = [i for i in range(len(names)) if i not in used]
+            before, predicted = self._pairs.previous(keyframe, graph.keyframes), None
+            if before is not None and graph.is_open(before.index):
+                predicted = graph.between(before, keyframe)
+            node = self._pairs.take(keyframe, [names[i] for i in rows], m.pixels[rows], predicted)
+            if node is not None:
+                keyframe.nodes.append(node)
+                addition.nodes.append(node)
+        return guess
+
+    def is_astray(self, node: Node, values: Values) -> bool:
+        factor = node.factor
+        if not isinstance(factor, ReprojectionFactor) or not factor.free or any(key not in values for key in node.keys):
+            return False
+        return factor.is_astray(values[node.keys[0]], values[node.keys[-1]])
+
+    def point(self, node: Node) -> int | None:
+        free = isinstance(node.factor, ReprojectionFactor) and node.factor.free
+        return node.keys[-1] if free else None
+
+    def leave(self, t: float) -> Sequence[int]:
+        return [] if self._unknown is None else self._unknown.leave(t)
+
+    def keep_only(self, keys: set[int]) -> None:
+        if self._unknown is not None:
+            self._unknown.keep_only(keys)
+
+    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
+        return None if self._unknown is None else self._unknown.learnt(values, spreads)
+
+
+def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> PointMapper | None:
+    """The mapper of a run; None where nothing is to be mapped."""
+    camera = sensors.get(CameraSensor.modality)
+    if not isinstance(camera, CameraSensor) or camera.points.model is None:
+        return None
+    if settings.landmarks == "known" and not settings.visual_odometry:
+        return None
+    return PointMapper(camera, camera.points.model, diagnostics, settings)

@@ -1,0 +1,57 @@
+"""A factor with some of its values held: what is not known of them widens its noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors import positive
+from factors.displaced import common_error
+from factors.se2 import Array
+from factors.update import Sightings
+
+
+@dataclass(frozen=True)
+class Marginalized:
+    """A factor of sightings on the pose alone: its other values are ``values``, with covariances ``spreads``, None for exact ones.
+
+    An error of a value is common to all K sightings, so it counts K times as much: see :func:`~factors.displaced.common_error`.
+    """
+
+    factor: Sightings
+    values: tuple[Array, ...]
+    spreads: tuple[Array | None, ...]
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, g), and its Jacobian (K, g, 3) by the pose."""
+        residual, (by_pose, *others) = self.factor.whitened([values[0], *self.values])
+        noise = np.eye(residual.shape[1])
+        for block, spread in zip(others, self.spreads, strict=True):
+            if spread is not None:
+                noise = noise + common_error(block, spread)
+        if noise.ndim == 2:
+            return residual, [by_pose]
+        whitener = positive.whitener(noise)
+        return np.einsum("kij,kj->ki", whitener, residual), [whitener @ by_pose]
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual and its Jacobian by the pose."""
+        residual, (by_pose,) = self.whitened(values)
+        weight = np.sqrt(self.weight(np.einsum("ki,ki->k", residual, residual)))
+        return (weight[:, None] * residual).ravel(), [(weight[:, None, None] * by_pose).reshape(-1, 3)]
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return self.factor.weight(squared)
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss, as the weights have it."""
+        residual, _ = self.whitened(values)
+        squared = np.einsum("ki,ki->k", residual, residual)
+        return float(0.5 * np.sum(self.weight(squared) * squared))
+
+    def dof(self) -> int:
+        """How many numbers were measured."""
+        return self.factor.dof()
