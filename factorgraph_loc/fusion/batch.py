@@ -16,9 +16,8 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_estimator import GraphEstimator, SolvingBackend
-from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, SmootherSettings
 from factorgraph_loc.fusion.incremental import Incremental
-from factorgraph_loc.fusion.smoother import SmootherSettings, incremental_settings
 from factorgraph_loc.fusion.variables import Values, pose_key
 from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.setup import Setup
@@ -44,7 +43,7 @@ class Batch(GraphEstimator):
         if not any(mapper.estimates for mapper in graph.mappers):
             return Guessing(graph, self._settings.widest_loss)
         ahead = SmootherSettings(**self._settings.model_dump(exclude={"widest_loss"}))
-        return Ahead(graph, Incremental(graph, incremental_settings(graph, ahead)), self._settings.widest_loss)
+        return Ahead(graph, Incremental(graph, ahead), self._settings.widest_loss)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""

@@ -17,8 +17,9 @@ from typing import Protocol
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph import MOTION, Graph
+from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
+from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
 from factorgraph_loc.fusion.variables import Node

@@ -17,7 +17,7 @@ from pydantic import Field
 from scipy.linalg.lapack import dpotrf
 
 from factorgraph_loc.fusion.heading_search import HeadingSearch
-from factorgraph_loc.fusion.layout import POSE, Layout
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
@@ -32,7 +32,6 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
-MOTION = "odometry"  # the block of its constants
 
 
 class EkfSettings(FilterSettings):

@@ -14,6 +14,7 @@ import numpy as np
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph_parts import Keyframe, TickAt, between_keyframes
 from factorgraph_loc.fusion.kept import Kept
+from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.marginals import IndeterminateError, blamed, damped
 from factorgraph_loc.fusion.problem import Problem
@@ -39,8 +40,6 @@ from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import Increment
 from factors.se2 import Array
-
-MOTION = "odometry"  # the block of its constants
 
 
 class Graph:

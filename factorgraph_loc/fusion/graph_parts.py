@@ -33,6 +33,17 @@ class GraphSettings(FileModel):
     visual_odometry: bool = False
 
 
+class SmootherSettings(GraphSettings):
+    """``lag`` [s]: length of the window, none for the full history. ``relinearize_*``: how far a variable may move (m and rad;
+    for the odometry's constants in their units) before its factors are linearised anew, and after how many updates that is
+    checked. ``smooth`` off: the final trajectory repeats the causal one."""
+
+    lag: Annotated[float, Field(ge=0.1, le=3600.0)] | None = None
+    relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
+    relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
+    smooth: bool = True
+
+
 @dataclass
 class Keyframe:
     """A pose variable of the graph: its time, the odometry there, and the sightings and scans that hang on it."""

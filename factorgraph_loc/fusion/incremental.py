@@ -9,13 +9,13 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Solver, Window, read_all
@@ -41,27 +41,16 @@ ITERATIONS_AFTER_FAILURE = 10
 NEAR_POINTS = 0.02
 
 
-@dataclass(frozen=True)
-class IncrementalSettings:
-    """``lag`` [s] of a window, None for the full history; ``smooth`` off: the end repeats what was believed on the way.
-
-    ``relinearize_*``: see :class:`~factorgraph_loc.fusion.smoother.SmootherSettings`. ``waits``: what is seen between keyframes
-    waits for the next one; ``solve_every`` [s]: how long measurements may wait for the solver.
-    """
-
-    lag: float | None
-    smooth: bool
-    relinearize_threshold: float
-    relinearize_skip: int
-    waits: bool
-    solve_every: float
-
-
 class Incremental:
     """The backend of the smoother; see the module."""
 
-    def __init__(self, graph: Graph, settings: IncrementalSettings) -> None:
+    def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
+        self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
+        # how long observations may wait for the solver
+        every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
+        defers = not self._waits and (settings.lag is None or settings.lag >= 2.0 * every)
+        self._solve_every = every if defers else 0.0
         self._maps = any(mapper.estimates for mapper in graph.mappers)
         self._failed: list[str] = []
         # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
@@ -150,14 +139,14 @@ class Incremental:
         """Take a new keyframe and what came with it."""
         guess = addition.values[keyframe.key], spread
         self._filtered.append(guess)
-        if keyframe.t < self._solved + self._settings.solve_every:
+        if keyframe.t < self._solved + self._solve_every:
             self._wait([self._odometry_node(keyframe), *addition.nodes], addition.values, guess)
             return
         self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         """Take what was added to a keyframe that is in the graph."""
-        if guess is not None and (self._settings.waits or keyframe.t < self._solved + self._settings.solve_every):
+        if guess is not None and (self._waits or keyframe.t < self._solved + self._solve_every):
             self._wait(addition.nodes, addition.values, guess)
             return
         self._update(addition.nodes, addition.values)

@@ -8,6 +8,7 @@ from functools import cached_property
 
 from factors.se2 import Array
 
+MOTION = "motion"  # the block of the constants of odometry
 POSE = 3  # components of the error state that are the pose's
 
 

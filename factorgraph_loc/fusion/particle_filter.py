@@ -23,7 +23,7 @@ from pydantic import Field
 
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
-from factorgraph_loc.fusion.layout import POSE, Layout
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
@@ -38,8 +38,6 @@ from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
-
-MOTION = "odometry"  # the block of its constants
 
 
 class ParticleFilterSettings(FilterSettings):

@@ -24,8 +24,10 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.twist.measurement import Twist
+from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.registry import moving
+from factorgraph_loc.sensors.twist.measurement import in_space
+from factorgraph_loc.sensors.twist.settings import twist_settings
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_sighting import Looker, Match
 from factorgraph_loc.slam.monoslam_state import POSE, Eye, Innovation, MapPoint, SlamState, squared, widening
@@ -46,7 +48,6 @@ from factorgraph_loc.slam.space_motion import (
 )
 from factorgraph_loc.slam.space_pose import planar_estimate, planar_trajectory
 from factorgraph_loc.vision.consensus import CameraPose
-from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import positive, se2
 from factors.camera.model import carrier, huber_weight
@@ -108,10 +109,10 @@ class Monoslam(Filter):
         super().__init__(setup, settings)
         self._settings = settings
         self._looker = Looker(setup, self.diagnostics, settings.landmarks)
-        twist = setup.rig.twist if "twist" in setup.sensors else None
+        twist = twist_settings(setup)
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
         self._planar = settings.planar is not False
-        self._wheels = "odometry" in setup.sensors
+        self._wheels = bool(moving(setup.sensors, "floor"))
         self._step: Step | None = None
         self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
         # without a map nothing tells of the start: its uncertainty is kept out of the state, where it would shrink as the
@@ -120,9 +121,10 @@ class Monoslam(Filter):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
-        if isinstance(measurement, Twist) and self._twists is not None:
+        twist = in_space(measurement)
+        if twist is not None and self._twists is not None:
             self._ahead = None
-            if not self._twists.add(measurement.t, measurement.v, measurement.w):
+            if not self._twists.add(twist.t, twist.v, twist.w):
                 self.diagnostics.drop_late("twist")
         else:
             super().process(measurement)
@@ -219,7 +221,7 @@ class Monoslam(Filter):
     def _uses(self, modality: str) -> bool:
         return modality in self.modalities
 
-    def _see(self, m: PixelSightings | CameraFrame) -> None:
+    def _see(self, m: Pixels) -> None:
         eye = self._looker.eye(m)
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))
@@ -233,10 +235,10 @@ class Monoslam(Filter):
             state = self._managed(m, state, eye, match)
         self._state = state
 
-    def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
+    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
         """Told of every image and what was found in it."""
 
-    def _corrected(self, m: PixelSightings | CameraFrame, prior: SlamState, eye: Eye, match: Match) -> SlamState:
+    def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The Kalman update, iterated; pixels far off have their noise widened, then are weighted by Huber's loss."""
         points, spreads = match.points, match.spreads
         zero = np.zeros(len(prior.covariance))
@@ -263,16 +265,14 @@ class Monoslam(Filter):
                 break
         return prior.plus(delta, prior.covariance - spread.T @ spread)
 
-    def _report(self, m: PixelSightings | CameraFrame, residual: Array, innovation: Innovation, noise: Array) -> None:
-        sensor = "camera_right" if isinstance(m, PixelSightings) and m.right else "camera"
+    def _report(self, m: Pixels, residual: Array, innovation: Innovation, noise: Array) -> None:
+        sensor = "camera_right" if m.right else "camera"
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
         self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
         for i, name in enumerate("uv"):
             self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
 
-    def _relocated(
-        self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match
-    ) -> tuple[SlamState, bool]:
+    def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
         """Where nothing is found where it is expected, image after image, or where the pose is hardly known, the place is looked
         for in the whole map; whether it was found. Points in the state are given up with the old place."""
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
@@ -301,14 +301,14 @@ class Monoslam(Filter):
             covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         return SlamState(robot, covariance)
 
-    def _managed(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match) -> SlamState:
+    def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
         """Points counted, deleted, made x, y, z, and taken in where there are too few."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
-        frame = m if isinstance(m, CameraFrame) else None
+        frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
         room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - LATELY))
         for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
-            name = m.points[row] if isinstance(m, PixelSightings) else f"met{state.met}"
+            name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
             grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
             state = replace(grown, met=state.met + 1)

@@ -9,8 +9,7 @@ import numpy as np
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.camera.sensor import DISAGREES, EXACT, MOST
+from factorgraph_loc.sensors.camera.sensor import DISAGREES, EXACT, MOST, Pixels
 from factorgraph_loc.slam.monoslam_search import agreeing, find
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
 from factorgraph_loc.vision import consensus
@@ -63,25 +62,21 @@ class Looker:
             worst = float(np.trace(self._map.covariances, axis1=1, axis2=2).max())
             self._spreads_matter = worst > (EXACT * self._left_eye.model.sigma / self._left_eye.model.fx) ** 2
 
-    def eye(self, m: PixelSightings | CameraFrame) -> Eye | None:
+    def eye(self, m: Pixels) -> Eye | None:
         """The camera that took an image."""
-        return self._right_eye if isinstance(m, PixelSightings) and m.right else self._left_eye
+        return self._right_eye if m.right else self._left_eye
 
-    def match(self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye) -> Match:
+    def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
         """The pixels that belong to points, those that cannot be right left out and counted as rejected."""
-        if isinstance(m, PixelSightings):
-            return self._named(m, state, eye)
-        return self._searched(m, state, eye)
+        return self._named(m, m.names, state, eye) if m.frame is None else self._searched(m.frame, state, eye)
 
-    def new(
-        self, m: PixelSightings | CameraFrame, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]
-    ) -> list[int]:
+    def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
         """Rows of an image that may become points: what has no name yet in map and state, or was followed from the image before
         (``tracks``) and lies far from what is matched and expected."""
-        if isinstance(m, PixelSightings):
+        if m.frame is None:
             there = {p.name for p in state.points}
-            return [i for i, name in enumerate(m.points) if i not in match.taken and name not in there]
-        followed = np.isin(m.tracks, list(tracks))
+            return [i for i, name in enumerate(m.names) if i not in match.taken and name not in there]
+        followed = np.isin(m.frame.tracks, list(tracks))
         expected = eye.mapped(state, range(len(state.points))).pixels
         occupied = np.concatenate((m.pixels[list(match.taken)].reshape(-1, 2), expected))
         chosen: list[int] = []
@@ -96,11 +91,11 @@ class Looker:
         lately = [i for i, p in enumerate(state.points) if p.t >= since]
         return len(_visible(eye, eye.mapped(state, lately))[1])
 
-    def _named(self, m: PixelSightings, state: SlamState, eye: Eye) -> Match:
+    def _named(self, m: Pixels, names: Sequence[str], state: SlamState, eye: Eye) -> Match:
         index = {p.name: i for i, p in enumerate(state.points)}
-        ours = [(i, index[name]) for i, name in enumerate(m.points) if name in index]
-        known = [(i, self._map.index[name]) for i, name in enumerate(m.points) if name in self._map.index]
-        if not self._grows and (unknown := len(m.points) - len(known)):
+        ours = [(i, index[name]) for i, name in enumerate(names) if name in index]
+        known = [(i, self._map.index[name]) for i, name in enumerate(names) if name in self._map.index]
+        if not self._grows and (unknown := len(names) - len(known)):
             self._diagnostics.ignore("point not in the map", unknown)
         taken = frozenset(i for i, _ in (*ours, *known))
         right = self._agreeing(m.pixels, ours, state, eye)
@@ -126,12 +121,12 @@ class Looker:
         match = self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
         return replace(match, tempering=eye.model.tempering)
 
-    def relocated(self, m: PixelSightings | CameraFrame, eye: Eye) -> CameraPose | None:
+    def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
         """Where the camera is by this image and the map alone; None where that does not tell."""
-        if isinstance(m, CameraFrame):
-            found = None if self._associator is None else self._associator.relocalized(m)
+        if m.frame is not None:
+            found = None if self._associator is None else self._associator.relocalized(m.frame)
             return None if found is None else CameraPose(*found[:3])
-        known = [(i, self._map.index[name]) for i, name in enumerate(m.points) if name in self._map.index]
+        known = [(i, self._map.index[name]) for i, name in enumerate(m.names) if name in self._map.index]
         if len(known) < FEWEST_FOUND:
             return None
         rows, points = (list(part) for part in zip(*known, strict=True))

@@ -12,7 +12,6 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.camera.bound import CameraSensor
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factorgraph_loc.slam.new_points import FEWEST
@@ -56,11 +55,11 @@ class PointMapper:
         if m.modality != self._camera.modality:
             return guess
         points = self._camera.points
-        if isinstance(m, PixelSightings):
-            names: list[Hashable] = list(m.points)
-            used = {i for i, name in enumerate(m.points) if name in points.map.index}
+        if m.frame is None:
+            names: list[Hashable] = list(m.names)
+            used = {i for i, name in enumerate(m.names) if name in points.map.index}
         else:
-            names, used = m.tracks.tolist(), set(points.used.tolist())
+            names, used = m.frame.tracks.tolist(), set(points.used.tolist())
         if self._unknown is not None:
             self._taken = m.t
             rows = [i for i in range(len(names)) if i not in used]

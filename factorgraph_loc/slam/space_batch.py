@@ -20,14 +20,13 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.twist.measurement import Twist
-from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.twist.measurement import in_space
+from factorgraph_loc.sensors.twist.settings import TwistSettings, twist_settings
 from factorgraph_loc.slam.monoslam import Monoslam, MonoslamSettings
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, squared
 from factorgraph_loc.slam.space_motion import RobotState, TwistChain
-from factorgraph_loc.vision.frame import CameraFrame
 from factors import positive
 from factors.camera.model import huber_loss, huber_weight
 from factors.se2 import Array
@@ -82,7 +81,7 @@ class SpaceBatch(Monoslam):
         if settings.landmarks != "known" or settings.planar:
             raise InputError("space_batch: takes points of a known map and a robot in space, expected planar = false")
         super().__init__(setup, settings.model_copy(update={"planar": False}))
-        twist = setup.rig.twist if "twist" in setup.sensors else None
+        twist = twist_settings(setup)
         self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
         self._images: dict[tuple[float, bool], _Image] = {}
         self._prior: PosePrior | None = None
@@ -100,8 +99,9 @@ class SpaceBatch(Monoslam):
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
         self._conclusion = None
-        if isinstance(measurement, Twist):
-            self._chain.add(measurement.t, measurement.v, measurement.w)
+        twist = in_space(measurement)
+        if twist is not None:
+            self._chain.add(twist.t, twist.v, twist.w)
         super().process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
@@ -143,9 +143,9 @@ class SpaceBatch(Monoslam):
             np.array([spreads[i] for i in rows]).reshape(-1, 6, 6),
         )
 
-    def _matched(self, m: PixelSightings | CameraFrame, match: Match, eye: Eye) -> None:
+    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
         if len(match.pixels):
-            key = (m.t, isinstance(m, PixelSightings) and m.right)
+            key = (m.t, m.right)
             self._images[key] = _Image(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
     def _motion_graph(self, t: Array) -> gtsam.NonlinearFactorGraph:

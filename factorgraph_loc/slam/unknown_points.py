@@ -19,8 +19,7 @@ from factorgraph_loc.fusion.variables import Node, point_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.variable import NOTHING, Estimated
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
+from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, Pixels, lifted
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
@@ -85,7 +84,7 @@ class UnknownPoints:
 
     def take(
         self,
-        m: PixelSightings | CameraFrame,
+        m: Pixels,
         rows: Sequence[int],
         keyframe: Keyframe,
         guess: Guess,
@@ -102,8 +101,8 @@ class UnknownPoints:
             self._way += float(np.hypot(*keyframe.from_previous.delta[:2]))
         names = self._named(m, rows, lifted(model, *guess), graph)
         certain: set[int] = set()  # rows
-        if isinstance(m, CameraFrame) and self._loops.due(m.t):
-            certain = self._revisited(model, Image(m, keyframe, guess, self._way), rows, names, graph)
+        if m.frame is not None and self._loops.due(m.t):
+            certain = self._revisited(model, Image(m.frame, keyframe, guess, self._way), rows, names, graph)
         pixels = np.asarray(m.pixels[rows], dtype=float)
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
@@ -114,10 +113,10 @@ class UnknownPoints:
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known)
-        if isinstance(m, CameraFrame):
+        if m.frame is not None:
             seen_from = lifted(model, *guess).position
             self._remember(
-                m, [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)], seen_from
+                m.frame, [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)], seen_from
             )
         for i, agrees in zip(old, right.tolist(), strict=True):
             self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
@@ -130,10 +129,10 @@ class UnknownPoints:
         places, pose = self._places(keyframe, guess[0], waiting, graph)
         for name, found, seen in self._new.ready(waiting, places.get, PER_KEYFRAME - len(old)):
             key = point_key(len(self._names))
-            self._names[key] = str(name) if isinstance(m, PixelSightings) else f"track{name}"
+            self._names[key] = f"track{name}" if m.names is None else str(name)
             self._points[name] = _Point(key, keyframe.t, positive.inverse(found.covariance))
-            if isinstance(m, CameraFrame):
-                self._looks.keep(key, m, rows[names.index(name)], lifted(model, *guess).position, self._way)
+            if m.frame is not None:
+                self._looks.keep(key, m.frame, rows[names.index(name)], lifted(model, *guess).position, self._way)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
@@ -144,13 +143,11 @@ class UnknownPoints:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
         return pose, guess[1]
 
-    def _named(
-        self, m: PixelSightings | CameraFrame, rows: Sequence[int], camera: CameraPose, graph: GraphView
-    ) -> list[Hashable]:
+    def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: GraphView) -> list[Hashable]:
         """What is seen, by name: of features the number of the track, or of that under which the point came into the graph."""
-        if isinstance(m, PixelSightings):
-            return [m.points[i] for i in rows]
-        tracks = m.tracks[list(rows)].tolist()
+        if m.frame is None:
+            return [m.names[i] for i in rows]
+        tracks = m.frame.tracks[list(rows)].tolist()
         # the track that a point came with may come back itself
         gone = self._points.keys() - set(tracks)
         self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
@@ -162,7 +159,12 @@ class UnknownPoints:
         positions = np.array([graph.values[self._points[name].key] for name in lost]).reshape(-1, 3)
         place = {row: i for i, row in enumerate(rows)}
         for which, row in refound(
-            self.model, camera, positions, [self._looks[self._points[name].key].descriptor for name in lost], m, free
+            self.model,
+            camera,
+            positions,
+            [self._looks[self._points[name].key].descriptor for name in lost],
+            m.frame,
+            free,
         ):
             track = names[place[row]]
             if self._new.count(track) < FEWEST_SIGHTINGS:

@@ -20,12 +20,19 @@ class CameraFrame:
     sensor: ClassVar[str] = "camera"
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
+    right: ClassVar[bool] = False
+    names: ClassVar[None] = None
     t: float
     feature: str
     pixels: Array
     sizes: Array
     descriptors: NDArray[Any]
     tracks: NDArray[np.int64]
+
+    @property
+    def frame(self) -> "CameraFrame":
+        """The features that were found."""
+        return self
 
     @property
     def count(self) -> int:

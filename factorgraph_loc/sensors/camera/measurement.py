@@ -13,6 +13,7 @@ class PixelSightings:
 
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
+    frame: ClassVar[None] = None  # no features were looked for
     t: float
     points: tuple[str, ...]
     pixels: Array
@@ -22,6 +23,11 @@ class PixelSightings:
     def sensor(self) -> str:
         """The sensor that saw them."""
         return "sightings_right" if self.right else "sightings"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the points."""
+        return self.points
 
     @property
     def count(self) -> int:

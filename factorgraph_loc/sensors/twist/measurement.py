@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+from factorgraph_loc.model.measurement import Measurement
 from factors.se2 import Array
 
 
@@ -18,3 +19,8 @@ class Twist:
     t: float
     v: Array
     w: Array
+
+
+def in_space(m: Measurement) -> Twist | None:
+    """The motion in space that a measurement tells; None for another one."""
+    return m if isinstance(m, Twist) else None
