@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from factorgraph_loc.model.measurement import Measurement
 from factors.se2 import Array
 
 
@@ -19,8 +18,3 @@ class Twist:
     t: float
     v: Array
     w: Array
-
-
-def in_space(m: Measurement) -> Twist | None:
-    """The motion in space that a measurement tells; None for another one."""
-    return m if isinstance(m, Twist) else None

@@ -5,7 +5,6 @@ from typing import Annotated
 from pydantic import Field
 
 from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.setup import Setup
 
 PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)")]
 
@@ -16,8 +15,3 @@ class TwistSettings(SensorSettings):
 
     shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
     turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
-
-
-def twist_settings(setup: Setup) -> TwistSettings | None:
-    """Those of a run; None where motion in space is not used."""
-    return setup.rig.find(TwistSettings) if "twist" in setup.sensors else None
