@@ -79,6 +79,10 @@ def settled(
         for name, found in knowledge.found.items()
     }
     notes = [note for part in parts.values() for note in part.notes]
+    if not has_heading(logs[0]):
+        notes.insert(
+            0, "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
+        )
     if len(logs) == 1:
         notes.append(
             "One log cannot tell what differs between runs: the uncertainties of constants are those of the input rig."

@@ -34,8 +34,7 @@ def constants_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
 def dependents_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
     """What is learnt for the constants that remain, without what is tried last."""
     used = [calibrators()[name] for name in knowledge.found]
-    learnt = [one for one, part in zip(used, knowledge.found.values(), strict=True) if one.has_noise(part)]
-    units = [unit for one in learnt for unit in one.noise]
+    units = [unit for one in used for unit in one.noise]
     for one in used:
         old, new = one.settings(start), getattr(knowledge.rig, one.section)
         if one.uncertain and new is not None and new.uncertainty != old.uncertainty:

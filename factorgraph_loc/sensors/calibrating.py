@@ -5,13 +5,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from factorgraph_loc.drawing.markup import Rows
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fitting.constants import Learnt, describe
-from factorgraph_loc.fitting.robust import Constant, Fit, is_worth
+from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, folds, gains, is_worth
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factors.se2 import Array
+
+BLOCK = 20.0  # s; errors in one block may be correlated
+BLOCKS = 5  # stretches of time of a single log, each predicted by the others
 
 
 class Unit(NamedTuple):
@@ -109,10 +114,6 @@ class Calibrator:
             groups.setdefault(next((names[0] for names in self.together if c.name in names), c.name), []).append(c)
         return {Unit(self.section, tuple(c.name for c in some)): sum(c.gain for c in some) for some in groups.values()}
 
-    def has_noise(self, _found: Any) -> bool:
-        """Whether ``noise`` was learnt."""
-        return True
-
     def optional(self, _learnt: Rig) -> tuple[Unit, ...]:
         """What is tried last, and is not used unless it pays."""
         return ()
@@ -184,10 +185,12 @@ class Calibrator:
         return ()
 
 
-class ConstantsFit(NamedTuple):
-    """All constants of a sensor fitted together, from ``start``; ``gain`` (P, K): see
+@dataclass(frozen=True)
+class ConstantsFound:
+    """``parts``: the data by log; all constants fitted together (``everything``), from ``start``; ``gain`` (P, K): see
     :func:`~factorgraph_loc.fitting.robust.gains`; ``denied``: names of those that something else denies."""
 
+    parts: tuple[Any, ...]
     everything: Fit
     gain: Array
     start: Mapping[str, float]
@@ -195,42 +198,62 @@ class ConstantsFit(NamedTuple):
 
 
 class ConstantsCalibrator(Calibrator):
-    """Of a sensor whose constants are fitted by least squares. What :meth:`learn` finds has a ``fit``, which is None where the
-    constants cannot be fitted."""
+    """Of a sensor whose constants are fitted by least squares. The data of a log have stamps ``t`` (K,), ``residuals(settings)``
+    (K, D) in standard deviations, and can be cut into two ``halves()``."""
 
-    def parts(self, found: Any) -> Sequence[Any]:
-        """The data by log; each can be cut into ``halves()``."""
+    def part(self, log: Log) -> Any:
+        """The data of a log; InputError if they are too few."""
         raise NotImplementedError
 
-    def base(self, found: Any, rig: Rig, accepted: Collection[str] | None) -> Any:
+    def constants(self, parts: Sequence[Any], settings: Any) -> Sequence[Constant]:
+        """What may be fitted; neutral are the values of the rig."""
+        raise NotImplementedError
+
+    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> Any:
+        """The constants of a sensor that the logs have."""
+        if self.channel not in logs[0].streams:
+            return None
+        parts, settings = tuple(map(self.part, logs)), self.settings(rig)
+        constants = self.constants(parts, settings)
+        everything = self.fit(None, parts, settings, constants, {c.name: c.neutral for c in constants})
+        gain = gains(everything, folds([one.t for one in parts], BLOCKS))
+        return ConstantsFound(parts, everything, gain, everything.as_dict())
+
+    def base(self, found: Any, rig: Rig, _accepted: Collection[str] | None) -> Any:
         """What the constants are part of, with neutral ones."""
-        raise NotImplementedError
+        return self.changed(self.settings(rig), {c.name: c.neutral for c in found.everything.constants})
 
     def changed(self, base: Any, values: Mapping[str, float]) -> Any:
         """The same with other constants."""
-        raise NotImplementedError
+        return base.model_copy(update=dict(values))
 
     def fit(
-        self, found: Any, parts: Sequence[Any], base: Any, constants: Sequence[Constant], start: Mapping[str, float]
+        self, _found: Any, parts: Sequence[Any], base: Any, constants: Sequence[Constant], start: Mapping[str, float]
     ) -> Fit:
-        """The ``constants`` fitted to some of the data together."""
-        raise NotImplementedError
+        """The ``constants`` fitted to some of the data together, with the other constants and the noise of ``base``."""
+        names = [c.name for c in constants]
+
+        def whitened(values: Array) -> Array:
+            changed = self.changed(base, dict(zip(names, values.tolist(), strict=True)))
+            return np.concatenate([one.residuals(changed) for one in parts])
+
+        return fit(constants, np.array([start[n] for n in names]), whitened, blocks([one.t for one in parts], BLOCK))
 
     def finished(
-        self, found: Any, logs: Sequence[Log], rig: Rig, base: Any, learnt: Sequence[Learnt], *, by_log: bool
+        self, _found: Any, _logs: Sequence[Log], _rig: Rig, base: Any, learnt: Sequence[Learnt], *, by_log: bool
     ) -> Settled:
-        """With what depends on the constants."""
-        raise NotImplementedError
+        """With what depends on the constants; unless ``by_log`` without what is told of each log."""
+        del by_log
+        return Settled({self.section: base}, learnt)
 
     def settle(
         self, found: Any, logs: Sequence[Log], rig: Rig, accepted: Collection[str] | None, *, by_log: bool
     ) -> Settled:
         """See :meth:`Calibrator.settle`."""
-        everything, gain, start, denied = found.fit
-        constants, parts = everything.constants, self.parts(found)
+        constants, start, parts = found.everything.constants, found.start, found.parts
         kept = [
             c
-            for c, g in zip(constants, gain, strict=True)
+            for c, g in zip(constants, found.gain, strict=True)
             if is_worth(g) and (accepted is None or f"{self.section}.{c.name}" in accepted)
         ]
         base = self.base(found, rig, accepted)
@@ -245,5 +268,6 @@ class ConstantsCalibrator(Calibrator):
             for one in (parts if len(parts) > 1 else parts[0].halves())
             if by_log
         ]
+        everything, gain, denied = found.everything, found.gain, found.denied
         learnt = describe(self.section, everything, pooled, alone, gain, len(parts), denied, self.uncertain)
         return self.finished(found, logs, rig, base, learnt, by_log=by_log)

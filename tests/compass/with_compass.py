@@ -1,5 +1,6 @@
 """What a compass can be used for where its package is installed: run by ``test_compass.py``, which puts it on the path."""
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -176,3 +177,21 @@ def test_a_simulated_drive_has_it():
     biases = [fgloc.info(log).compass["bias"] for log in logs]
     assert biases[1] != biases[2]
     assert all(abs(bias - 0.1) < 0.8 for bias in biases)
+
+
+def test_its_bias_is_calibrated(tmp_path):
+    changes = {
+        "drive": {"duration": 60.0},
+        "world": {"landmarks": 12, "tags": 0},
+        "rig": {"compass": {"bias": 0.25, "sigma": 0.02}, "sensors": ["odometry", "bearing_range"]},
+    }
+    log = fgloc.simulate("office", 3, changes=changes)
+    streams = {name: stream for name, stream in log.streams.items() if name != "rfid"}
+    rig = log.rig.model_copy(update={"rfid": None, "compass": CompassSettings(sigma=0.02)})
+    given = dataclasses.replace(log, streams=streams, rig=rig)
+    found = fgloc.calibrate(given, tmp_path / "a.rig.toml")
+    (bias,) = (one for one in found.knowledge.constants if one.sensor == "compass")
+    assert bias.fitted == pytest.approx(0.25, abs=5.0 * bias.error)
+    assert bias.error < 0.01
+    assert ("compass.bias",) in [one.names for one in found.judgements]
+    assert "compass.bias [rad]" in (tmp_path / "a.report.html").read_text()

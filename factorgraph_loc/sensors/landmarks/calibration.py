@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from factorgraph_loc.fitting.robust import Constant, Fit, Integers, blocks, fit, spread
+from factorgraph_loc.fitting.robust import Constant, Integers, spread
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
@@ -18,7 +18,6 @@ from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
-BLOCK = 20.0  # s; errors in one block may be correlated
 INLIER = 4.0  # standard deviations beyond which a sighting has no part in the scatter
 LAGS = np.concatenate(([0.0], np.geomspace(0.15, 60.0, 16)))  # s, edges of the bins of the autocorrelation
 NEIGHBOURS = 200  # of a sighting, in its track, that the autocorrelation looks at
@@ -122,19 +121,6 @@ def could_be_depths(seen: Sequence[Sightings]) -> bool:
 def range_spread(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
     """Robust standard deviation of the ranges' residuals [m]."""
     return float(spread(np.concatenate([one.errors(settings) for one in seen]))[0])
-
-
-def fit_sensor(
-    seen: Sequence[Sightings], settings: BearingRangeSettings, constants: Sequence[Constant], start: Mapping[str, float]
-) -> Fit:
-    """The ``constants`` of one or several logs together, with the noise and the other constants of ``settings``."""
-    names = [c.name for c in constants]
-
-    def whitened(values: Array) -> Array:
-        changed = settings.model_copy(update=dict(zip(names, values.tolist(), strict=True)))
-        return np.concatenate([one.residuals(changed) for one in seen])
-
-    return fit(constants, np.array([start[n] for n in names]), whitened, blocks([one.t for one in seen], BLOCK))
 
 
 def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> BearingRangeSettings:

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 from factorgraph_loc.drawing.markup import Rows, image, number, table
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import Learnt
-from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
+from factorgraph_loc.fitting.robust import Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, ConstantsFit, Settled, Told, Unit
+from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
 from factorgraph_loc.sensors.landmarks import calibration as sightings
 from factorgraph_loc.sensors.landmarks.calibration import Sightings
 from factorgraph_loc.sensors.landmarks.figures import correlation_figure, sightings_figure
@@ -19,24 +19,22 @@ from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 
 MIN_SIGHTINGS = 100
 MOST_SIGHTINGS = 12000  # of a log that have a part in fits
-BLOCKS = 5  # stretches of time of a single log, each predicted by the others
 # ranges are taken to be of the other kind, distance or depth, if then their spread is below this share
 BETTER_KIND = 0.9
 ROUNDS = 2  # of constants and scatter in turn
 RANGE_KIND = "range_kind"
 SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
+FIRST = BearingRangeSettings(range_sigma=0.1)  # of which nothing is known
 SCATTER = Unit("bearing_range", tuple(SIGMAS))
 
 
 @dataclass(frozen=True)
-class SensorFit:
-    """All constants fitted together to sightings ``thinned`` out of all that were ``seen``; ``settings``: with these and their
-    scatter, of the kind of ranges that fits best."""
+class SensorFit(ConstantsFound):
+    """The parts are thinned out of all sightings that were ``seen``. ``settings``: with all constants and their scatter, of the
+    kind of ranges that fits best."""
 
-    fit: ConstantsFit
-    settings: BearingRangeSettings
-    seen: tuple[Sightings, ...]
-    thinned: tuple[Sightings, ...]
+    settings: BearingRangeSettings = FIRST
+    seen: tuple[Sightings, ...] = ()
 
 
 class LandmarkCalibrator(ConstantsCalibrator):
@@ -55,7 +53,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         "depth_axis": "rad",
         "time_offset": "s",
     }
-    first = BearingRangeSettings(range_sigma=0.1)
+    first = FIRST
 
     def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> SensorFit | None:
         """The constants of the sensor, of logs with sightings."""
@@ -63,40 +61,34 @@ class LandmarkCalibrator(ConstantsCalibrator):
             return None
         seen, before = tuple(_sightings(log) for log in logs), self.settings(rig)
         thinned = [one.thinned(MOST_SIGHTINGS) for one in seen]
-        everything, settings = _fit_and_scatter(thinned, before)
+        everything, settings = self._fit_and_scatter(thinned, before)
         if sightings.could_be_depths(thinned):
             other = before.model_copy(update={RANGE_KIND: "distance" if before.range_kind == "depth" else "depth"})
-            found, changed = _fit_and_scatter(thinned, other)
+            found, changed = self._fit_and_scatter(thinned, other)
             if sightings.range_spread(thinned, changed) < BETTER_KIND * sightings.range_spread(thinned, settings):
                 everything, settings = found, changed
         gain = gains(everything, folds([one.t for one in thinned], BLOCKS))
-        return SensorFit(ConstantsFit(everything, gain, everything.as_dict()), settings, seen, tuple(thinned))
+        return SensorFit(tuple(thinned), everything, gain, everything.as_dict(), (), settings, seen)
 
-    def parts(self, found: SensorFit) -> Sequence[Sightings]:
-        """The sightings of each log."""
-        return found.thinned
+    def _fit_and_scatter(
+        self, seen: Sequence[Sightings], before: BearingRangeSettings
+    ) -> tuple[Fit, BearingRangeSettings]:
+        """All constants of the sensor and its scatter, in turn."""
+        constants = sightings.constants_of(seen, before)
+        start = {c.name: c.neutral for c in constants}
+        settings = sightings.with_scatter(seen, before)
+        for _ in range(ROUNDS):
+            everything = self.fit(None, seen, settings, constants, start)
+            start = everything.as_dict()
+            settings = sightings.with_scatter(seen, self.changed(settings, start))
+        return everything, settings
 
     def base(self, found: SensorFit, rig: Rig, accepted: Collection[str] | None) -> BearingRangeSettings:
         """The settings with the scatter of all constants together, of the kind of ranges that is accepted."""
-        settings = found.settings.model_copy(update={c.name: c.neutral for c in found.fit.everything.constants})
+        settings = found.settings.model_copy(update={c.name: c.neutral for c in found.everything.constants})
         if accepted is None or f"{self.section}.{RANGE_KIND}" in accepted:
             return settings
         return settings.model_copy(update={RANGE_KIND: self.settings(rig).range_kind})
-
-    def changed(self, base: BearingRangeSettings, values: Mapping[str, float]) -> BearingRangeSettings:
-        """The settings with other constants."""
-        return base.model_copy(update=dict(values))
-
-    def fit(
-        self,
-        _found: SensorFit,
-        parts: Sequence[Sightings],
-        base: BearingRangeSettings,
-        constants: Sequence[Constant],
-        start: Mapping[str, float],
-    ) -> Fit:
-        """By range and bearing."""
-        return sightings.fit_sensor(parts, base, constants, start)
 
     def finished(
         self,
@@ -109,7 +101,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         by_log: bool,
     ) -> Settled:
         """With the scatter that is left, and how alike neighbouring errors are."""
-        settings = sightings.with_scatter(found.thinned, base)
+        settings = sightings.with_scatter(found.parts, base)
         before, notes = rig.bearing_range, []
         if before is not None and settings.range_kind != before.range_kind:
             notes.append(f"The ranges fit better as the {settings.range_kind} than as the {before.range_kind}.")
@@ -181,18 +173,6 @@ def _sightings(log: Log) -> Sightings:
             f"expected {MIN_SIGHTINGS} or more"
         )
     return seen
-
-
-def _fit_and_scatter(seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
-    """All constants of the sensor and its scatter, in turn."""
-    constants = sightings.constants_of(seen, before)
-    start = {c.name: c.neutral for c in constants}
-    settings = sightings.with_scatter(seen, before)
-    for _ in range(ROUNDS):
-        everything = sightings.fit_sensor(seen, settings, constants, start)
-        start = everything.as_dict()
-        settings = sightings.with_scatter(seen, settings.model_copy(update=start))
-    return everything, settings
 
 
 def _correlations(told: Told) -> Rows:

@@ -11,10 +11,10 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
 from factorgraph_loc.sensors import clock_shift
 from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP
+from factorgraph_loc.sensors.odometry.calibration.windows import integrated
 from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.summary import Summary
-from factors.odometry.chain import OdometryChain
 from factors.se2 import Array
 
 WINDOW = 0.2  # s over which a rate is taken, at least
@@ -46,7 +46,7 @@ def motion_problems(log: Log) -> list[str]:
     lines = _coverage(log, stream)
     begin, end = _longest(stream.t)
     t = np.arange(begin, end, STEP) + log.rig.time_offset("odometry")
-    states = _integrated(log, stream).states(t)
+    states = integrated(log, odometry_model(log.rig)).states(t)
     heading, way = states[:, 3], states[:, 4]
     gyro = log.streams.get("imu")
     if isinstance(gyro, YawRateStream) and len(gyro.t) > 1:
@@ -123,16 +123,6 @@ def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
         offset = -found.shift if sensor == "imu" else found.shift
         lines.append(clock_shift.line(name, found.shift, "the odometry", sensor, offset))
     return lines
-
-
-def _integrated(log: Log, stream: VelocityStream | IncrementStream) -> OdometryChain:
-    chain = OdometryChain(odometry_model(log.rig), horizon=np.inf)
-    t = stream.t + log.rig.time_offset("odometry")
-    if isinstance(stream, VelocityStream):
-        chain.add_velocities(t, stream.v, stream.w)
-    else:
-        chain.add_increments(t, stream.dx, stream.dy, stream.dtheta)
-    return chain
 
 
 def _rates(values: Array, window: float) -> Array:

@@ -1,9 +1,11 @@
 """How wheel odometry is calibrated: by the motion of the reference over short windows."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
+
+import numpy as np
 
 from factorgraph_loc.drawing.markup import image, number, table
 from factorgraph_loc.errors import InputError
@@ -11,7 +13,7 @@ from factorgraph_loc.fitting.constants import Learnt
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, ConstantsFit, Settled, Told, Unit
+from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
 from factorgraph_loc.sensors.odometry.calibration import constants as odometry
 from factorgraph_loc.sensors.odometry.calibration.figures import odometry_figure
 from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
@@ -23,7 +25,6 @@ from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
 MIN_WINDOWS = 20
-BLOCKS = 5  # stretches of time of a single log, each predicted by the others
 ROUNDS = 2  # of constants and scatter in turn
 MOST_OUTLIERS = 0.05  # share of the windows
 NOISE = Unit("odometry", ("noise",))
@@ -31,13 +32,10 @@ KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
 
 
 @dataclass(frozen=True)
-class WheelsFit:
-    """``windows`` of 2 s, by log, and the ``fit`` of all constants, with ``sigmas`` (3,) of the residuals; None and no windows
-    where the reference has no heading."""
+class WheelsFit(ConstantsFound):
+    """The parts are windows of 2 s. ``sigmas`` (3,) of the residuals."""
 
-    windows: tuple[Windows, ...] = ()
-    fit: ConstantsFit | None = None
-    sigmas: Array | None = None
+    sigmas: Array = field(default_factory=lambda: np.ones(3))
 
 
 class OdometryCalibrator(ConstantsCalibrator):
@@ -65,10 +63,10 @@ class OdometryCalibrator(ConstantsCalibrator):
                 f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
             )
 
-    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> WheelsFit:
+    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> WheelsFit | None:
         """The constants of the wheels, where the reference has headings."""
         if logs[0].reference is None or not logs[0].reference.has_heading:
-            return WheelsFit()
+            return None
         windows = tuple(cut(log, odometry.WINDOW) for log in logs)
         for one in windows:
             if len(one.begin) < MIN_WINDOWS:
@@ -85,24 +83,7 @@ class OdometryCalibrator(ConstantsCalibrator):
             start = everything.as_dict()
         denied = odometry.denied_at_rest(everything, windows)
         gain = gains(everything, folds([one.begin for one in windows], BLOCKS), denied)
-        return WheelsFit(windows, ConstantsFit(everything, gain, start, denied), sigmas)
-
-    def settle(
-        self, found: WheelsFit, logs: Sequence[Log], rig: Rig, accepted: Collection[str] | None, *, by_log: bool
-    ) -> Settled:
-        """See :meth:`ConstantsCalibrator.settle`."""
-        if found.fit is None:
-            note = "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
-            return Settled({"odometry": rig.odometry}, notes=(note,))
-        return super().settle(found, logs, rig, accepted, by_log=by_log)
-
-    def has_noise(self, found: WheelsFit) -> bool:
-        """Where the constants can be fitted."""
-        return found.fit is not None
-
-    def parts(self, found: WheelsFit) -> Sequence[Windows]:
-        """The windows of each log."""
-        return found.windows
+        return WheelsFit(windows, everything, gain, start, denied, sigmas)
 
     def base(self, _found: WheelsFit, rig: Rig, _accepted: Collection[str] | None) -> OdometryModel:
         """The model of the input rig."""
@@ -121,7 +102,6 @@ class OdometryCalibrator(ConstantsCalibrator):
         start: Mapping[str, float],
     ) -> Fit:
         """With the scatter of all constants together."""
-        assert found.sigmas is not None, "there are windows"
         return odometry.fit_odometry(parts, base, constants, found.sigmas, start)
 
     def finished(
@@ -188,9 +168,9 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     def told_residuals(self, told: Told) -> list[str]:
         """Of the windows."""
-        if not told.found.windows:
+        if told.found is None:
             return []
-        figure = odometry_figure(told.found.windows, odometry_model(told.learnt))
+        figure = odometry_figure(told.found.parts, odometry_model(told.learnt))
         return ["<h2>Residuals of the odometry</h2>", image(figure)]
 
 

@@ -18,4 +18,5 @@ SENSOR = SensorType(
     simulation={"compass": Section("compass.settings:CompassSimulation", always=True)},
     simulate="compass.simulation:simulate",
     summarize="compass.summary:summarize",
+    calibrator="compass.calibration:CALIBRATOR",
 )

@@ -1,0 +1,53 @@
+"""How the bias of a compass is learnt from the headings of a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compass.settings import CompassSettings
+from factorgraph_loc.fitting.robust import Constant
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator
+from factors import se2
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What was measured at ``t`` (K,), less the true headings: ``errors`` (K,) [rad]."""
+
+    t: Array
+    errors: Array
+
+    def halves(self) -> tuple[Headings, Headings]:
+        """The first and the second half in time."""
+        half = len(self.t) // 2
+        return Headings(self.t[:half], self.errors[:half]), Headings(self.t[half:], self.errors[half:])
+
+    def residuals(self, settings: CompassSettings) -> Array:
+        """In standard deviations (K, 1)."""
+        return se2.wrap(settings.bias - self.errors)[:, None] / settings.sigma
+
+
+class CompassCalibrator(ConstantsCalibrator):
+    """Learns the bias."""
+
+    section, channel, senses = "compass", "compass", False
+    uncertain, units, first = {"bias": 1.0}, {"bias": "rad"}, CompassSettings()
+
+    def part(self, log: Log) -> Headings:
+        """The headings while there is a reference."""
+        stream = log.streams["compass"]
+        t = stream.t + log.rig.time_offset("compass")
+        errors = se2.wrap(stream.heading - log.reference.at(t, max_gap=0.5)[:, 2])
+        known = np.isfinite(errors)
+        return Headings(t[known], errors[known])
+
+    def constants(self, _parts: object, settings: CompassSettings) -> tuple[Constant, ...]:
+        """The bias."""
+        return (Constant("bias", settings.bias, 0.02, -np.pi, np.pi),)
+
+
+CALIBRATOR = CompassCalibrator()
