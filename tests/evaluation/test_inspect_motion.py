@@ -9,6 +9,7 @@ from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.io.look_over import look_over
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.stream import selected
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark
@@ -54,6 +55,14 @@ def later(log, **shifts):
     """The log with streams that are stamped later, by name."""
     streams = {k: replace(s, t=s.t + shifts.get(k, 0.0)) for k, s in log.streams.items()}
     return replace(log, streams=streams)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.6, 1.0, 3.0])
+def test_a_drive_shorter_than_the_window_of_its_rates_tells_nothing(log, seconds):
+    moved = log.streams["odometry"]
+    short = replace(log, streams={"odometry": selected(moved, moved.t < seconds)})
+    sparse = replace(short, reference=Trajectory(log.reference.t[::8], log.reference.poses[::8]))
+    assert motion_problems(sparse) == []
 
 
 def motion_problems(log):

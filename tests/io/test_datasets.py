@@ -166,6 +166,8 @@ def test_kitti_cameras_stand_beside_the_first(kitti_odometry, one):
         ("kitti_odometry", "sequences/03/times.txt", ("1.036224e-01", "0"), ("times.txt:2", "after that of the row")),
         ("kitti_odometry", "sequences/03/calib.txt", ("P2: 700", "P2: "), ("calib.txt:2", "P2", "12 finite numbers")),
         ("kitti_odometry", "sequences/03/calib.txt", ("P2", "P4"), ("calib.txt: has no line P2",)),
+        ("kitti_odometry", "sequences/03/calib.txt", ("0.7 0 0 1", "0.7 0 0 0"), ("calib.txt:2", "P2", "0 0 1")),
+        ("kitti_odometry", "sequences/03/calib.txt", ("P2: 700 0", "P2: 700 9"), ("calib.txt:2", "fx 0 cx")),
     ],
 )
 def test_bad_files(kind, file, change, fragments, refused, request):

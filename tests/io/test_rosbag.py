@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_idl, get_types_from_msg
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model
@@ -347,6 +347,29 @@ def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refus
     file = tmp_path / "drive" / "drive.mcap"
     file.write_bytes(file.read_bytes().replace(b"Quaternion orientation", b"Quaternion orientatiom"))
     refuse(file, "/odom:1: nav_msgs/msg/Odometry is not defined in the bag as ROS does", rfid=None)
+
+
+@pytest.mark.parametrize(
+    ("definition", "fragment"),
+    [
+        ("geometry_msgs/Pose pose\nfloat64[36] variance", "has no attribute 'covariance'"),
+        ("geometry_msgs/Pose pose\nfloat64[9] covariance", "out of bounds"),
+        ("geometry_msgs/Pose pose\nstring covariance", "could not convert string"),
+    ],
+)
+def test_a_start_that_the_bag_defines_otherwise(definition, fragment, tmp_path, bag_maker, refuse):
+    kind = "geometry_msgs/msg/PoseWithCovariance"
+    with bag_maker(tmp_path / "drive") as made:
+        fill(made)
+        made.store = get_typestore(Stores.ROS2_HUMBLE)
+        del made.store.fielddefs[kind]
+        made.store.register(get_types_from_msg(definition, kind))
+        name = definition.split()[-1]
+        value = "much" if "string" in definition else np.ones(36 if "36" in definition else 9)
+        told = made.make(kind, pose=made.pose(1.0, 2.0, 0.0), **{name: value})
+        made.write("/initialpose", T0, f"{kind}Stamped", header=made.header(T0), pose=told)
+    start = {"topic": "/initialpose"}
+    refuse(made.path, f"/initialpose:1: {kind}Stamped is not defined", fragment, start=start, rfid=None)
 
 
 IDL = """\

@@ -189,3 +189,16 @@ def test_images_pass_through_memory_one_at_a_time(maker, read_drive):
     tracemalloc.stop()
     assert len(images.file) == 60
     assert peak < 8e6
+
+
+def test_a_camera_that_the_bag_defines_otherwise(tmp_path, bag_maker, refused):
+    with bag_maker(tmp_path / "drive") as made:
+        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
+        add_info(made)
+        add_image(made, T0, np.zeros((480, 640)), "mono8")
+    file = tmp_path / "drive" / "drive.mcap"
+    assert b"float64[9] k" in file.read_bytes()
+    file.write_bytes(file.read_bytes().replace(b"float64[9] k", b"float64[9] q"))
+    options = {"odometry": {"topic": "/odom"}, "camera": CAMERA}
+    says = "/camera/camera_info:1: sensor_msgs/msg/CameraInfo is not defined"
+    refused(file, says, "'K'", reader="rosbag", options=options)

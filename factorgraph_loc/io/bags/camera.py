@@ -129,26 +129,23 @@ class Info:
         if topic.type != INFO:
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {INFO}")
         self._source = f"{bag.path} {name}"
-        self._message: Any = None
+        self._content: dict[str, Any] = {}
+        self._notes: list[str] = []
+        self.frame = ""
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        if self._message is None:
-            self._message = item.message
-
-    @property
-    def frame(self) -> str:
-        return str(self._message.header.frame_id)
-
-    def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
-        """The camera, sitting where ``mounting`` says."""
-        info = self._message
-        k: Array = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=float)
-        d: Array = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, dtype=float)
+        if self._content:
+            return
+        info = item.message
+        k: Array = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=float)
+        d: Array = np.asarray(info.d if hasattr(info, "d") else info.D, dtype=float)
         lens = np.zeros(4)
         lens[: min(4, len(d))] = d[:4]
         if np.any(d[4:]):
-            notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are taken, not {d[4:].tolist()}")
-        content = {
+            left = f"not {d[4:].tolist()}"
+            self._notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are taken, {left}")
+        self.frame = str(info.header.frame_id)
+        self._content = {
             "width": int(info.width),
             "height": int(info.height),
             "fx": float(k[0]),
@@ -157,7 +154,11 @@ class Info:
             "cy": float(k[5]),
             "distortion": tuple(lens.tolist()),
         }
-        return parse_model(CameraSettings, content | mounting, self._source)
+
+    def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
+        """The camera, sitting where ``mounting`` says; ``notes`` gets what of its lens is not taken."""
+        notes += self._notes
+        return parse_model(CameraSettings, self._content | mounting, self._source)
 
 
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:

@@ -93,22 +93,22 @@ class Start:
         if topic.type != WITH_COVARIANCE:
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
         self._source = f"{bag.path} {name}"
-        self._found: tuple[int, Any] | None = None
+        self._found: tuple[int, Array, Array] | None = None  # stamp [ns], pose (1, 7), variances (3,)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._found is None:
-            self._found = (t_ns, item.message.pose)
+            told = item.message.pose
+            variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
+            self._found = (t_ns, np.array([seven(told.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
         """InputError if a variance of x, y or heading is not above zero."""
         assert self._found is not None
-        t_ns, told = self._found
+        t_ns, values, variances = self._found
         first = np.ones(1, dtype=np.int64)
-        values = np.array([seven(told.pose)])
         check_rotations(self._source, first, values)
         turns = rotations_of(self._source, first, values[:, 3:])
         pose = on_floor(self._source, values[:, :3], turns, warnings, self._turned)[0]
-        variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
         for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
             if not 0.0 < variance < np.inf:
                 raise bad_field(self._source, f"covariance {name}", variance, "more than 0", row=1)

@@ -52,7 +52,7 @@ add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS},
 
 
 class Gatherer(Protocol):
-    """Takes the messages of one topic."""
+    """Takes out of the messages of one topic what a log needs; messages are not kept, so that what they lack is found here."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
@@ -98,7 +98,7 @@ class Listeners:
             for stamper, gatherer in self._of[item.topic]:
                 try:
                     gatherer.add(item, stamper.stamp(item))
-                except (AttributeError, TypeError) as error:
+                except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
                     raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {told(error)}") from error

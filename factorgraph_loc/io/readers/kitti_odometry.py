@@ -77,6 +77,9 @@ def _camera(path: Path, number: int, size: tuple[int, int]) -> CameraSettings:
         focal = np.array((matrix[0, 0], matrix[1, 1]))
         if np.any(focal <= 0.0):
             raise bad_field(path, f"P{number}", text.strip(), "focal lengths above 0", row=row)
+        rectified = np.array(((focal[0], 0.0, matrix[0, 2]), (0.0, focal[1], matrix[1, 2]), (0.0, 0.0, 1.0)))
+        if np.any(matrix[:, :3] != rectified):
+            raise bad_field(path, f"P{number}", text.strip(), "fx 0 cx, 0 fy cy, 0 0 1, each before a fourth", row=row)
         # the fourth column is minus the camera's place times the matrix before it
         right, down, ahead = (-np.linalg.solve(matrix[:, :3], matrix[:, 3])).tolist()
         content = {"width": size[0], "height": size[1], "fx": focal[0], "fy": focal[1]}

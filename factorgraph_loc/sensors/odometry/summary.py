@@ -129,7 +129,8 @@ def _rates(values: Array, window: float) -> Array:
     """How fast values (N,) grow, over a window about each time; NaN at the ends."""
     half = max(1, round(window / STEP / 2.0))
     out = np.full(len(values), np.nan)
-    out[half : len(values) - half] = (values[2 * half :] - values[: len(values) - 2 * half]) / (2 * half * STEP)
+    if len(values) > 2 * half:
+        out[half:-half] = (values[2 * half :] - values[: -2 * half]) / (2 * half * STEP)
     return out
 
 
