@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_benchmark.reprojection import reprojection_residuals, spread_of
 from scipy.stats import chi2
 from space_world import RIG, carried, with_features
 
@@ -115,8 +116,8 @@ def test_recorded_starry_night(data_root):
     assert figures["causal.space_position_rmse"] < 0.05
     assert figures["final.space_position_rmse"] < 0.05
     assert np.median(np.abs(space.pose_errors(result.final_space, batch.final_space)[:, 3:])) < 0.002
-    found = space.spread_of(space.reprojection_residuals(batch.final_space, log))
-    assert found["u_mad"] < 0.5 * space.spread_of(space.reprojection_residuals(log.reference3, log))["u_mad"]
+    found = spread_of(reprojection_residuals(batch.final_space, log))
+    assert found["u_mad"] < 0.5 * spread_of(reprojection_residuals(log.reference3, log))["u_mad"]
 
 
 @pytest.mark.parametrize("name", ["monoslam", "space_batch"])
