@@ -1,6 +1,5 @@
 """The rows of one sensor of a log."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import compress, pairwise
@@ -17,19 +16,24 @@ SEEN = 2  # the rank of streams of what is seen; lower ones tell how the robot m
 
 
 @dataclass(frozen=True)
-class Stream(ABC):
+class Stream:
     """The rows of one sensor, as columns; ``t`` (N,) in seconds from the log's start, by the sensor's own clock.
 
     Rows stand in the order in which they arrived; a stamp may be a little older than the one before (a late measurement).
-    ``rank``: of rows of one time, those of the stream with the lowest come first: 0 of wheel odometry, 1 of other motion.
+    ``rank``: of rows of one time, those of the stream with the lowest come first: 0 of wheel odometry, 1 of other motion. ``kind``:
+    the class of its measurements, made of a stamp and a value of each column.
     """
 
     rank: ClassVar[int] = SEEN
+    kind: ClassVar[type[Any]]
     t: Array
 
-    @abstractmethod
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """What the rows tell, in their order; ``offset`` [s] is added to their stamps."""
+        """What the rows tell, in their order, each a measurement of its own; ``offset`` [s] is added to their stamps."""
+        return map(self.kind, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
+
+    def _columns(self) -> Iterator[Any]:
+        return (getattr(self, field.name) for field in fields(self)[1:])
 
     def begun_anew(self) -> Self:
         """The same of a robot that was put down at its first row, wherever it was before."""
@@ -38,6 +42,18 @@ class Stream(ABC):
     def scans(self) -> Iterator[tuple[int, int]]:
         """The first row of each run of equal stamps, and the one after its last."""
         return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
+
+
+@dataclass(frozen=True)
+class ScanStream(Stream):
+    """Rows of which those of one stamp are one measurement, made of names (K,) and arrays (K,)."""
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        """What the rows tell, in their order; ``offset`` [s] is added to their stamps."""
+        for i, j in self.scans():
+            parts = (column[i:j] for column in self._columns())
+            values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
+            yield self.kind(float(self.t[i]) + offset, *values)
 
 
 def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:

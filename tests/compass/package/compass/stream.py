@@ -1,11 +1,9 @@
 """What a compass reports, its rows in a log, and the table that holds them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from factorgraph_loc.files.columns import ANGLE, FULL_TURN, STAMP, Table, within
-from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.stream import Stream
 from factors.se2 import Array
 
@@ -33,7 +31,5 @@ class Heading:
 class HeadingStream(Stream):
     """``heading`` (N,) [rad]."""
 
+    kind: ClassVar[type[Any]] = Heading
     heading: Array
-
-    def measurements(self, offset: float) -> Iterator[Measurement]:
-        return map(Heading, (self.t + offset).tolist(), self.heading.tolist())
