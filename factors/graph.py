@@ -97,19 +97,19 @@ class PriorFactor:
 
 
 class VectorPriorFactor:
-    """A Gaussian on one vector: ``mean`` (P,) and standard deviations ``sigmas`` (P,)."""
+    """A Gaussian on one vector: ``mean`` (P,), and standard deviations (P,) or a covariance (P, P)."""
 
-    def __init__(self, mean: Array, sigmas: Array) -> None:
+    def __init__(self, mean: Array, spread: Array) -> None:
         self._mean = mean
-        self._sigmas = sigmas
+        self._whitener = np.diag(1.0 / spread) if spread.ndim == 1 else positive.whitener(spread)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (P,) and its Jacobian."""
-        return (values[0] - self._mean) / self._sigmas, [np.diag(1.0 / self._sigmas)]
+        return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""
-        return 0.5 * float(np.sum(((values[0] - self._mean) / self._sigmas) ** 2))
+        return 0.5 * float(np.sum((self._whitener @ (values[0] - self._mean)) ** 2))
 
 
 def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph import Graph
@@ -26,6 +27,7 @@ from factorgraph_loc.fusion.variables import Node
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import NewVariable, Observation, Sensor
 from factors import se2
+from factors.graph import VectorPriorFactor
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
@@ -261,9 +263,14 @@ class Builder:
         return GraphView(graph.keyframes, *estimates, between, shared, constants)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _View, addition: Addition) -> None:
-        """A landmark comes into the graph, with the sightings that told it."""
+        """A landmark comes into the graph, with the sightings that told it, or with its prior."""
         key = self._graph.new_block(new, view.covariance)
         addition.values[key] = new.mean
+        if not new.sightings:
+            native = gtsam.PriorFactorVector(key, new.mean, gtsam.noiseModel.Gaussian.Covariance(new.noise))
+            prior = Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native)
+            view.keyframe.nodes.append(prior)
+            addition.nodes.append(prior)
         for t, seen in new.sightings:
             keyframe = self._graph.before(t)
             if self._backend.is_open(keyframe.index):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,13 +27,14 @@ CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is lo
 class Cloud:
     """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
 
-    ``localized``: the place is known.
+    ``parts``: the columns of each block in them. ``localized``: the place is known.
     """
 
     poses: Array
     constants: Array
     log_weights: Array
     localized: bool = True
+    parts: Mapping[str, slice] = field(default_factory=dict)
 
     @property
     def weights(self) -> Array:
@@ -42,6 +44,13 @@ class Cloud:
     def moments(self) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame."""
         return pose_moments(self.poses, self.weights)
+
+    def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
+        """With one more block, drawn from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
+        first = self.constants.shape[1]
+        drawn = mean + positive.draws(covariance, len(self.poses), rng)
+        parts = {**self.parts, name: slice(first, first + len(mean))}
+        return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
     def density(self) -> tuple[Cloud, Array]:
         """The cloud as a density with the moments of what it was drawn from: poses shrunk towards their mean, each with a Gaussian

@@ -28,7 +28,7 @@ from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate, PosePrior, Status
-from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.learnt import Learnt, LearntPoint
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
@@ -79,11 +79,11 @@ class _View:
         return se2.world_to_body(*self._filter._state.moments)
 
     def value(self, name: str) -> Array | None:
-        cloud, part = self._filter._state, self._filter._parts.get(name)
+        cloud, part = self._filter._state, self._filter._state.parts.get(name)
         return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
 
     def spread(self, name: str) -> Array:
-        cloud, part = self._filter._state, self._filter._parts[name]
+        cloud, part = self._filter._state, self._filter._state.parts[name]
         return vector_moments(cloud.constants[:, part], cloud.weights)[1]
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:
@@ -135,14 +135,17 @@ class ParticleFilter(Filter):
         """The constants that are estimated."""
         if self._state is None:
             return Learnt()
-        mean, covariance = vector_moments(self._state.constants, self._state.weights)
-        sigmas = np.sqrt(np.diag(covariance))
-        names = [
-            label if block == MOTION else f"{block}.{label}"
-            for block, constants in self._blocks
-            for label in constants.names
-        ]
-        return Learnt({n: (float(v), float(s)) for n, v, s in zip(names, mean, sigmas, strict=True)})
+        cloud, values, points = self._state, {}, {}
+        labels = {name: constants.names for name, constants in self._blocks}
+        for name, part in cloud.parts.items():
+            mean, covariance = vector_moments(cloud.constants[:, part], cloud.weights)
+            if name not in labels:
+                points[name.partition("/")[2]] = LearntPoint(mean, covariance)
+                continue
+            prefix = "" if name == MOTION else f"{name}."
+            for label, value, sigma in zip(labels[name], mean, np.sqrt(np.diag(covariance)), strict=True):
+                values[prefix + label] = float(value), float(sigma)
+        return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
@@ -201,7 +204,8 @@ class ParticleFilter(Filter):
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
-        return Cloud(poses, self._rng.standard_normal((count, len(sigmas))) * sigmas, np.full(count, -np.log(count)))
+        constants = self._rng.standard_normal((count, len(sigmas))) * sigmas
+        return Cloud(poses, constants, np.full(count, -np.log(count)), parts=self._parts)
 
     def _predict(self, increment: Increment) -> None:
         noise = self._rng.standard_normal((len(self._state.poses), 3)) @ positive.root(increment.covariance).T
@@ -216,7 +220,7 @@ class ParticleFilter(Filter):
         """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
-        part = self._parts.get(MOTION)
+        part = cloud.parts.get(MOTION)
         if part is not None:
             values = cloud.constants[:, part]
             mean = cloud.weights @ values
@@ -236,9 +240,12 @@ class ParticleFilter(Filter):
         sensor, view = self._sensors[m.modality], _View(self)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
+                if not seen.sightings:
+                    self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._rng)
                 continue
             if seen.is_judged:
-                here = seen.on_pose(view.values(seen.blocks), {})
+                spreads = {name: view.spread(name) for name in seen.blocks}
+                here = seen.on_pose(view.values(seen.blocks), spreads)
                 correction = here.correct(view.pose, view.covariance, {}, {}, 1)
                 if not sensor.judge(here, correction, view):
                     continue
@@ -264,7 +271,7 @@ class ParticleFilter(Filter):
         mean, left = 0.0, 1.0
         while True:
             cloud = self._state
-            values = {name: cloud.constants[:, self._parts[name]] for name in observation.blocks}
+            values = {name: cloud.constants[:, cloud.parts[name]] for name in observation.blocks}
             likelihood = weighable(observation.log_likelihood(cloud.poses, values), cloud.log_weights, self._t)
             share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
             weighed = cloud.log_weights + share * likelihood

@@ -85,6 +85,9 @@ class BackwardSimulation:
     def _step(self, cloud: Cloud, increment: Increment, after: Cloud) -> tuple[Cloud, Array]:
         """Where the states ``after`` came from, and the noise (M, 3) of the motion in between."""
         here, kernel = cloud.density()
+        after = replace(
+            after, constants=after.constants[:, : cloud.constants.shape[1]]
+        )  # without blocks that came later
         predicted, by_state = self._moved(here, increment)
         transition = np.eye(len(kernel))
         transition[:3] = by_state

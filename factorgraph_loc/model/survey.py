@@ -2,7 +2,10 @@
 
 from typing import Annotated
 
+import numpy as np
 from pydantic import AfterValidator, Field
+
+from factors.se2 import Array
 
 
 def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -15,3 +18,11 @@ def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, fl
 
 Variance = Annotated[float, Field(ge=-1e8, le=1e8, description="m^2")]
 Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_positive_semidefinite)]
+
+
+def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Array:
+    """The covariance (2, 2) [m^2] of a position with ``sigma`` [m] in x and y, or with (xx, xy, yy) in place of it."""
+    if covariance is None:
+        return sigma**2 * np.eye(2)
+    xx, xy, yy = covariance
+    return np.array(((xx, xy), (xy, yy)))

@@ -101,7 +101,7 @@ class NewVariable:
 
     ``mean`` (d,): where it is seen to be; ``by_pose`` (d, 3) and ``by_block`` (d, P) by name: its Jacobians; ``noise`` (d, d): its
     covariance from the measurement alone. ``sightings``: the observations that told it, each with the time of the pose that it
-    hangs on.
+    hangs on; none of a block that begins with a prior, which ``mean`` and ``noise`` are then.
     """
 
     name: str

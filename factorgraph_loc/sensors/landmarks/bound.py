@@ -29,12 +29,20 @@ from factors.se2 import Array
 from factors.update import Correction
 
 GOING_BACK = 5.0  # s that an estimator may go back in time
+SURVEYED_ITERATIONS = 4
 SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
 
 
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
-    """Landmarks that were seen at one time: those of the map as one term, and each other one as a term."""
+    """Landmarks that were seen at one time: those of the map as one term, and each other one as a term. ``surveyed``: some of these
+    have a survey, which a first look from afar is too far from to be linearised but once."""
+
+    surveyed: bool = False
+
+    @property
+    def iterations(self) -> int | None:  # type: ignore[override]
+        return SURVEYED_ITERATIONS if self.surveyed else None
 
     @property
     def measured(self) -> BearingRangeFactor:
@@ -42,12 +50,18 @@ class LandmarkObservation(ResidualObservation):
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
-        factor = self.measured
-        parameters = None
-        if factor.estimated and self.blocks[0] in values:
-            parameters = np.zeros((len(poses), len(PARAMETERS)))
-            parameters[:, list(factor.estimated)] = values[self.blocks[0]]
-        return factor.log_likelihood(poses, parameters)
+        total = np.zeros(len(poses))
+        for term in self.terms:
+            factor, at, parameters = cast(BearingRangeFactor, term.factor), poses, None
+            if factor.estimated and term.blocks[0] in values:
+                parameters = np.zeros((len(poses), len(PARAMETERS)))
+                parameters[:, list(factor.estimated)] = values[term.blocks[0]]
+            if factor.free:  # a landmark that is elsewhere is as a robot that is elsewhere
+                places = values[term.blocks[-1]]
+                factor, at = replace(factor, points=places[:1]), poses.copy()
+                at[:, :2] -= places - places[0]
+            total += factor.log_likelihood(at, parameters)
+        return total
 
     @property
     def things(self) -> frozenset[Hashable]:
@@ -85,7 +99,7 @@ class LandmarkSensor(Sensor):
     def __init__(self, binding: Binding, constants: Estimated) -> None:
         setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
         self.constants, self._motion = constants, motion
-        self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices)
+        self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices, carries=True)
         self._sought = KnownLandmarks(
             setup, Diagnostics()
         )  # what is seen before the start is counted when it is taken in
@@ -100,6 +114,16 @@ class LandmarkSensor(Sensor):
         twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
         known = self._landmarks.factor(m, view.offset, twist)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
+        for name, factor in self._landmarks.surveyed(m, view.offset, twist):
+            block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
+            if view.value(block) is None:
+                yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
+            if view.value(block) is None:  # the estimator does without
+                here = replace(factor, points=position[None], point_covariances=spread[None], free=False)
+                terms.append(Term(here, self._shared, 2))
+            else:
+                terms.append(Term(factor, (*self._shared, block), 2))
+        surveyed = any(term.blocks != self._shared for term in terms)
         met: list[tuple[str, Term]] = []
         for name, factor in self._landmarks.others(m, view.offset, twist):
             block = f"{self.modality}/{name}"
@@ -109,7 +133,7 @@ class LandmarkSensor(Sensor):
             else:
                 terms.append(term)
         if terms:
-            yield LandmarkObservation(m.t, tuple(terms))
+            yield LandmarkObservation(m.t, tuple(terms), surveyed)
         for block, term in met if view.newest else ():
             new = self._proposed(m.t, block, term, view)
             if new is not None:

@@ -2,11 +2,10 @@
 
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files.models import Coordinate, FileModel
-from factorgraph_loc.model.survey import Covariance
+from factorgraph_loc.model.survey import Covariance, spread_of
 from factors.se2 import Array
 
 
@@ -24,7 +23,4 @@ class Landmark(FileModel):
 
     def spread(self) -> Array:
         """The covariance (2, 2) of the position [m^2]."""
-        if self.covariance is None:
-            return self.sigma**2 * np.eye(2)
-        xx, xy, yy = self.covariance
-        return np.array(((xx, xy), (xy, yy)))
+        return spread_of(self.sigma, self.covariance)

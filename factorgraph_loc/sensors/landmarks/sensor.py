@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,26 +17,32 @@ from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import Correction
 
-EXACT = 0.1  # a survey that is so much better than the sensor (as a share of its sigma) is taken as exact
-
 
 class KnownLandmarks:
     """Turns measurements into factors; what the map or the rig lacks is counted as ignored.
 
     ``use`` of the map: ``known`` takes its landmarks as they are and ignores others, ``extended`` estimates the others, ``unknown``
-    estimates all, as if there were no map. ``estimated``: places of the sensor's constants that are estimated.
+    estimates all, as if there were no map. ``estimated``: places of the sensor's constants that are estimated. ``carries``: the
+    estimator knows where landmarks of the map are whose survey is not exact; else that widens the noise.
     """
 
     def __init__(
-        self, setup: Setup, diagnostics: Diagnostics, use: MapUse = "known", estimated: tuple[int, ...] = ()
+        self,
+        setup: Setup,
+        diagnostics: Diagnostics,
+        use: MapUse = "known",
+        estimated: tuple[int, ...] = (),
+        *,
+        carries: bool = False,
     ) -> None:
         settings = setup.rig.bearing_range if "bearing_range" in setup.sensors else None
         self._model = None if settings is None else settings.model()
         landmarks = {} if use == "unknown" else setup.world.landmarks
         self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
-        self._surveys = {name: m.spread() for name, m in landmarks.items()}
-        worst = max((float(np.trace(spread)) for spread in self._surveys.values()), default=0.0)
-        self._survey_matters = settings is not None and worst > (EXACT * settings.range_sigma) ** 2
+        limit = math.inf if settings is None else 2.0 * (settings.exact_survey * settings.range_sigma) ** 2
+        spreads = {name: m.spread() for name, m in landmarks.items()}
+        self._surveys = {name: spread for name, spread in spreads.items() if np.trace(spread) > limit}
+        self._carries = carries
         self._maps_others = use != "known"
         self._estimated = estimated
         self._diagnostics = diagnostics
@@ -61,14 +68,31 @@ class KnownLandmarks:
             self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
         if len(rows) < len(known):
             self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
+        if self._carries:
+            rows = [i for i in rows if m.landmarks[i] not in self._surveys]
         if not rows:
             return None
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
         factor = self._factor(self._model, m, rows, points, offset, twist)
-        if self._survey_matters:
-            spreads = np.array([self._surveys[m.landmarks[i]] for i in rows])
+        if any(m.landmarks[i] in self._surveys for i in rows):
+            spreads = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
             factor = replace(factor, point_covariances=spreads)
         return factor
+
+    def surveyed(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> list[tuple[str, BearingRangeFactor]]:
+        """The landmarks of the map whose survey is not exact by name, each with a factor on the pose and its position."""
+        if self._model is None or not self._carries or not self._surveys:
+            return []
+        told = ~(np.isnan(m.range) & np.isnan(m.bearing))
+        rows = [i for i, name in enumerate(m.landmarks) if name in self._surveys and told[i]]
+        free = [self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist) for i in rows]
+        return [(m.landmarks[i], replace(factor, free=True)) for i, factor in zip(rows, free, strict=True)]
+
+    def survey(self, name: str) -> tuple[Array, Array]:
+        """Position (2,) and covariance (2, 2) of a landmark, as the map has them."""
+        return self._positions[name], self._surveys[name]
 
     def others(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None

@@ -22,7 +22,11 @@ class BearingRangeUncertainty(FileModel):
 
 
 class BearingRangeSettings(SensorSettings):
-    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model."""
+    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model.
+
+    A landmark whose position was surveyed with a larger sigma than ``exact_survey`` times ``range_sigma`` is estimated on the way,
+    with its survey as the prior; others are taken as exact.
+    """
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     x: Offset = 0.0
@@ -36,6 +40,7 @@ class BearingRangeSettings(SensorSettings):
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
     bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad, not degrees")] = 0.05
     robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
+    exact_survey: Annotated[float, Field(ge=0.0, le=10.0, description="as a share of range_sigma")] = 0.2
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
 
     def model(self) -> BearingRangeModel:

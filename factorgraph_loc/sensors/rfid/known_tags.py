@@ -1,6 +1,7 @@
 """Inventory rounds of RFID antennas, as all estimators take them in."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,18 @@ from factors.rfid.detection import Looks, RfidLikelihood
 from factors.rfid.tag_states import TagStates
 from factors.rfid.update import _Integers
 from factors.se2 import Array
+
+EXACT = 0.2  # a survey that is so much better than what a pass tells (as a share of that) is taken as exact
+
+
+def trust(sigmas: Array, pass_sigma: float) -> float:
+    """The exponent that a likelihood of tags is due whose places have errors of these ``sigmas`` (T,) [m].
+
+    Such an error is the same each time that a tag is passed, so that no number of reads tells the pose better. A pass by itself
+    tells it with a variance of ``pass_sigma`` squared, and with the sum of both where the tag's place is not exact.
+    """
+    counted = np.where(sigmas > EXACT * pass_sigma, sigmas, 0.0)
+    return float(np.mean(1.0 / (1.0 + (counted / pass_sigma) ** 2))) if len(sigmas) else 1.0
 
 
 class KnownTags:
@@ -28,7 +41,10 @@ class KnownTags:
         self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
         self._rounds: dict[tuple[str, ...], tuple[list[int], _Integers, _Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
-        self.likelihood = None if settings is None else RfidLikelihood(settings.model(), self.map.tags)
+        self.likelihood, self.trust = None, 1.0
+        if settings is not None:
+            model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
+            self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         self.states = TagStates(len(self.map.names), 0.0 if settings is None else settings.dead_tags)
 
     def looks(self, m: RfidScan, *, count: bool = True) -> Looks | None:

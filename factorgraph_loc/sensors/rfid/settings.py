@@ -148,9 +148,11 @@ class RfidSettings(SensorSettings):
 
     ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
     below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where
-    the log does not tell the rounds. ``dead_tags``: the share of a map's tags that are broken, hidden or gone, before anything is
-    heard of them. The default is a guess for an installation that is kept in order; ``fgloc calibrate`` learns it. ``rssi``,
-    ``phase``: what is made of them, where an estimator is given these sensors.
+    the log does not tell the rounds. ``pass_sigma`` [m]: how well a pass of a tag tells the pose by itself,
+    from which follows how much tags tell whose survey is not exact (:func:`~factorgraph_loc.sensors.rfid.known_tags.trust`).
+    ``dead_tags``: the share of a map's tags that are broken, hidden or gone, before anything is heard of them. The default is a
+    guess for an installation that is kept in order; ``fgloc calibrate`` learns it. ``rssi``, ``phase``: what is made of them, where
+    an estimator is given these sensors.
     """
 
     preset: Literal["rackham"] | None = None
@@ -161,6 +163,7 @@ class RfidSettings(SensorSettings):
     miss: Share = 0.0
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 1.0
     round_gap: Annotated[float, Field(ge=1e-4, le=10.0, description="s")] = 0.05
+    pass_sigma: Annotated[float, Field(ge=0.01, le=10.0, description="m")] = 0.1
     dead_tags: Share = 0.03
     rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None

@@ -1,6 +1,8 @@
 """Strength and phase of RFID reads, as all estimators take them in."""
 
 from collections import deque
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -9,10 +11,11 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors.rfid.factor import RfidFactor
-from factors.rfid.phase import PhaseLikelihood, PhaseReads
-from factors.rfid.strength import RssiLikelihood, RssiReads
+from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
+from factors.rfid.strength import RssiLikelihood, RssiModel, RssiReads
 from factors.se2 import Array
 
+M = TypeVar("M", RssiModel, PhaseModel)
 Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, phase, frequency
 GOING_BACK = 5.0  # s that an estimator may go back in time
 
@@ -39,9 +42,9 @@ class TagSignals:
             return
         antennas = tags.likelihood.model.antennas
         if settings.rssi is not None and "rssi" in setup.sensors:
-            self.strength = RssiLikelihood(settings.rssi.model(antennas), tags.map.tags)
+            self.strength = RssiLikelihood(_tempered(settings.rssi.model(antennas), tags.trust), tags.map.tags)
         if settings.phase is not None and "phase" in setup.sensors:
-            self.phase = PhaseLikelihood(settings.phase.model(antennas), tags.map.tags)
+            self.phase = PhaseLikelihood(_tempered(settings.phase.model(antennas), tags.trust), tags.map.tags)
             self._window, self._step = settings.phase.window, settings.phase.step
 
     def strengths(self, m: RfidScan) -> RssiReads | None:
@@ -99,3 +102,7 @@ class TagSignals:
 
     def _of_window(self) -> list[Row]:
         return [row for _, row in self._rows if row[0] >= self._newest - self._window]
+
+
+def _tempered(model: M, trust: float) -> M:
+    return replace(model, tempering=model.tempering * trust)

@@ -1,5 +1,6 @@
 """The tags of a map as arrays, in the world's frame."""
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -14,11 +15,13 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class TagMap:
-    """``names``: T EPCs; ``tags``: where they are in the world, the survey's errors corrected; ``index``: places by EPC."""
+    """``names``: T EPCs; ``tags``: where they are in the world, the survey's errors corrected; ``index``: places by EPC;
+    ``sigmas`` (T,) [m]: standard deviations of their survey along an axis."""
 
     names: tuple[str, ...]
     tags: TagArray
     index: dict[str, int]
+    sigmas: Array
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
@@ -29,7 +32,8 @@ def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None 
     transform = survey.transform()
     points[:, :2] = se2.transform_from(transform, points[:, :2])
     tags = TagArray(points, facing + transform[2])
-    return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)})
+    sigmas = np.array([math.sqrt(np.trace(tag.spread()) / 2.0) for tag in chosen.values()])
+    return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)}, sigmas)
 
 
 MARGIN = 1.0  # m, how far beyond walls and tags the robot may be
