@@ -122,7 +122,7 @@ def test_what_lies_outside_its_bounds_is_not_run():
         fgloc.run(log, "dead_reckoning")
 
 
-@pytest.mark.parametrize("estimator", ["dead_reckoning", "ekf", "particle_filter"])
+@pytest.mark.parametrize("estimator", ["dead_reckoning", "ekf", "particle_filter", "switching", "smoother", "batch"])
 def test_an_estimator_that_does_not_use_it_counts_it(estimator):
     run = fgloc.run(made_log(), estimator, sensors=["odometry", "compass"])
     assert run.result.diagnostics.ignored == {"compass": 10}
