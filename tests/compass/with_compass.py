@@ -17,6 +17,7 @@ from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import all_tables
+from factors import se2
 
 T = np.arange(50) / 10.0
 UNIX = 1_700_000_000_000_000_000
@@ -122,10 +123,38 @@ def test_what_lies_outside_its_bounds_is_not_run():
         fgloc.run(log, "dead_reckoning")
 
 
-@pytest.mark.parametrize("estimator", ["dead_reckoning", "ekf", "particle_filter", "switching", "smoother", "batch"])
-def test_an_estimator_that_does_not_use_it_counts_it(estimator):
-    run = fgloc.run(made_log(), estimator, sensors=["odometry", "compass"])
+def test_an_estimator_that_does_not_use_it_counts_it():
+    run = fgloc.run(made_log(), "dead_reckoning", sensors=["odometry", "compass"])
     assert run.result.diagnostics.ignored == {"compass": 10}
+
+
+def drifting_log() -> fgloc.Log:
+    """Half a minute around a circle, with odometry that turns a tenth too fast and a compass of an unknown bias, 0.1 rad."""
+    t = np.arange(300) / 10.0
+    heading = 0.2 * t
+    truth = np.column_stack((np.sin(heading) / 0.2, (1.0 - np.cos(heading)) / 0.2, se2.wrap(heading)))
+    at = t[::5] + 0.03
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(at))
+    streams = {
+        "odometry": fgloc.VelocityStream(t, np.ones(300), np.full(300, 0.22)),
+        "compass": HeadingStream(at, se2.wrap(0.2 * at + 0.1 + noise)),
+    }
+    rig = RIG.model_copy(update={"compass": CompassSettings(uncertainty={"bias": 0.3})})
+    start = fgloc.StartPose(0.0, np.zeros(3), np.full(3, 0.01))
+    return fgloc.Log("circle", rig, fgloc.World(), streams, fgloc.Trajectory(t, truth), start)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "particle_filter", "smoother", "batch"])
+def test_estimators_use_it_and_learn_its_bias(estimator):
+    log = drifting_log()
+    without = fgloc.run(log, "dead_reckoning", sensors=["odometry"]).scores
+    run = fgloc.run(log, estimator)
+    bias, sigma = run.result.learnt.values["compass.bias"]
+    assert sigma < 0.05
+    assert abs(bias - 0.1) < 2.0 * sigma
+    assert run.scores["final.heading_rmse"] < 0.1 * without["final.heading_rmse"]
+    assert run.scores["final.position_rmse"] < 0.1 * without["final.position_rmse"]
+    assert run.scores["nis.compass.count"] == 60
 
 
 def test_it_is_pushed():

@@ -18,5 +18,6 @@ SENSOR = SensorType(
     simulation={"compass": Section("compass.settings:CompassSimulation", always=True)},
     simulate="compass.simulation:simulate",
     summarize="compass.summary:summarize",
+    bind="compass.sensor:bind",
     calibrator="compass.calibration:CALIBRATOR",
 )
