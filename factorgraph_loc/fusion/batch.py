@@ -98,6 +98,7 @@ class Guessing:
     def begin(self, newest: Keyframe) -> None:
         """The graph begins, or keyframes were taken back and ``newest`` was added."""
         graph = self._graph
+        graph.forget_landmarks(())
         kept = {k.key for k in graph.keyframes}
         self._guesses = {key: value for key, value in self._guesses.items() if key in kept or key in graph.values}
         self.refine(newest, (graph.pose, graph.covariance))

@@ -17,6 +17,7 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.simulation import preset, simulate
@@ -126,6 +127,22 @@ def test_unknown_start() -> None:
     assert result.t[first] - result.t[0] < 20.0
     assert errors(log, result)[first:].max() < 0.6
     assert set(result.status[:first]) <= {"ambiguous", "unlocalized"}
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "batch"])
+def test_landmarks_of_a_track_that_was_lost_are_forgotten(estimator: str) -> None:
+    """The odometry jumps by 8 m; tags tell it once, and landmarks that were put to where they seemed to be do not lead back."""
+    seen = {"max_range": 6.0, "rate": 5.0}
+    log = office({}, 3, drive={"duration": 26.0}, world={"tags": 60, "landmarks": 30}, sightings=seen)
+    odometry = log.streams["odometry"]
+    assert isinstance(odometry, IncrementStream)
+    way = odometry.dx + 8.0 * (np.arange(len(odometry.t)) == np.searchsorted(odometry.t, 20.0))
+    carried = replace(log, streams={**log.streams, "odometry": replace(odometry, dx=way)})
+    sensors = ("odometry", "rfid", "bearing_range")
+    result = run(carried, RunConfig(estimator, {"landmarks": "unknown"}, sensors=sensors))
+    (told,) = result.diagnostics.events
+    assert told[1].startswith("lost: tags were not read as they were expected since 20.0 s")
+    assert score(result, log)["final.position_rmse"] < 0.15
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "batch"])
