@@ -14,7 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.calibrating import Calibrator, State, Told, Unit
+from factorgraph_loc.sensors.calibrating import Calibrator, State, Told
 from factorgraph_loc.sensors.registry import channels, moving
 
 Scores = Mapping[str, Any]
@@ -47,10 +47,6 @@ class Calibration:
     def judgement(self, name: str) -> Judgement | None:
         """That of a parameter, by its name with the section's."""
         return next((one for one in self.judgements if name in one.names), None)
-
-    def accepts(self, unit: Unit) -> bool:
-        """Whether the rig has what was learnt of these parameters."""
-        return unit in self.accepted
 
     def told(self) -> Iterator[tuple[Calibrator, Told]]:
         """What is told of each sensor."""

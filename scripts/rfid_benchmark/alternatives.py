@@ -13,7 +13,7 @@ from benchmarking.report import Options, Report, pooled
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import ODOMETRY_KEY, Values, pose_key
+from factorgraph_loc.fusion.variables import Values, constants_key, pose_key
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
@@ -34,6 +34,7 @@ SEEDS = 10
 FIRST = 3000
 DURATION = 120.0  # s
 SENSORS = ("odometry", "rfid")
+ODOMETRY_KEY = constants_key(0)
 STEP = 1e-5  # of numerical derivatives
 CELL = 0.1  # m, of the sums over the antenna's field
 

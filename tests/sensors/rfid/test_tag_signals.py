@@ -1,6 +1,7 @@
 """Strength and phase of reads: windows of phases, going back in time, rigs that lack what a sensor needs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.rfid.bound import TagSensor
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.sensor import WaitingScans
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
 from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.simulation import preset, simulate
+from factors import se2
 
 SENSORS = ("odometry", "rfid", "rssi", "phase")
 STRENGTH = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0)
@@ -95,17 +97,21 @@ def test_strengths_place_the_robot_but_are_no_evidence():
     """Other places are judged by what was read and not read: what the track is judged by must be the same."""
     rfid = RfidSettings(antennas={"ahead": AntennaSettings()}, rssi=STRENGTH)
     pose, covariance = np.zeros(3), np.diag((0.3, 0.3, 0.2)) ** 2
+    view = SimpleNamespace(t=0.5, offset=None, newest=True, localized=False, pose=pose, covariance=covariance)
     found = {}
     for sensors in (SENSORS[:2], SENSORS[:3]):
         setup = Setup(Rig(rfid=rfid), WORLD, sensors, np.random.default_rng(1))
-        scans, m = WaitingScans(setup, Diagnostics()), scan(0.5, "a", rssi=-45.0)
-        looks = scans.tags.looks(m)
-        found[sensors] = scans.update(m, looks, pose, covariance)
-    without, with_strength = found.values()
-    assert with_strength.evidence == pytest.approx(without.evidence)
-    assert with_strength.excess_nll == pytest.approx(without.excess_nll)
+        found[len(sensors)] = list(TagSensor(setup, Diagnostics()).observe(scan(0.5, "a", rssi=-45.0), view))
+    (alone,), (detection, strength) = found.values()
+    without, first = (one.correct(pose, covariance, {}, {}) for one in (alone, detection))
+    assert first.evidence == pytest.approx(without.evidence)
+    assert first.excess_nll == pytest.approx(without.excess_nll)
+    assert detection.is_judged
+    assert not strength.is_judged
+    assert strength.at_its_time() is None
     # twice as strong as from where the robot was thought to be: nearer to the tag
-    assert with_strength.pose[0] > without.pose[0] + 1e-3
+    placed = se2.compose(pose, first.delta)
+    assert strength.correct(placed, first.covariance, {}, {}).delta[0] > 1e-3
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
