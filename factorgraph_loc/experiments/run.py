@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -210,7 +211,7 @@ class _Loop:
         """Feed everything, ticks included."""
         started = perf_counter()
         initialized = self._prior is None
-        for (t, is_motion), group in groupby(self._measurements(), lambda m: (m.t, m.is_motion)):
+        for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
             if not initialized and t > self._start:
                 self._initialize()
                 initialized = True

@@ -27,7 +27,7 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
-from factors import positive, se2
+from factors import positive, rts_kernels, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -58,10 +58,12 @@ class _State:
 
     def plus(self, delta: Array, covariance: Array) -> _State:
         pose = se2.compose(self.pose, se2.exp(delta[:POSE]))
-        return replace(self, pose=pose, rest=self.rest + delta[POSE:], covariance=covariance)
+        return _State(pose, self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
         """The first ``size`` components of the error state: without blocks that came later."""
+        if size == len(self.covariance):
+            return self
         return replace(self, rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def with_block(self, new: NewVariable) -> _State:
@@ -86,12 +88,7 @@ class _Step:
 
     def covariance(self, before: Array) -> Array:
         """The covariance (S, S) after the prediction, from that before."""
-        moved = self.transition @ before
-        after = before.copy()
-        after[:3] = moved
-        after[:, :3] = moved.T
-        after[:3, :3] = moved @ self.transition.T + self.noise
-        return after
+        return np.asarray(rts_kernels.predicted(before, self.transition, self.noise))
 
 
 @dataclass(frozen=True)
@@ -214,21 +211,20 @@ class Ekf(Filter):
     def _smoothed(self, here: _State, step: _Step, after: _State) -> _State:
         """The state ``here`` given what came later: ``step`` led from it to where ``after`` is the smoothed state."""
         after = after.first(len(here.covariance))
-        predicted = step.covariance(here.covariance)
-        carried = here.covariance.copy()  # transition times covariance
-        carried[:3] = step.transition @ here.covariance
-        gain = positive.solve(predicted, carried).T
         change = np.concatenate((se2.log(se2.between(step.pose, after.pose)), after.rest - here.rest))
-        covariance = here.covariance + gain @ (after.covariance - predicted) @ gain.T
-        if not _is_sound(covariance):
-            # a sum that is as positive as its parts, whatever the gain
-            gain = positive.solve(positive.nearest(predicted), carried).T
-            transition = np.eye(len(carried))
-            transition[:3] = step.transition
-            left, later = np.eye(len(carried)) - gain @ transition, after.covariance.copy()
-            later[:3, :3] += step.noise
-            covariance = positive.nearest(left @ here.covariance @ left.T + gain @ later @ gain.T)
-        return here.plus(gain @ change, covariance)
+        try:
+            found = rts_kernels.smoothed(here.covariance, step.transition, step.noise, change, after.covariance)
+        except np.linalg.LinAlgError:
+            found = None
+        if found is not None and _is_sound(found[1]):
+            return here.plus(*found)
+        # a sum that is as positive as its parts, whatever the gain
+        transition = np.eye(len(change))
+        transition[:3] = step.transition
+        gain = positive.solve(positive.nearest(step.covariance(here.covariance)), transition @ here.covariance).T
+        left, later = np.eye(len(change)) - gain @ transition, after.covariance.copy()
+        later[:3, :3] += step.noise
+        return here.plus(gain @ change, positive.nearest(left @ here.covariance @ left.T + gain @ later @ gain.T))
 
     def _start(self, prior: PosePrior) -> _State:
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
@@ -246,7 +242,7 @@ class Ekf(Filter):
             delta, transition[:, part] = self._motion.changed(increment, s.rest[part.start - POSE : part.stop - POSE])
         transition[:, :POSE] = se2.adjoint(se2.inverse(delta))
         self._step = _Step(se2.compose(s.pose, delta), transition, increment.covariance)
-        self._state = replace(s, pose=self._step.pose, covariance=self._step.covariance(s.covariance))
+        self._state = _State(self._step.pose, s.rest, self._step.covariance(s.covariance), s.layout)
 
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()

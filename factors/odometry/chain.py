@@ -114,8 +114,9 @@ class OdometryChain:
         t = row[0]
         if self._forgotten and t < self._knots[0, _T]:
             return False
-        self._reserve(1)
         n = i = self._count
+        if n == len(self._rows):
+            self._reserve(1)
         if n and t < self._knots[n - 1, _T]:
             i = int(np.searchsorted(self._knots[:n, _T], t, side="right"))
             self._rows[i + 1 : n + 1] = self._rows[i:n]

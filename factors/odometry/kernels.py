@@ -6,7 +6,7 @@ import math
 import numba
 import numpy as np
 
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
 
 # Of a covariance of positions: what is less than this share of it is a matter of rounding. A robot that is not known to a hundred
@@ -118,6 +118,17 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
         by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * moving
         by_changes[i, 3] = jacobian[i, 2] * way
     return np.array((p * cx - q * cy, q * cx + p * cy, wrapped(turn))), by_changes
+
+
+@numba.njit(cache=True)
+def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
+    """:func:`recalibrate` where only ``constants`` (P,) change, whose places among all are ``indices`` (P,): the Jacobian (3, P) is
+    by these."""
+    changes = np.zeros(4)
+    for i in range(len(indices)):
+        changes[indices[i]] = constants[i]
+    delta, by_changes = recalibrate(twist, moving, changes)
+    return delta, np.ascontiguousarray(by_changes[:, indices])
 
 
 @numba.njit(cache=True)

@@ -15,7 +15,7 @@ from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
-from factors.odometry.model import PARAMETERS, OdometryFactor, between_factor, recalibrated
+from factors.odometry.model import PARAMETERS, OdometryFactor, between_factor
 from factors.se2 import Array
 
 HORIZON = 5.0  # s of odometry that are kept
@@ -36,6 +36,7 @@ class Motion:
         self._rig = rig
         self._constants_as_noise = not self_calibration
         self.constants = rig.estimated("odometry") if self_calibration else NOTHING
+        self._indices = np.array(self.constants.indices, dtype=np.int64)
         self._use_gyro = "imu" in sensors
         self._use_wheels = "odometry" in sensors
         self.horizon = HORIZON
@@ -73,8 +74,8 @@ class Motion:
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """``delta`` (3,) of an increment under changed ``constants`` (P,), and the Jacobian (3, P) of its perturbation."""
-        delta, jacobian = recalibrated(increment, self._full(constants))
-        return delta, jacobian[:, list(self.constants.indices)]
+        delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
+        return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment under changed ``constants`` (P,)."""
