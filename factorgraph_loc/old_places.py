@@ -2,11 +2,14 @@
 
 import importlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial, update_wrapper
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
+
+from factorgraph_loc.plugins import MOVED, load
 
 _SENSORS = tuple(f"factorgraph_loc.sensors.{name}" for name in ("odometry", "twist", "landmarks", "rfid", "camera"))
 _MODULES: dict[str, tuple[str, ...]] = {
@@ -101,3 +104,21 @@ class OldPlaces(MetaPathFinder, Loader):
             raise AttributeError(f"module {module.__name__!r} has no attribute {name!r}")
 
         module.__dict__["__getattr__"] = found
+
+
+def odometry_model(rig: Any, **options: bool) -> Any:
+    """factorgraph_loc.sensors.odometry.model.odometry_model"""
+    return load("factorgraph_loc.sensors.odometry.model:odometry_model")(rig, **options)
+
+
+def estimated(rig: Any, *, section: str) -> Any:
+    """factorgraph_loc.Rig.estimated"""
+    return rig.estimated(section)
+
+
+def _of(section: str) -> Callable[..., Any]:
+    return update_wrapper(partial(estimated, section=section), estimated)
+
+
+MOVED |= {"odometry_model": odometry_model}
+MOVED |= {f"estimated_{section}": _of(section) for section in ("odometry", "bearing_range", "camera")}

@@ -7,7 +7,7 @@ Each is named by its place, and imported when it is first used. Another package 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from factorgraph_loc.errors import InputError
@@ -21,6 +21,9 @@ def load(place: Place) -> Any:
     module, _, name = place.partition(":")
     found = importlib.import_module(module)
     return getattr(found, name) if name else found
+
+
+MOVED: dict[str, Callable[..., Any]] = {}  # what methods of a rig were in version 0.1.0, as functions of the rig
 
 
 class Group(Mapping[str, Any]):

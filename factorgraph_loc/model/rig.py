@@ -6,6 +6,8 @@ there to catch wrong units (degrees for radians, mm for m).
 
 from __future__ import annotations
 
+import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -14,7 +16,7 @@ from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.model.sections import sections, sections_of_channels
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.variable import NOTHING, Estimated
-from factorgraph_loc.plugins import load
+from factorgraph_loc.plugins import MOVED, load
 
 S = TypeVar("S", bound=FileModel)
 
@@ -30,6 +32,14 @@ class Rig(FileModel):
 
         def __init__(self, **values: Any) -> None: ...
         def __getattr__(self, section: str) -> Any: ...
+
+    else:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in MOVED:
+                return super().__getattr__(name)
+            warnings.warn(f"Rig.{name} is deprecated: see {MOVED[name].__doc__}", DeprecationWarning, stacklevel=2)
+            return partial(MOVED[name], self)
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """The settings of a class, of the ``section`` if a rig may have several of that class; None if it has none."""
