@@ -156,7 +156,7 @@ def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tu
     constants = log.rig.estimated("odometry")
     factors: list[tuple[Factor, tuple[int, ...]]] = [
         (PriorFactor(prior.pose, se2.world_to_body(prior.pose, prior.covariance)), (pose_key(0),)),
-        (VectorPriorFactor(np.zeros(len(constants.names)), constants.sigmas), (ODOMETRY_KEY,)),
+        (VectorPriorFactor(np.zeros(len(constants.names)), constants.sigmas), (constants_key(0),)),
     ]
     t, before = [prior.t], None
     for m in log.measurements(SENSORS):
@@ -166,13 +166,13 @@ def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tu
         elif isinstance(m, RfidScan) and before is not None and (looks := tags.looks(m)) is not None:
             state, k = motion.state(m.t), len(t)
             between = OdometryFactor(motion.relative(before, state), constants.indices)
-            factors.append((between, (pose_key(k - 1), pose_key(k), ODOMETRY_KEY)))
+            factors.append((between, (pose_key(k - 1), pose_key(k), constants_key(0))))
             factors.append((make(tags.likelihood, looks), (pose_key(k),)))
             t.append(m.t)
             before = state
     guess = causal.at(np.clip(np.array(t), causal.t[0], causal.t[-1]))
     values: Values = {pose_key(k): pose for k, pose in enumerate(guess)}
-    return Problem(factors), values | {ODOMETRY_KEY: np.zeros(len(constants.names))}, np.array(t)
+    return Problem(factors), values | {constants_key(0): np.zeros(len(constants.names))}, np.array(t)
 
 
 def section(options: Options) -> Report:
