@@ -102,7 +102,7 @@ def test_a_window_longer_than_the_run_gives_the_full_history(ranges):
 def test_a_particle_filter_comes_near_the_kalman_filter_and_smoother(ranges):
     filtered, smoothed = kalman(ranges)
     estimator = make(
-        "particle_filter", LINEAR, FAR, particles=20_000, smoothing_interval=0.5, smoothing_trajectories=2000
+        "particle_filter", LINEAR, FAR, particles=10_000, smoothing_interval=0.5, smoothing_trajectories=1000
     )
     causal = drive(estimator, ranges)
     # the mean of N particles of spread s is off by s / sqrt(N_eff): 6 sigma of 2,000 effective ones, below 1e-7 of false alarms
