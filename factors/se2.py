@@ -160,13 +160,13 @@ def transform_from(pose: Array, points: Array) -> Array:
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """A covariance ``(..., 3, 3)`` of the body-frame perturbation, as that of ``(x, y, heading)`` in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
-    return rotation @ covariance @ np.swapaxes(rotation, -1, -2)
+    return rotation @ covariance @ rotation.mT
 
 
 def world_to_body(pose: Array, covariance: Array) -> Array:
     """A covariance ``(..., 3, 3)`` of ``(x, y, heading)`` in the world, as that of the body-frame perturbation."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
-    return np.swapaxes(rotation, -1, -2) @ covariance @ rotation
+    return rotation.mT @ covariance @ rotation
 
 
 def arc_coefficients(phi: float) -> tuple[float, float]:

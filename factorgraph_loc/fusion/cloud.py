@@ -132,7 +132,9 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
     :data:`LEAST`, so that a likelihood is taken in a few hundred shares at most."""
 
     def effective(share: float) -> float:
-        return effective_size(normalised(log_weights + share * likelihood))
+        weighed = log_weights + share * likelihood
+        weights = np.exp(weighed - weighed.max())
+        return float(weights.sum() ** 2 / (weights @ weights))
 
     if effective(left) >= enough:
         return left

@@ -113,7 +113,8 @@ class Graph:
 
     def recalibrated(self, increment: Increment) -> Increment:
         """An increment under the constants of the odometry."""
-        return self.motion.recalibrated(increment, self.value(MOTION, np.zeros(0)))
+        key = self.keys.get(MOTION)
+        return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
         """The estimate of a block, ``default`` where there is none; KeyError where that is None."""

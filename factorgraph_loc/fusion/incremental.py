@@ -203,16 +203,12 @@ class Incremental:
 
         Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
         """
-        sensors = self._graph.sensors
-        followed = {
-            key
-            for name, key in self._graph.keys.items()
-            if is_landmark(key) or (name in sensors and sensors[name].follows_constants)
-        }
+        keys = self._graph.keys
+        followed = {keys[name] for name, s in self._graph.sensors.items() if s.follows_constants and name in keys}
         self._graph.pose, self._graph.covariance = self._marginal(newest.key)
         self._filtered[newest.index] = (self._graph.pose, self._graph.covariance)
         for key in touched:
-            if key not in followed:
+            if not is_landmark(key) and key not in followed:
                 value = self._solver.value(key)
                 if not np.all(np.isfinite(value)):
                     raise IndeterminateError(key)

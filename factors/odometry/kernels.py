@@ -78,8 +78,10 @@ def _widen(covariance: Array) -> None:
 
 
 @numba.njit(cache=True)
-def recalibrated(delta: Array, moving: float, changes: Array) -> Array:
-    """The increment ``delta`` (3,) alone of :func:`factors.odometry.model.recalibrated`."""
+def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
+    """The increment ``delta`` (3,) alone of :func:`factors.odometry.model.recalibrated`, where ``constants`` (P,) change, whose
+    places among all are ``indices`` (P,)."""
+    changes = _full(constants, indices)
     x, y, phi = log(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
     return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
@@ -124,11 +126,16 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """:func:`recalibrate` where only ``constants`` (P,) change, whose places among all are ``indices`` (P,): the Jacobian (3, P) is
     by these."""
+    delta, by_changes = recalibrate(twist, moving, _full(constants, indices))
+    return delta, np.ascontiguousarray(by_changes[:, indices])
+
+
+@numba.njit(cache=True)
+def _full(constants: Array, indices: Integers) -> Array:
     changes = np.zeros(4)
     for i in range(len(indices)):
         changes[indices[i]] = constants[i]
-    delta, by_changes = recalibrate(twist, moving, changes)
-    return delta, np.ascontiguousarray(by_changes[:, indices])
+    return changes
 
 
 @numba.njit(cache=True)

@@ -81,7 +81,7 @@ class Motion:
         """An increment under changed ``constants`` (P,)."""
         if not self.constants.names:
             return increment
-        delta = kernels.recalibrated(increment.delta, increment.moving, self._full(constants))
+        delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
