@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import gtsam
@@ -183,7 +184,7 @@ class Builder:
             correction = seen.correct(*view.guess, {}, {}, seen.iterations or ITERATIONS_OF_GUESS)
             if seen.is_judged and not sensor.judge(seen, correction, view):
                 continue
-            evidence = laplace_evidence(seen, *view.guess, correction)
+            evidence = partial(laplace_evidence, seen, *view.guess, correction)
             self._waiting.append(seen)
             graph.pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
             graph.covariance = correction.covariance
@@ -238,8 +239,7 @@ class Builder:
             addition.nodes += nodes
             if guess is not None:
                 self._search.expect(sensor, here, odometry, view)
-                evidence = laplace_evidence(here, *view.guess, correction) if self._search.weighs else 0.0
-                self._search.keep(sensor, here, odometry, evidence)
+                self._search.keep(sensor, here, odometry, partial(laplace_evidence, here, *view.guess, correction))
                 pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
                 view.guess = pose, correction.covariance[:3, :3]
         if guess is None:

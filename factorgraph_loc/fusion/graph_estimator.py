@@ -73,7 +73,14 @@ class GraphEstimator(ABC):
         self._max_delay = settings.max_delay
         calibration: Calibration = "all" if settings.self_calibration else "none"
         self._motion = bound_motion(setup, self.diagnostics, self_calibration=settings.self_calibration)
-        sensors = bound_sensors(setup, self._motion, self.diagnostics, use=settings.landmarks, calibration=calibration)
+        sensors = bound_sensors(
+            setup,
+            self._motion,
+            self.diagnostics,
+            use=settings.landmarks,
+            points=settings.landmarks,
+            calibration=calibration,
+        )
         mappers: list[Mapper] = []
         for bind in MAPPERS.values():
             found = bind(sensors, self.diagnostics, settings)

@@ -16,6 +16,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -243,6 +244,7 @@ class ParticleFilter(Filter):
                 if not seen.sightings:
                     self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._rng)
                 continue
+            here = seen
             if seen.is_judged:
                 spreads = {name: view.spread(name) for name in seen.blocks}
                 here = seen.on_pose(view.values(seen.blocks), spreads)
@@ -251,7 +253,7 @@ class ParticleFilter(Filter):
                     continue
                 self._search.expect(sensor, here, self._odometry, view)
             evidence = self._weigh(seen)
-            self._search.keep(sensor, seen, self._odometry, evidence)
+            self._search.keep(sensor, here, self._odometry, partial(float, evidence))
         refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
         if refuted is not None:
             # for the final trajectory: since then the track was elsewhere

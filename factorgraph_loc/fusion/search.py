@@ -151,12 +151,14 @@ class Search:
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
 
-    def keep(self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: float) -> None:
-        """An observation was applied to a track, of which ``evidence`` is the log of its probability."""
+    def keep(
+        self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
+    ) -> None:
+        """An observation was applied to a track, under which ``evidence`` tells the log of its probability."""
         seen = None if self._population is None and self._bounds is None else observation.at_its_time()
         if seen is None or not self._is_due(sensor, odometry.t):
             return
-        self._kept.append(Kept(odometry, seen, evidence))
+        self._kept.append(Kept(odometry, seen, evidence()))
         while self._kept[0].odometry.t < odometry.t - DURATION:
             self._kept.popleft()
         if self._population is not None:

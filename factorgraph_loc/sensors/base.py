@@ -9,7 +9,7 @@ correction of a Gaussian, and weighed over poses. Neither side knows the other b
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
@@ -127,13 +127,15 @@ class NewVariable:
 class Binding:
     """What a sensor is bound to: a run, the ``motion`` of its robot, and where to report.
 
-    ``use``: what the map is taken for; ``calibration``: which uncertain constants the estimator learns.
+    ``use``: what the map's landmarks are taken for, and ``points`` its points; ``calibration``: which uncertain constants the
+    estimator learns.
     """
 
     setup: Setup
     motion: Motion
     diagnostics: Diagnostics
     use: MapUse = "known"
+    points: MapUse = "known"
     calibration: Calibration = "all"
 
 
@@ -347,18 +349,10 @@ class ResidualObservation:
         return -np.array(costs)
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Observation:
-        return replace(
-            self,
-            terms=tuple(
-                Term(
-                    Marginalized(
-                        cast(Sightings, term.factor),
-                        tuple(values[name] for name in term.blocks),
-                        tuple(spreads.get(name) for name in term.blocks),
-                    ),
-                    (),
-                    term.rows,
-                )
-                for term in self.terms
-            ),
-        )
+        if not self.blocks:
+            return self
+        terms = []
+        for term in self.terms:
+            held = tuple(values[name] for name in term.blocks), tuple(spreads.get(name) for name in term.blocks)
+            terms.append(Term(Marginalized(cast(Sightings, term.factor), *held), (), term.rows))
+        return ResidualObservation(self.t, tuple(terms))

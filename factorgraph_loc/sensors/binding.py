@@ -16,10 +16,16 @@ def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bo
 
 
 def bound_sensors(
-    setup: Setup, motion: Motion, diagnostics: Diagnostics, *, use: MapUse = "known", calibration: Calibration = "all"
+    setup: Setup,
+    motion: Motion,
+    diagnostics: Diagnostics,
+    *,
+    use: MapUse = "known",
+    points: MapUse = "known",
+    calibration: Calibration = "all",
 ) -> dict[str, Sensor]:
-    """The sensors of a run that see the world around the robot, by the modality of their measurements. ``use``: what the map is
-    taken for."""
-    binding = Binding(setup, motion, diagnostics, use, calibration)
+    """The sensors of a run that see the world around the robot, by the modality of their measurements. ``use``: what the map's
+    landmarks are taken for, and ``points`` its points."""
+    binding = Binding(setup, motion, diagnostics, use, points, calibration)
     sensors: list[Sensor | None] = [bind(binding) for _, bind in functions("bind")]
     return {sensor.modality: sensor for sensor in sensors if sensor is not None}

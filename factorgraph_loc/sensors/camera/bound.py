@@ -96,7 +96,7 @@ class CameraSensor(Sensor):
     follows_constants = True  # where points are looked for depends on them
 
     def __init__(self, binding: Binding, constants: Estimated) -> None:
-        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
+        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.points
         self._uncertain, self._motion = constants, motion
         self.constants = constants if binding.calibration == "all" else NOTHING
         self.points = KnownPoints(setup, diagnostics, constants, use, motion)
