@@ -33,3 +33,14 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     carried[:3] = transition @ covariance
     gain = np.ascontiguousarray(np.linalg.solve(after, carried).T)
     return gain @ change, covariance + gain @ (later - after) @ gain.T
+
+
+@numba.njit(cache=True)
+def is_skew(covariance: Array, share: float) -> bool:
+    """Whether a covariance (S, S) is farther from symmetry than this share of two standard deviations."""
+    for i in range(len(covariance)):
+        for j in range(i):
+            skew = covariance[i, j] - covariance[j, i]
+            if skew * skew > share * share * covariance[i, i] * covariance[j, j]:
+                return True
+    return False

@@ -323,8 +323,5 @@ class Ekf(Filter):
 
 def _is_sound(covariance: Array) -> bool:
     """Whether rounding left a covariance symmetric and positive."""
-    variances = covariance.diagonal()
-    skew = np.abs(covariance - covariance.T)
-    if skew.max() > SKEW * variances.min() and np.any(skew**2 > SKEW**2 * np.outer(variances, variances)):
-        return False
-    return bool(dpotrf(covariance, lower=1)[1] == 0)  # LAPACK's own, as this is asked at each step
+    # LAPACK's own, as this is asked at each step
+    return not rts_kernels.is_skew(covariance, SKEW) and bool(dpotrf(covariance, lower=1)[1] == 0)

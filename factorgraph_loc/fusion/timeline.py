@@ -7,8 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -35,8 +34,7 @@ class FilterSettings(FileModel):
     smooth: bool = True
 
 
-@dataclass(frozen=True)
-class _Taken:
+class _Taken(NamedTuple):
     """A measurement with what there was before it: the filter's state, time and odometry, and how many records and ticks; and what
     the diagnostics say of it."""
 
@@ -133,7 +131,7 @@ class Filter(ABC):
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
         del self._records[:records], self._ticks[:ticks]
         self._taken = deque(
-            replace(taken, records=taken.records - records, ticks=taken.ticks - ticks) for taken in self._taken
+            taken._replace(records=taken.records - records, ticks=taken.ticks - ticks) for taken in self._taken
         )
 
     @abstractmethod
