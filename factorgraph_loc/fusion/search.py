@@ -114,10 +114,11 @@ class Search:
         return None if self._population is None else self._population.best
 
     def modes(self, t: float) -> list[Mode]:
-        """Where the robot may be at ``t``, the likeliest place first; none where nothing was seen."""
+        """Where the robot may be at ``t``, the likeliest place first; none where what was seen tells none. Of a start whose position is
+        known there is one, whatever does not agree with it."""
         now = self._motion.state(t)
         at, found = self._hypotheses()
-        if at is None:
+        if at is None or not found:
             return [] if self.start is None else [self.start.mode(now)]
         since = self._motion.relative(at, now)
         return [

@@ -93,6 +93,17 @@ def test_landmarks_tell_the_heading(name, missing, log):
     check(name, log, run(log, replace(CONFIGS[name], prior=position(log))), within=12.0 if missing else 6.0)
 
 
+@pytest.mark.parametrize("name", [*CONFIGS, "switching"])
+def test_sightings_that_fit_no_heading_leave_the_start_as_it_was_told(name):
+    """The robot is 9 m away: at times no heading explains what is seen from there, and the robot claims none."""
+    told = {"drive": {"duration": 14.0}, "world": {"tags": 25, "landmarks": 20, "points": 60}}
+    log = simulated(preset("office", told), 2)
+    config = CONFIGS.get(name, RunConfig("switching"))
+    result = run(log, replace(config, prior="10,6", sensors=("odometry", "bearing_range")))
+    assert "localized" not in result.status
+    assert np.all(np.isfinite(result.poses))
+
+
 def test_switching_without_tags_finds_it_by_landmarks(log):
     result = run(log, RunConfig("switching", prior=position(log)))
     first = result.status.index("localized")
