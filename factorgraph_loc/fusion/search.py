@@ -114,8 +114,8 @@ class Search:
         return None if self._population is None else self._population.best
 
     def modes(self, t: float) -> list[Mode]:
-        """Where the robot may be at ``t``, the likeliest place first; none where what was seen tells none. Of a start whose position is
-        known there is one, whatever does not agree with it."""
+        """Where the robot may be at ``t``, the likeliest place first; none where what was seen tells none. Of a start whose
+        position is known there is always one."""
         now = self._motion.state(t)
         at, found = self._hypotheses()
         if at is None or not found:
