@@ -16,6 +16,7 @@ from factors.se2 import Array
 
 # of a cloud that has collapsed to one point: its covariance must still be one
 MINIMUM_VARIANCE = 1e-10
+LEAST_VARIANCE = 1e-30  # of constants, in their units: particles that all descend from one must not make them exact
 MODES = 5  # at most
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
 BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
@@ -68,6 +69,8 @@ class Cloud:
         # The covariance of a weighted sample is by sum(w^2) too small, and by more where many descend from few, of which only what
         # the kernels drew is independent. It is little, but the constants would lose it with each resampling.
         lost = float(weights @ weights)
+        spreads = range(3, len(covariance))
+        covariance[spreads, spreads] += LEAST_VARIANCE
         if not self.localized:
             covariance[:3] = covariance[:, :3] = 0.0
             constants = np.broadcast_to(mean[3:], self.constants.shape)

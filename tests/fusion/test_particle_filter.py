@@ -143,6 +143,16 @@ def test_the_density_of_a_cloud_has_the_moments_of_what_it_was_drawn_from():
     np.testing.assert_allclose(found.mean(axis=0) / sigmas, 0.0, atol=0.02)
 
 
+def test_constants_of_particles_that_descend_from_one_stay_uncertain():
+    """Their spread has gone below what numbers can tell apart; a later state must still be compared with them."""
+    rng = np.random.default_rng(0)
+    cloud = Cloud(0.1 * rng.standard_normal((50, 3)), np.tile((0.02, -0.2), (50, 1)), np.full(50, -np.log(50.0)))
+    shrunk, kernel = cloud.density()
+    np.linalg.cholesky(kernel)
+    np.testing.assert_allclose(shrunk.constants, cloud.constants, atol=1e-12)
+    assert np.all(np.diag(kernel)[3:] < 1e-24)
+
+
 def test_a_density_of_several_modes_stays_at_its_poses():
     rng = np.random.default_rng(4)
     cloud = Cloud(rng.normal(size=(100, 3)), rng.normal(size=(100, 1)), np.full(100, -np.log(100.0)), localized=False)
