@@ -23,6 +23,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.binding import bound_motion
+from factorgraph_loc.sensors.registry import moving
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
@@ -67,7 +68,7 @@ class Switching:
         )
         self._tags: Filter = ParticleFilter(by_tags, of_tags)
         self._vision: Filter = Ekf(by_sight, EkfSettings(max_delay=delay, smooth=False, self_calibration=False))
-        by_scans = "rfid" in setup.sensors
+        by_scans = TAG_SENSORS[0] in setup.sensors
         self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
         self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
         for part in (self._tags, self._vision):
@@ -101,7 +102,7 @@ class Switching:
         if isinstance(measurement, Tick) or (measurement.modality == TAGS) == (self._active is self._tags):
             self._active.process(measurement)
             late = self._vision.diagnostics.late
-            self.diagnostics.late |= {sensor: count for sensor, count in late.items() if sensor != "odometry"}
+            self.diagnostics.late |= {sensor: count for sensor, count in late.items() if not moving((sensor,), "floor")}
             self._record()
         elif measurement.modality == TAGS:
             self.diagnostics.ignore("rfid while no tag is read", measurement.count)

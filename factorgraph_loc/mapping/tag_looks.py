@@ -12,7 +12,7 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factorgraph_loc.text import listed
-from factors.rfid.detection import Looks
+from factors.rfid.detection import TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array
 
@@ -36,9 +36,9 @@ class TagLooks:
     facing: Array
     positions: Array
 
-    def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> Looks:
+    def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
         """The looks ``which`` at all tags, made from ``poses`` (K', 3) in the world, as seen from the world's origin."""
-        return Looks(poses, self.antennas[which], self.rounds[which], self.hits[which])
+        return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
 def tag_looks(log: Log, height: float | None = None) -> TagLooks:

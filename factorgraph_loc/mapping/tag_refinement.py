@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array
 
@@ -48,7 +48,9 @@ def reach(model: RfidModel) -> float:
     return out
 
 
-def refine(model: RfidModel, looks: Looks, heights: Array, candidates: Candidates) -> tuple[Candidates, Array, Array]:
+def refine(
+    model: RfidModel, looks: TagReadCounts, heights: Array, candidates: Candidates
+) -> tuple[Candidates, Array, Array]:
     """Candidates at the optimum nearest to each, its negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
@@ -56,7 +58,7 @@ def refine(model: RfidModel, looks: Looks, heights: Array, candidates: Candidate
     for first in range(0, len(nll), CHUNK):
         part = slice(first, first + CHUNK)
         tag, facing = candidates.tag[part], candidates.facing[part]
-        mine = Looks(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tag]))
+        mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tag]))
         problem = _Refinement(model, mine, heights[tag], facing)
         places[part], nll[part], information = problem.solve(places[part])
         covariances[part] = np.linalg.inv(information + prior)
@@ -68,7 +70,7 @@ class _Refinement:
     """C places at once, each by looks of its own column of hits."""
 
     model: RfidModel
-    looks: Looks
+    looks: TagReadCounts
     heights: Array
     facing: Array
 
@@ -102,7 +104,7 @@ class _Refinement:
     def _only(self, which: NDArray[np.int64]) -> _Refinement:
         looks = self.looks
         hits = np.ascontiguousarray(looks.hits[:, which])
-        mine = Looks(looks.offsets, looks.antennas, looks.rounds, hits)
+        mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, hits)
         return _Refinement(self.model, mine, self.heights[which], self.facing[which])
 
     def _curvature(self, places: Array, information: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.mapping.tag_refinement import Candidates, reach, refine
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array, wrap, wrap_scalar
 
@@ -74,7 +74,7 @@ def sigma(covariance: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> list[Found]:
+def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[Found]:
     """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: from known poses, as
     seen from the world's origin."""
     looks = merged(looks, *FINE)
@@ -102,7 +102,7 @@ def search(model: RfidModel, looks: Looks, heights: Array, facing: Array) -> lis
     return out
 
 
-def merged(looks: Looks, distance: float, angle: float) -> Looks:
+def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
     """The looks, those of one antenna counted together while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
     group = np.empty(len(looks.antennas), dtype=np.int64)
     first: dict[int, int] = {}
@@ -121,11 +121,11 @@ def merged(looks: Looks, distance: float, angle: float) -> Looks:
     hits = np.zeros((len(kept), looks.hits.shape[1]), dtype=np.int64)
     np.add.at(rounds, group, looks.rounds)
     np.add.at(hits, group, looks.hits)
-    return Looks(looks.offsets[kept], looks.antennas[kept], rounds, hits)
+    return TagReadCounts(looks.offsets[kept], looks.antennas[kept], rounds, hits)
 
 
 def _lattice_search(
-    model: RfidModel, looks: Looks, read: NDArray[np.bool_], heights: Array, facing: Array
+    model: RfidModel, looks: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> Candidates:
     """The best places of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
     cells = _cells(looks.offsets[:, :2], reach(model))
@@ -162,7 +162,7 @@ def _cells(places: Array, distance: float) -> Array:
 
 
 def _nll(
-    model: RfidModel, looks: Looks, tags: NDArray[np.int64], cells: Array, height: float, direction: float
+    model: RfidModel, looks: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
 ) -> Array:
     """Tempered negative log-likelihood (G, S) of S ``tags`` at all cells."""
     points = np.column_stack((cells, np.full(len(cells), height)))

@@ -30,7 +30,7 @@ from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import Increment
 from factors.odometry.model import PARAMETERS, OdometryFactor, recalibrated
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.tag_factor import RfidTagFactor
 from factors.se2 import Array
@@ -117,7 +117,7 @@ class _Way:
         tags = np.flatnonzero(wanted)
         out = [Found((), 0, 0.0) for _ in wanted]
         if len(tags) and len(poses):
-            mine = Looks(along.offsets, along.antennas, along.rounds, np.ascontiguousarray(along.hits[:, tags]))
+            mine = TagReadCounts(along.offsets, along.antennas, along.rounds, np.ascontiguousarray(along.hits[:, tags]))
             found = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
             for tag, one in zip(tags.tolist(), found, strict=True):
                 out[tag] = one
@@ -189,9 +189,9 @@ class _Way:
             if not len(rows):
                 continue
             hits = looks.hits[rows]
-            here = Looks(self._offsets[rows], looks.antennas[rows], looks.rounds[rows], hits)
+            here = TagReadCounts(self._offsets[rows], looks.antennas[rows], looks.rounds[rows], hits)
             if len(fixed):
-                mine = Looks(here.offsets, here.antennas, here.rounds, np.ascontiguousarray(hits[:, fixed]))
+                mine = TagReadCounts(here.offsets, here.antennas, here.rounds, np.ascontiguousarray(hits[:, fixed]))
                 out.append((RfidFactor(map_, mine), (pose_key(i),)))
             near = np.hypot(*(places - self._values[pose_key(i)][:2]).T) < self._reach
             for tag in variable[near | hits[:, variable].any(axis=0)].tolist():

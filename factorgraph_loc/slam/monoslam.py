@@ -28,7 +28,7 @@ from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.twist.use import in_space, twist_settings
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
-from factorgraph_loc.slam.monoslam_sighting import Looker, Match
+from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher, Match
 from factorgraph_loc.slam.monoslam_state import POSE, Eye, Innovation, MapPoint, SlamState, squared, widening
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
@@ -107,7 +107,7 @@ class Monoslam(Filter):
     def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
         super().__init__(setup, settings)
         self._settings = settings
-        self._looker = Looker(setup, self.diagnostics, settings.landmarks)
+        self._looker = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
         twist = twist_settings(setup)
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
         self._planar = settings.planar is not False

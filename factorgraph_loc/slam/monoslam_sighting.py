@@ -41,7 +41,7 @@ class Match:
     tempering: float = 1.0
 
 
-class Looker:
+class FeatureMatcher:
     """Associates; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:

@@ -74,7 +74,7 @@ class UnknownPoints:
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
     _looks: PointLooks = field(default_factory=PointLooks)
     _loops: LoopClosure = field(default_factory=LoopClosure)
-    _way: float = 0.0  # m that the robot has gone
+    _distance_travelled: float = 0.0  # m that the robot has gone
     _again_as: dict[Hashable, Hashable] = field(default_factory=dict)  # names of points that are followed by new tracks
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
@@ -98,11 +98,13 @@ class UnknownPoints:
             model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
         rows = list(rows)
         if keyframe.from_previous is not None:
-            self._way += float(np.hypot(*keyframe.from_previous.delta[:2]))
+            self._distance_travelled += float(np.hypot(*keyframe.from_previous.delta[:2]))
         names = self._named(m, rows, lifted(model, *guess), graph)
         certain: set[int] = set()  # rows
         if m.frame is not None and self._loops.due(m.t):
-            certain = self._revisited(model, Image(m.frame, keyframe, guess, self._way), rows, names, graph)
+            certain = self._revisited(
+                model, Image(m.frame, keyframe, guess, self._distance_travelled), rows, names, graph
+            )
         pixels = np.asarray(m.pixels[rows], dtype=float)
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
@@ -132,7 +134,9 @@ class UnknownPoints:
             self._names[key] = f"track{name}" if m.names is None else str(name)
             self._points[name] = _Point(key, keyframe.t, positive.inverse(found.covariance))
             if m.frame is not None:
-                self._looks.keep(key, m.frame, rows[names.index(name)], lifted(model, *guess).position, self._way)
+                self._looks.keep(
+                    key, m.frame, rows[names.index(name)], lifted(model, *guess).position, self._distance_travelled
+                )
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
@@ -208,7 +212,7 @@ class UnknownPoints:
         for row, name, agrees in seen:
             track = int(m.tracks[row])
             if agrees:
-                self._looks.keep(self._points[name].key, m, row, seen_from, self._way)
+                self._looks.keep(self._points[name].key, m, row, seen_from, self._distance_travelled)
             elif self._again_as.pop(track, None) is not None:
                 self._points[name].strikes -= 1  # the point itself did nothing wrong
 

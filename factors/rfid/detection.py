@@ -40,7 +40,7 @@ class TagArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class TagReadCounts:
     """What K antennas read of T tags, each at its own place on the way.
 
     ``offsets`` (K, 3): the robot's pose at the look, in the frame of the pose that the likelihood is of; ``antennas`` (K,): places
@@ -59,16 +59,16 @@ class Looks:
         if not len(self.odds):
             object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
 
-    def moved(self, offset: Array) -> Looks:
+    def moved(self, offset: Array) -> TagReadCounts:
         """The same looks, of the pose that lies ``offset`` (3,) before theirs."""
-        return Looks(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits, self.odds)
+        return TagReadCounts(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits, self.odds)
 
 
-def together(parts: list[Looks]) -> Looks:
+def together(parts: list[TagReadCounts]) -> TagReadCounts:
     """Several looks as one, all of the same pose, in the order in which they were made: the odds are those before the first."""
     if len(parts) == 1:
         return parts[0]
-    return Looks(
+    return TagReadCounts(
         np.concatenate([p.offsets for p in parts]),
         np.concatenate([p.antennas for p in parts]),
         np.concatenate([p.rounds for p in parts]),
@@ -100,7 +100,7 @@ class RfidLikelihood:
     def __post_init__(self) -> None:
         object.__setattr__(self, "packed", self.model.packed())
 
-    def score(self, poses: Array, looks: Looks) -> Score:
+    def score(self, poses: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         n = len(poses)
@@ -110,7 +110,7 @@ class RfidLikelihood:
         rfid_kernels.score(self.packed, poses, *tags, *where, *seen, looks.odds, self.model.tempering, *out)
         return out
 
-    def silence(self, pose: Array, covariance: Array, looks: Looks) -> Array:
+    def silence(self, pose: Array, covariance: Array, looks: TagReadCounts) -> Array:
         """Tempered negative log-likelihood (T,), if they are alive, that tags of which that is not certain were not read, from a
         pose (3,) with body-frame ``covariance`` (3, 3); less what it is out of reach, and 0 where a tag was read or is certain."""
         out = np.empty(len(self.tags.points))
@@ -121,7 +121,7 @@ class RfidLikelihood:
         rfid_kernels.silence(self.packed, pose, covariance, *tags, *where, *seen, looks.odds, tempering, out)
         return out
 
-    def log_likelihood(self, poses: Array, looks: Looks) -> Array:
+    def log_likelihood(self, poses: Array, looks: TagReadCounts) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`): for particles."""
         poses = np.ascontiguousarray(poses, dtype=float)
         certain, silent, which = self.by_silence(poses, looks)
@@ -129,7 +129,7 @@ class RfidLikelihood:
             add_mixed(silent, looks.odds[which], self.model.tempering, certain)
         return certain
 
-    def by_silence(self, poses: Array, looks: Looks) -> tuple[Array, Array32, NDArray[np.int64]]:
+    def by_silence(self, poses: Array, looks: TagReadCounts) -> tuple[Array, Array32, NDArray[np.int64]]:
         """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,
         of the silence of U tags that may be dead, each by itself if it is alive, above what it is out of reach, (U, N), with the
         places (U,) of these tags in the map."""
@@ -144,7 +144,7 @@ class RfidLikelihood:
             add_log_likelihood(self.packed, self._tables, int(looks.antennas[i]), at, *tags, apart, out, silent)
         return self.model.tempering * out, silent, which
 
-    def _near(self, poses: Array, looks: Looks) -> NDArray[np.bool_]:
+    def _near(self, poses: Array, looks: TagReadCounts) -> NDArray[np.bool_]:
         """Which tags (T,) may be in reach of an antenna from any of the poses."""
         packed = self.packed
         way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
@@ -158,7 +158,7 @@ class RfidLikelihood:
     def _tables(self) -> Tables:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
-    def by_tag(self, pose: Array, looks: Looks) -> tuple[Array, Array, Array]:
+    def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
         """What each tag says on its own, at one pose (3,): tempered negative log-likelihood (T,), its gradient (T, 2) by the tag's
         position in the world, and information (T, 2, 2)."""
         count = len(self.tags.points)

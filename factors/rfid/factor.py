@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from factors.compressed import compressed
-from factors.rfid.detection import Looks, RfidLikelihood, Score
+from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.phase import PhaseLikelihood, PhaseReads, PhaseScore
 from factors.rfid.strength import RssiLikelihood, RssiReads, RssiScore
 from factors.se2 import Array
@@ -22,7 +22,7 @@ class RfidFactor:
     likelihood. ``seen``: looks for a :class:`RfidLikelihood`, reads for the other two."""
 
     likelihood: RfidLikelihood | RssiLikelihood | PhaseLikelihood
-    seen: Looks | RssiReads | PhaseReads
+    seen: TagReadCounts | RssiReads | PhaseReads
 
     @property
     def is_phase(self) -> bool:
@@ -31,12 +31,12 @@ class RfidFactor:
 
     def with_odds(self, odds: Array) -> RfidFactor:
         """The same, with other log-odds (T,) that each tag is dead; these are of looks alone."""
-        return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, Looks) else self
+        return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, TagReadCounts) else self
 
     def score(self, pose: Array) -> TagScore:
         """Of one pose (3,); every part has a leading axis of length 1."""
         match self.likelihood, self.seen:
-            case RfidLikelihood() as detection, Looks() as looks:
+            case RfidLikelihood() as detection, TagReadCounts() as looks:
                 return detection.score(pose, looks)
             case RssiLikelihood() as strength, RssiReads() as reads:
                 return strength.score(pose, reads)
@@ -47,7 +47,7 @@ class RfidFactor:
     def log_likelihood(self, poses: Array) -> Array:
         """The tempered log-likelihood (N,) of poses (N, 3)."""
         match self.likelihood, self.seen:
-            case RfidLikelihood() as detection, Looks() as looks:
+            case RfidLikelihood() as detection, TagReadCounts() as looks:
                 return detection.log_likelihood(poses, looks)
             case RssiLikelihood() as strength, RssiReads() as reads:
                 return strength.log_likelihood(poses, reads)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compressed import compressed
-from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import of_tag, placed, terms
 from factors.rfid.model import Packed
 from factors.se2 import Array
@@ -28,7 +28,7 @@ class RfidTagFactor:
 
     likelihood: RfidLikelihood
     tag: int
-    looks: Looks
+    looks: TagReadCounts
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Residual (6,) and its Jacobians (6, 3) by the pose and (6, 2) by the position."""

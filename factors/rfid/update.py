@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factors import positive, se2, se2_kernels
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels as rfid_kernels
-from factors.rfid.detection import Looks, RfidLikelihood, Score
+from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.factor import RfidFactor, TagScore
 from factors.rfid.model import Packed
 from factors.se2 import Array
@@ -47,7 +47,7 @@ class TagUpdate:
 
 
 def update(
-    likelihood: RfidLikelihood, looks: Looks, pose: Array, covariance: Array, iterations: int = ITERATIONS
+    likelihood: RfidLikelihood, looks: TagReadCounts, pose: Array, covariance: Array, iterations: int = ITERATIONS
 ) -> TagUpdate:
     """The most likely pose after looks at tags; see :func:`updated`."""
     return updated([RfidFactor(likelihood, looks)], pose, covariance, iterations)
@@ -60,7 +60,7 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
     """
     pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
     likelihood, looks = factors[0].likelihood, factors[0].seen
-    if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, Looks):
+    if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
         return scored_update(factors, pose, covariance, iterations)
     tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))

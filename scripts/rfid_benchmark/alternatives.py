@@ -26,7 +26,7 @@ from factorgraph_loc.simulation.settings import preset
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry.model import OdometryFactor
-from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 
@@ -42,7 +42,7 @@ CELL = 0.1  # m, of the sums over the antenna's field
 class StackedFactor:
     """One row sqrt(2 nll) for each antenna and tag, with its own derivative; numerically, as the models give it only in sum."""
 
-    def __init__(self, likelihood: RfidLikelihood, looks: Looks) -> None:
+    def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts) -> None:
         self._likelihood, self._looks = likelihood, looks
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
@@ -67,7 +67,7 @@ class GaussianFactor:
     """Each detection as a measured place of its tag in the antenna's frame: mean and covariance of the field of detection, by
     moment matching. What was not read says nothing."""
 
-    def __init__(self, likelihood: RfidLikelihood, looks: Looks, fields: Sequence[tuple[Array, Array]]) -> None:
+    def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts, fields: Sequence[tuple[Array, Array]]) -> None:
         rows, tags = np.nonzero(looks.hits)
         antennas = looks.antennas[rows]
         self._points = likelihood.tags.points[tags, :2]
@@ -109,7 +109,7 @@ def field_moments(likelihood: RfidLikelihood, antenna: int) -> tuple[Array, Arra
     return mean, ((points - mean) * q[:, None]).T @ (points - mean)
 
 
-Maker = Callable[[RfidLikelihood, Looks], Factor]
+Maker = Callable[[RfidLikelihood, TagReadCounts], Factor]
 
 
 def makers(likelihood: RfidLikelihood) -> dict[str, Maker]:

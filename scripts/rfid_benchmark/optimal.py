@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.se2 import Array
 from rfid_benchmark.grid_filter import GridFilter
 
@@ -81,6 +81,6 @@ def optimal_filter(log: Log) -> Trajectory:
     return Trajectory(np.array(t), np.array(means).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))
 
 
-def _log_likelihood(likelihood: RfidLikelihood, looks: Looks, poses: Array) -> Array:
+def _log_likelihood(likelihood: RfidLikelihood, looks: TagReadCounts, poses: Array) -> Array:
     # exact, not from tables: what is optimal must not have their error
     return -likelihood.score(poses, looks).nll

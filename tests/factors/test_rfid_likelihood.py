@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray, together
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
 
@@ -24,7 +24,7 @@ POSE = np.array((4.0, 3.0, 0.5))
 
 def scene(
     model: DetectionModel, seed: int = 0, tempering: float = 1.0, pitch: float = 0.1
-) -> tuple[RfidLikelihood, Looks]:
+) -> tuple[RfidLikelihood, TagReadCounts]:
     """Four antennas with different places, 15 tags, of which some have no facing, and looks at different offsets."""
     rng = np.random.default_rng(seed)
     antennas = tuple(Antenna(0.3 * math.cos(a), 0.3 * math.sin(a), 1.0, a, pitch) for a in np.arange(4) * math.pi / 2.0)
@@ -32,7 +32,7 @@ def scene(
     facing[:3] = np.nan
     tags = TagArray(np.column_stack((rng.uniform(1.0, 7.0, (15, 2)), rng.uniform(0.8, 1.4, 15))), facing)
     hits = rng.integers(0, 3, (4, 15))
-    looks = Looks(rng.normal(size=(4, 3)) * 0.1, np.arange(4), np.full(4, 2), hits)
+    looks = TagReadCounts(rng.normal(size=(4, 3)) * 0.1, np.arange(4), np.full(4, 2), hits)
     return RfidLikelihood(RfidModel(antennas, (model,), 0.01, 0.02, tempering), tags), looks
 
 
@@ -56,12 +56,12 @@ def test_information_and_expectation_are_those_of_drawn_reads() -> None:
     """Over reads drawn from the model: the gradient has mean zero and the information as covariance. 4,000 draws: each of the
     checks is at 5 standard errors, so that all together fail by chance once in 100,000 runs."""
     likelihood, looks = scene(BeamModel(), pitch=0.0)
-    looks = Looks(np.zeros((4, 3)), looks.antennas, np.ones(4, dtype=np.int64), looks.hits)
+    looks = TagReadCounts(np.zeros((4, 3)), looks.antennas, np.ones(4, dtype=np.int64), looks.hits)
     rng = np.random.default_rng(5)
     q = np.array([likelihood.probabilities(POSE[None], a)[0] for a in range(4)])
     scores = [
         likelihood.score(
-            POSE, Looks(looks.offsets, looks.antennas, looks.rounds, (rng.random(q.shape) < q).astype(np.int64))
+            POSE, TagReadCounts(looks.offsets, looks.antennas, looks.rounds, (rng.random(q.shape) < q).astype(np.int64))
         )
         for _ in range(4000)
     ]
@@ -91,7 +91,7 @@ def test_tables_are_near_the_likelihood(name: str) -> None:
 def test_one_read_and_one_silence_by_hand() -> None:
     tags = TagArray(np.array(((2.0, 0.5, 1.0), (3.0, -1.0, 1.0))), np.full(2, np.nan))
     likelihood = RfidLikelihood(RfidModel((Antenna(z=1.0),), (BeamModel(),), 0.01, 0.02, 0.5), tags)
-    looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((1, 0),)))
+    looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((1, 0),)))
     p = probability(BeamModel(), np.array(((2.0, 0.5, 0.0), (3.0, -1.0, 0.0))))
     q = 0.01 + 0.97 * p
     expected = -0.5 * (math.log(q[0]) + math.log(1.0 - q[1]))
@@ -127,7 +127,7 @@ def test_tags_say_together_what_each_says() -> None:
 def test_a_model_without_a_floor_stays_finite() -> None:
     tags = TagArray(np.array(((0.5, 0.0, 0.0), (50.0, 0.0, 0.0))), np.full(2, np.nan))
     likelihood = RfidLikelihood(RfidModel((Antenna(),), (BeamModel(p0=1.0 - 1e-16),), 0.0, 0.0), tags)
-    looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((0, 1),)))
+    looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, np.int64), np.ones(1, np.int64), np.array(((0, 1),)))
     assert all(np.all(np.isfinite(part)) for part in likelihood.score(np.zeros(3), looks))
     assert not np.any(np.isnan(likelihood.log_likelihood(np.zeros((2, 3)), looks)))
 
@@ -143,21 +143,21 @@ def test_factor_has_the_cost_gradient_and_curvature_of_the_likelihood() -> None:
     assert factor.cost([POSE]) == pytest.approx(score.nll[0])
 
 
-def doubtful(seed: int, name: str = "beam") -> tuple[RfidLikelihood, Looks, Looks]:
+def doubtful(seed: int, name: str = "beam") -> tuple[RfidLikelihood, TagReadCounts, TagReadCounts]:
     """A scene in which most tags are silent: all of them certain to live, and with odds from certain to nearly given up."""
     likelihood, looks = scene(MODELS[name], seed, tempering=0.3)
     looks.hits[:, 4:] = 0
     return likelihood, looks, replace(looks, odds=np.resize(np.array((-np.inf, -3.0, 0.5, 8.0)), 15))
 
 
-def out_of_reach(likelihood: RfidLikelihood, looks: Looks) -> float:
+def out_of_reach(likelihood: RfidLikelihood, looks: TagReadCounts) -> float:
     """The negative log-likelihood of a tag out of reach that is not read."""
     model = likelihood.model
     floor = model.false_read + (1.0 - model.false_read - model.miss) / (1.0 + math.exp(14.0))
     return -model.tempering * float(looks.rounds.sum()) * math.log1p(-floor)
 
 
-def mixture(likelihood: RfidLikelihood, looks: Looks, odds: np.ndarray, pose: np.ndarray) -> float:
+def mixture(likelihood: RfidLikelihood, looks: TagReadCounts, odds: np.ndarray, pose: np.ndarray) -> float:
     """The negative log-likelihood of tags that may be dead, tag by tag; a tag that is read lives, which is not counted."""
     total, none = 0.0, out_of_reach(likelihood, looks)
     each, _, _ = likelihood.by_tag(pose, looks)
@@ -196,7 +196,7 @@ def test_expectation_over_what_a_tag_that_may_be_dead_can_do() -> None:
     odds = np.array((math.log(dead / (1.0 - dead)),))
     values, chances = [], []
     for k, ways in enumerate((1.0, 2.0, 1.0)):
-        looks = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, 2), np.array(((k,),)), odds)
+        looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, 2), np.array(((k,),)), odds)
         score = likelihood.score(np.zeros(3), looks)
         values.append(score.nll[0])
         chances.append((1.0 - dead) * ways * q**k * (1.0 - q) ** (2 - k) + (dead if k == 0 else 0.0))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 from factors.rfid.tag_factor import ROWS, RfidTagFactor
 
@@ -24,7 +24,7 @@ def factor(model, seed, tempering=0.3):
     tags = TagArray(np.column_stack((rng.normal(size=(3, 2)), rng.uniform(0.8, 1.4, 3))), rng.uniform(-3.0, 3.0, 3))
     likelihood = RfidLikelihood(RfidModel(antennas, (model,), 0.01, 0.02, tempering), tags)
     rounds = rng.integers(1, 4, 8)
-    looks = Looks(
+    looks = TagReadCounts(
         rng.normal(scale=(0.3, 0.3, 0.2), size=(8, 3)),
         rng.integers(0, 2, 8),
         rounds,
@@ -57,7 +57,9 @@ def test_gradients_by_pose_and_place_are_those_of_the_cost(model, seed):
 def test_it_says_of_the_pose_and_of_the_place_what_the_likelihood_says_of_each(seed):
     subject, (pose, place) = factor(LOGISTIC, seed)
     nll, gradient, information = subject.score([pose, place])
-    one = Looks(subject.looks.offsets, subject.looks.antennas, subject.looks.rounds, subject.looks.hits[:, 1:2].copy())
+    one = TagReadCounts(
+        subject.looks.offsets, subject.looks.antennas, subject.looks.rounds, subject.looks.hits[:, 1:2].copy()
+    )
     tags = subject.likelihood.tags
     there = TagArray(np.array([[*place, tags.points[1, 2]]]), tags.facing[1:2])
     single = RfidLikelihood(subject.likelihood.model, there)

@@ -14,7 +14,7 @@ from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid import update as rfid_update
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 from factors.update import linearized_update, robust_update
@@ -88,7 +88,7 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
         at = se2.compose(pose, offset)[None]
         shares = np.array([likelihood.probabilities(at, k)[0] for k in range(3)])
         hits = rng.binomial(2, shares).astype(np.int64)
-        looks = Looks(np.tile(offset, (3, 1)), np.arange(3), np.full(3, 2), hits)
+        looks = TagReadCounts(np.tile(offset, (3, 1)), np.arange(3), np.full(3, 2), hits)
         start, covariance = se2.compose(pose, se2.exp(scale * rng.standard_normal(3))), spread(rng, 3, scale)
         factors = [RfidFactor(likelihood, looks)]
         found = rfid_update.updated(factors, start, covariance, iterations)

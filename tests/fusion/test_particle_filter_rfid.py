@@ -19,7 +19,7 @@ from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 
 SENSORS = ("odometry", "rfid")
 KNOWN = RunConfig("particle_filter", {"particles": 1500, "smooth": False}, SENSORS)
@@ -71,7 +71,7 @@ def test_posterior_of_one_tag(kld):
     axes = [np.linspace(-4.0 * s, 4.0 * s, 61) for s in (0.6, 0.6, 0.4)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     likelihood = RfidLikelihood(rfid.model(), TagArray(np.array(((2.0, 0.5, 0.0),)), np.array((np.nan,))))
-    two = Looks(np.zeros((1, 3)), np.zeros(1, np.int64), np.array((4,)), np.array(((2,),)))
+    two = TagReadCounts(np.zeros((1, 3)), np.zeros(1, np.int64), np.array((4,)), np.array(((2,),)))
     log_density = -likelihood.score(grid, two).nll - 0.5 * np.sum(grid**2 / np.diag(covariance), axis=1)
     weights = np.exp(log_density - log_density.max())
     weights /= weights.sum()

@@ -15,7 +15,7 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.sensors.rfid.bound import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 
 NOISE = OdometryNoise(
@@ -52,7 +52,7 @@ class World:
         if self.t > 0.0:
             self.motion.add(VelocityOdometry(self.t, SPEED, self.turn))
         n = self.antennas
-        looks = Looks(np.zeros((n, 3)), np.arange(n), np.ones(n, dtype=np.int64), self.hits())
+        looks = TagReadCounts(np.zeros((n, 3)), np.arange(n), np.ones(n, dtype=np.int64), self.hits())
         factor = RfidFactor(self.told, looks)
         seeker.add(self.motion.state(self.t), TagObservation(self.t, factor, int(looks.hits.sum()), looks))
         at, self.t = self.truth, self.t + STEP
@@ -146,7 +146,7 @@ def test_a_scan_that_is_older_than_the_last_is_left_out():
     seeker = world.seeker()
     world.scan(seeker)
     before = seeker.log_evidence
-    looks = Looks(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, 25), int))
+    looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, 25), int))
     older = TagObservation(-0.1, RfidFactor(world.likelihood, looks), 25, looks)
     assert not seeker.add(world.motion.state(-0.1), older)
     assert seeker.log_evidence == before

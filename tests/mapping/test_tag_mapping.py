@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2
-from factors.rfid.detection import Looks, RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel
 
 SMALL = {"world": {"width": 7.0, "depth": 6.5, "tags": 8}, "drive": {"duration": 60.0}}
@@ -50,7 +50,9 @@ def drawn(model, tags, poses, antennas, rng):
     p = np.empty((len(offsets), len(tags.points)))
     for a in antennas:
         p[which == a] = likelihood.probabilities(offsets[which == a], a)
-    return Looks(offsets, which, np.ones(len(which), dtype=np.int64), (rng.random(p.shape) < p).astype(np.int64))
+    return TagReadCounts(
+        offsets, which, np.ones(len(which), dtype=np.int64), (rng.random(p.shape) < p).astype(np.int64)
+    )
 
 
 def straight(length=8.0, step=0.1):

@@ -20,7 +20,7 @@ from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
-from factors.rfid.detection import Looks, together
+from factors.rfid.detection import TagReadCounts, together
 from factors.rfid.factor import ROWS, RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
@@ -35,7 +35,7 @@ class TagObservation:
     t: float
     factor: RfidFactor
     found: int
-    here: Looks | None = None  # what was read and not read, from the pose at the scan's time
+    here: TagReadCounts | None = None  # what was read and not read, from the pose at the scan's time
     rounds: int = 0  # of antennas, of what was read and not read
     blocks: tuple[str, ...] = ()
     iterations: ClassVar[int] = rfid_update.ITERATIONS
@@ -49,7 +49,11 @@ class TagObservation:
     def things(self) -> frozenset[Hashable]:
         """The tags that were read, by their places in the map."""
         looks = self.factor.seen
-        return frozenset(np.flatnonzero(looks.hits.any(axis=0)).tolist()) if isinstance(looks, Looks) else frozenset()
+        return (
+            frozenset(np.flatnonzero(looks.hits.any(axis=0)).tolist())
+            if isinstance(looks, TagReadCounts)
+            else frozenset()
+        )
 
     def at_its_time(self) -> Self | None:
         """Only of what was read and not read: strength and phase have many optima."""
@@ -127,14 +131,14 @@ class TagSensor(Sensor):
                 if window is not None:
                     yield TagObservation(m.t, window, 1)
 
-    def _detection(self, m: RfidScan, moved: Looks, looks: Looks) -> TagObservation:
+    def _detection(self, m: RfidScan, moved: TagReadCounts, looks: TagReadCounts) -> TagObservation:
         assert self.tags.likelihood is not None
         factor = RfidFactor(self.tags.likelihood, moved)
         return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas))
 
     def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
         looks, t = observation.factor.seen, observation.t
-        assert isinstance(looks, Looks)
+        assert isinstance(looks, TagReadCounts)
         self._diagnostics.innovation("rfid", t, correction.nis, correction.dof)
         if view.newest and not self._is_evidence(observation, correction.evidence):
             self._diagnostics.reject(Silence.REJECTED, observation.rounds)
@@ -172,8 +176,8 @@ class TagSensor(Sensor):
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
         """All reads and misses as one factor."""
-        looks = [seen for o in observations if isinstance(seen := o.factor.seen, Looks)]
-        factors = [o.factor for o in observations if not isinstance(o.factor.seen, Looks)]
+        looks = [seen for o in observations if isinstance(seen := o.factor.seen, TagReadCounts)]
+        factors = [o.factor for o in observations if not isinstance(o.factor.seen, TagReadCounts)]
         if looks and self.tags.likelihood is not None:
             factors.append(RfidFactor(self.tags.likelihood, together(looks)))
         return [Term(factor, (), ROWS) for factor in factors]

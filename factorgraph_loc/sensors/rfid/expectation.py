@@ -12,7 +12,7 @@ from factorgraph_loc.sensors.forecast import Array32, Places
 from factorgraph_loc.sensors.rfid.forecast import ScanTables, log_weights, make_tables
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.se2 import Array
 
 ROUNDS_PER_SECOND = 2.0  # where nothing else is said
@@ -38,7 +38,7 @@ class RfidForecast:
         """In proportion to the rounds, whatever is read in them."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
-        one_round = Looks(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
+        one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
         found = self.likelihood.score(poses, one_round).information
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * found)
 

@@ -10,7 +10,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import TagMap, tag_map
-from factors.rfid.detection import Looks, RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.tag_states import TagStates
 from factors.rfid.update import _Integers
 from factors.se2 import Array
@@ -47,7 +47,7 @@ class KnownTags:
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         self.states = TagStates(len(self.map.names), 0.0 if settings is None else settings.dead_tags)
 
-    def looks(self, m: RfidScan, *, count: bool = True) -> Looks | None:
+    def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
         """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time.
 
         ``count`` off: what is ignored is not counted, as the scan will be looked at once more.
@@ -74,9 +74,9 @@ class KnownTags:
             diagnostics.ignore("tag not in the map", unknown)
         self.states.hear(m.t, np.flatnonzero(hits.any(axis=0)))
         self._tell()
-        return Looks(np.zeros((len(used), 3)), used, rounds, hits, odds)
+        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds)
 
-    def miss(self, t: float, looks: Looks, pose: Array, covariance: Array) -> None:
+    def miss(self, t: float, looks: TagReadCounts, pose: Array, covariance: Array) -> None:
         """Learn of the tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): that of the looks, as
         it was predicted before them."""
         if self.likelihood is not None:
