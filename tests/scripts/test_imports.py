@@ -11,7 +11,7 @@ from package_tables import HEIGHT, MODULES, ROOT, imported, package_of, tables
 EXCEPTIONS: set[tuple[str, str]] = set()
 
 # what estimators and sensors know of each other
-CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position")}
+CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position", "registry")}
 IMPORTS = {module: imported(module) for module in MODULES}
 
 
