@@ -146,7 +146,7 @@ def test_the_density_of_a_cloud_has_the_moments_of_what_it_was_drawn_from():
 def test_constants_of_particles_that_descend_from_one_stay_uncertain():
     """Their spread has gone below what numbers can tell apart; a later state must still be compared with them."""
     rng = np.random.default_rng(0)
-    cloud = Cloud(0.1 * rng.standard_normal((50, 3)), np.tile((0.02, -0.2), (50, 1)), np.full(50, -np.log(50.0)))
+    cloud = Cloud(0.1 * rng.standard_normal((50, 3)), np.tile((0.02, 0.0), (50, 1)), np.full(50, -np.log(50.0)))
     shrunk, kernel = cloud.density()
     np.linalg.cholesky(kernel)
     np.testing.assert_allclose(shrunk.constants, cloud.constants, atol=1e-12)
