@@ -33,7 +33,7 @@ def planned(tmp_path):
 
 
 def test_a_run_that_takes_too_long_or_too_much_memory_fails_and_the_others_go_on(planned, tmp_path):
-    runs = planned([LONG], [HUGE]) + planned([SHORT], ["ekf"])
+    runs = planned([LONG], [HUGE]) + planned([SHORT], ["dead_reckoning"])
     store = Store(tmp_path / "out")
     outcomes = list(execute(runs, tmp_path / "out", jobs=1, limits=Limits(memory=450.0)))
     assert [o.status for o in outcomes] == ["failed", "ok"]
