@@ -43,7 +43,7 @@ class Batch(GraphEstimator):
         if not any(mapper.estimates for mapper in graph.mappers):
             return Guessing(graph, self._settings.widest_loss)
         ahead = SmootherSettings(**self._settings.model_dump(exclude={"widest_loss"}))
-        return Ahead(graph, Incremental(graph, ahead), self._settings.widest_loss)
+        return Ahead(graph, ahead, self._settings.widest_loss)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
@@ -69,22 +69,16 @@ def graduated(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]
     return np.array([best.values[k.key] for k in graph.keyframes]), covariances
 
 
-class Ahead:
+class Ahead(Incremental):
     """A backend that is solved on the way, and once more at the end."""
 
-    def __init__(self, graph: Graph, solver: Incremental, widest: float) -> None:
-        self._solver, self._widest = solver, widest
-        self.begin, self.extend, self.attach = solver.begin, solver.extend, solver.attach
-        self.refine, self.guess_of, self.current, self.is_open = (
-            solver.refine,
-            solver.guess_of,
-            solver.current,
-            solver.is_open,
-        )
+    def __init__(self, graph: Graph, settings: SmootherSettings, widest: float) -> None:
+        super().__init__(graph, settings)
+        self._widest = widest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """The optimum over the whole log."""
-        return graduated(graph, self._solver.solved(graph), self._widest)
+        return graduated(graph, self.solved(graph), self._widest)
 
 
 class Guessing:

@@ -67,11 +67,6 @@ class Search:
         """Whether anything that may be seen tells a place."""
         return bool(self._finders) or self._bounds is not None
 
-    @property
-    def weighs(self) -> bool:
-        """Whether places are compared by what all sensors see."""
-        return self._bounds is not None
-
     def remember(self) -> None:
         """Keep the odometry that a search on the way needs."""
         self._motion.keep(2.0 * DURATION)
@@ -156,7 +151,7 @@ class Search:
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
         """An observation was applied to a track, under which ``evidence`` tells the log of its probability."""
-        seen = None if self._population is None and self._bounds is None else observation.at_its_time()
+        seen = observation.at_its_time() if self._bounds is not None else None
         if seen is None or not self._is_due(sensor, odometry.t):
             return
         self._kept.append(Kept(odometry, seen, evidence()))
@@ -183,16 +178,15 @@ class Search:
     def _refuted_by_all(
         self, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
     ) -> Refuted | None:
-        doubting = [s for s in self._sensors.values() if s.suspicious_since is not None]
+        doubting = {s: since for s in self._sensors.values() if (since := s.suspicious_since) is not None}
         if not doubting or self._bounds is None:
             self._population = None
             return None
-        since = min(float(s.suspicious_since or 0.0) for s in doubting)
         if self._population is None:
-            self._population, self._since = self._new_population(None), since
+            self._population, self._since = self._new_population(None), min(doubting.values())
             assert self._population is not None
             for row in self._kept:
-                if row.odometry.t >= since:
+                if row.odometry.t >= self._since:
                     self._population.add(row.odometry, row.observation)
         best = self._population.best
         if best is None:
@@ -205,7 +199,7 @@ class Search:
         track = sum(row.evidence for row in self._kept if row.odometry.t >= self._since)
         if self._population.log_evidence - track <= REFUTING:
             return None
-        return Refuted(doubting[0].lost, self._change(best, pose_at))
+        return Refuted(next(iter(doubting)).lost, self._change(best, pose_at))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> float:
         """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track."""

@@ -69,9 +69,9 @@ class LandmarkObservation(ResidualObservation):
 
     def at_its_time(self) -> Self | None:
         """Those of the map at the time that they were seen."""
-        factor = self.measured
-        if factor.free or self.blocks:
+        if self.blocks:
             return None
+        factor = self.measured
         return replace(
             self, terms=(replace(self.terms[0], factor=replace(factor, offset=None, offset_covariance=None)),)
         )
@@ -100,9 +100,8 @@ class LandmarkSensor(Sensor):
         setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
         self.constants, self._motion = constants, motion
         self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices, carries=True)
-        self._sought = KnownLandmarks(
-            setup, Diagnostics()
-        )  # what is seen before the start is counted when it is taken in
+        # what is seen before the start is counted when it is used there
+        self._sought = KnownLandmarks(setup, Diagnostics())
         self._shared = (self.modality,) if constants.names else ()
         self._new: NewLandmarks[tuple[float, LandmarkObservation]] = NewLandmarks()
         self._before: deque[tuple[float, NewLandmarks[tuple[float, LandmarkObservation]]]] = deque()
@@ -159,6 +158,10 @@ class LandmarkSensor(Sensor):
     @property
     def suspicious_since(self) -> float | None:
         return None if self._finder is None else self._finder.suspicious_since
+
+    def accept(self) -> None:
+        if self._finder is not None:
+            self._finder.clear()
 
     def evidence(self, m: BearingRange) -> LandmarkObservation | None:
         seen = self._sought.factor(m)
