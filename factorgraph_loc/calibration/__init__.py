@@ -1,1 +1,1 @@
-"""What is learnt from logs: here the constants and the noise of a robot's sensors, from runs with a reference."""
+"""Calibration of a robot's sensors (constants and noise) from logs with a reference trajectory."""

@@ -1,4 +1,4 @@
-"""A complete rig from logs with reference poses: learn, make consistent, keep what pays, cross-validate."""
+"""Calibration of a complete rig: learn, make consistent, select by cross-validation."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +18,18 @@ from factorgraph_loc.sensors.calibrating import Calibrator, State, Told
 from factorgraph_loc.sensors.registry import channels, moving
 
 Scores = Mapping[str, Any]
-STEPS = 6  # that are told of progress
+STEPS = 6  # steps of which progress is reported
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What came out.
+    """Result of a calibration.
 
-    ``judgements``: what an estimator says of each learnt parameter; ``accepted``: what the rig has of it. ``knowledge``: what is
-    learnt with those constants that it accepts. ``consistency``: of the noise of sensors, by their names: of landmarks with the
-    EKF, of the tempering of RFID with the smoother, with rigs learnt from the other logs where there are any. ``before`` and
-    ``after``: scores on each log with the input rig and the new one; ``held_out``: with a rig learnt from the other logs, but
-    for the factor on the noise; empty where there are none. ``doubts``: one line each.
+    ``judgements``: the estimator's verdict on each learnt parameter; ``accepted``: those that the rig contains. ``knowledge``:
+    what was learnt, with the accepted constants only. ``consistency``: of each sensor's noise, by sensor (landmarks with the
+    EKF, the tempering of RFID with the smoother), from rigs learnt from the other logs where there are any. ``before`` and
+    ``after``: scores on each log with the input rig and the new rig; ``held_out``: with a rig learnt from the other logs,
+    except for the factor on the noise; empty for a single log. ``doubts``: warnings, one line each.
     """
 
     logs: tuple[str, ...]
@@ -45,11 +45,11 @@ class Calibration:
     doubts: tuple[str, ...]
 
     def judgement(self, name: str) -> Judgement | None:
-        """That of a parameter, by its name with the section's."""
+        """The judgement of a parameter, named ``section.parameter``; None if it was not judged."""
         return next((one for one in self.judgements if name in one.names), None)
 
     def told(self) -> Iterator[tuple[Calibrator, Told]]:
-        """What is told of each sensor."""
+        """The results of each sensor, for the report."""
         for name, calibrator in calibrators().items():
             found, details = (part.get(name) for part in (self.knowledge.found, self.knowledge.details))
             consistency = self.consistency.get(name)
@@ -65,13 +65,13 @@ def calibrate(
     *,
     grids: Path | None = None,
 ) -> Calibration:
-    """The rig that ``logs`` tell; what they do not tell, and what does not pay, is taken from ``rig``, else from that of the first
-    log.
+    """Calibrate a rig from ``logs``. Values that the logs do not determine, or that do not improve the estimator, come from
+    ``rig``, by default that of the first log.
 
-    ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and scores it. ``progress`` is given the steps done
-    and all steps. ``grids``: path and beginning of the names of learnt grids, in a folder that lasts; for logs with reads of tags.
-    Raises InputError if a log lacks a reference, odometry, or sightings and reads, is too short, or is of another type than the
-    rest.
+    ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and returns its scores. ``progress`` is called
+    with the number of steps done and of all steps. ``grids``: path prefix of the files of learnt detection grids; needed for
+    logs with tag reads. Raises InputError if a log lacks a reference, odometry, or exteroceptive measurements, is too short, or
+    differs in kind from the others.
     """
     check(logs)
     report = progress or (lambda _done, _total: None)
@@ -107,7 +107,7 @@ def calibrate(
 
 
 class _Search:
-    """What all logs tell, what each fold of them tells, and which of it an estimator accepts."""
+    """What is learnt from all logs and from each fold, and which parameters the estimator accepts."""
 
     def __init__(self, logs: Sequence[Log], start: Rig, evaluate: Evaluate, grids: Path | None) -> None:
         self.logs, self.start, self._evaluate = logs, start, evaluate
@@ -122,21 +122,23 @@ class _Search:
 
     @property
     def knowledge(self) -> Knowledge:
-        """What all logs tell with the constants that are accepted."""
+        """What is learnt from all logs with the accepted constants."""
         assert self.everyone.knowledge is not None
         return self.everyone.knowledge
 
     @property
     def judges(self) -> bool:
-        """Whether any fold could be learnt from: else nothing can be judged."""
+        """Whether any fold could be learnt from, as is needed to judge parameters."""
         return any(
             one.knowledge is not None and fold.tests for one, fold in zip(self.bench.learners, self._folds, strict=True)
         )
 
     def make_consistent(self, names: Collection[str] | None = None) -> None:
-        """Each sensor, or those of ``names``, with honest noise, by runs without the others. That of one whose models have many
-        parameters is honest only on logs that these were not fitted to: with rigs that had no part of a log, if there are any.
-        What is found holds for all folds: a search in each would take longer than all the rest."""
+        """Adjust the noise of each sensor, or of ``names``, for consistency, in runs without the other sensors.
+
+        Where a sensor's models have many parameters, this uses rigs that were learnt without the log they are run on, if there
+        are any. The result is used for all folds, since a search in each would dominate the run time.
+        """
         for name, found in self.knowledge.found.items():
             if calibrators()[name].is_consistent and (names is None or name in names):
                 self.consistent[name] = self._made_consistent(name, found)
@@ -167,10 +169,10 @@ class _Search:
         )
 
     def choose(self) -> State:
-        """The parameters that pay."""
+        """Select the parameters that improve the estimator."""
         bench = self.bench
         constants, dependents = constants_of(self.learnt, self.start), dependents_of(self.learnt, self.start)
-        # without them a sensor that the input rig does not know cannot be used at all
+        # a sensor that the input rig lacks cannot be used without them
         needed = [one for one in calibrators().values() if getattr(self.start, one.section) is None]
         forced = frozenset({unit for one in needed for unit in one.noise} & {*dependents})
         dependents = [unit for unit in dependents if unit not in forced]
@@ -189,7 +191,7 @@ class _Search:
         for unit in dependents:
             state = bench.tried(state, unit)
         if not bench.better(state, forced):
-            # together they are no better than the input rig: some of them may be
+            # together they do not improve the input rig, but some of them may
             left, state = state - forced, forced
             for unit in [*constants, *dependents]:
                 if unit in left:
@@ -199,7 +201,7 @@ class _Search:
         return state
 
     def unseen(self, state: State) -> dict[str, Rig]:
-        """For each log the rig that other logs tell; empty if there are none."""
+        """For each log, the rig learnt from the other logs; empty for a single log."""
         return {log.name: learner.rig(state) for log, learner in self._learners_of_others()}
 
     def _learners_of_others(self) -> list[tuple[Log, Learner]]:
@@ -210,7 +212,7 @@ class _Search:
         return [(log, learners[part]) for log, part in zip(self.logs, parts, strict=True)]
 
     def _honest(self, rig: Rig) -> Rig:
-        """A rig with the noise that was found."""
+        """``rig`` with the adjusted noise."""
         for name, found in self.consistent.items():
             factor = None if found.trial is None else found.trial.factor
             rig = calibrators()[name].honest(rig, factor, found.rig, self.learnt.rig)
@@ -218,7 +220,7 @@ class _Search:
 
 
 def _folder(grids: Path | None, fold: int) -> Path | None:
-    """The place of the grids of a fold."""
+    """The path prefix of a fold's grids."""
     if grids is None:
         return None
     folder = grids.parent / f"{grids.name}.fold{fold}"
@@ -227,7 +229,7 @@ def _folder(grids: Path | None, fold: int) -> Path | None:
 
 
 def _judged(knowledge: Knowledge, learnt: Knowledge, judgements: Sequence[Judgement]) -> Knowledge:
-    """``knowledge`` of what is accepted, with all constants that were ``learnt`` and what became of them."""
+    """``knowledge`` of what is accepted, listing all constants that were ``learnt`` with the verdict on each."""
     found = {name: one for one in judgements for name in one.names}
     settled = {(c.sensor, c.name): c for c in knowledge.constants}
     constants = []
@@ -244,18 +246,18 @@ def _judged(knowledge: Knowledge, learnt: Knowledge, judgements: Sequence[Judgem
 
 
 def _is_complete(rig: Rig) -> bool:
-    """Whether a rig has what its sensors need, learnt or stated."""
+    """Whether a rig has all settings that its sensors need."""
     return all(one.is_complete(rig) for one in calibrators().values())
 
 
 def estimator_for(rig: Rig) -> str:
-    """The estimator that judges what is learnt of the sensors of a rig."""
+    """The name of the estimator that judges what is learnt for a rig."""
     named = [one.estimator for one in calibrators().values() if one.estimator and one.channel in rig.sensors]
     return named[0] if named else "ekf"
 
 
 def check(logs: Sequence[Log]) -> None:
-    """InputError if these logs cannot be calibrated together."""
+    """Raise InputError if these logs cannot be calibrated together."""
     if not logs:
         raise InputError("there is no log to calibrate from")
     for log in logs:
@@ -286,7 +288,9 @@ def _check_alike(first: Log, log: Log) -> None:
     for calibrator in calibrators().values():
         calibrator.check_alike(first, log)
     if has_heading(log) != has_heading(first):
-        raise InputError(f"{log.name} and {first.name}: only one has headings in its reference; calibrate them apart")
+        raise InputError(
+            f"{log.name} and {first.name}: only one has headings in its reference; calibrate them separately"
+        )
 
 
 def _has(log: Log, sensor: str) -> bool:
@@ -298,18 +302,16 @@ def _scores(logs: Sequence[Log], rig: Rig, evaluate: Evaluate) -> tuple[Scores, 
 
 
 def _doubts(knowledge: Knowledge, search: _Search, found: State) -> tuple[str, ...]:
-    """What the reader of the report should look at."""
+    """Warnings for the reader of the report."""
     doubts = list(knowledge.notes)
     if not search.judges:
-        doubts.append(
-            "The logs are too short to judge what was learnt on parts that had no part in it: nothing is changed."
-        )
+        doubts.append("The logs are too short to hold out parts for judging what was learnt: nothing is changed.")
     for name, calibrator in calibrators().items():
         one = search.consistent.get(name)
         if one is not None and found.intersection(calibrator.noise + calibrator.models):
             if one.trial is None:
                 doubts.append(
-                    "No log has enough poses of a reference to score: the noise in the rig is the mere scatter."
+                    "No log has enough poses of a reference to score: the noise in the rig is the scatter of the residuals."
                 )
             elif not one.reached:
                 doubts.append(

@@ -1,7 +1,7 @@
-"""The noise that makes an estimator honest: its stated covariance equal to its error.
+"""Measurement noise for which an estimator is consistent: its stated covariance equals its mean squared error.
 
-Errors of neighbouring sightings are nearly the same, while estimators take them as independent: with their mere scatter as noise
-an estimator is far too sure. One factor on the sigmas of range and bearing makes up for that.
+Errors of consecutive sightings are correlated, whereas estimators assume them independent. With the scatter of the residuals as
+noise an estimator is therefore overconfident. One factor on the standard deviations of range and bearing compensates for that.
 """
 
 import math
@@ -15,19 +15,20 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 
 Evaluate = Callable[[Log], Mapping[str, Any]]
-"""Runs an estimator on a log, with the log's rig, and gives the scores of :func:`factorgraph_loc.evaluation.metrics.score`."""
+"""Runs an estimator on a log, with the log's rig, and returns the scores of :func:`factorgraph_loc.evaluation.metrics.score`.
+"""
 
-FACTORS = (0.5, 30.0)  # between these the factor is sought
+FACTORS = (0.5, 30.0)  # bounds of the factor
 TOLERANCE = 0.08  # of the logarithm of ANEES
 TRIALS = 6
-MAX_FINAL = 1.5  # times the ideal: beyond it the final ANEES has its say too
-MIN_SCORED = 100  # poses below which a score says nothing
-_SLOPE = -1.2  # of log ANEES by log factor, where only one trial is known
+MAX_FINAL = 1.5  # times the ideal; above it the final ANEES counts too
+MIN_SCORED = 100  # poses needed for a meaningful score
+_SLOPE = -1.2  # of log ANEES over log factor, assumed after a single trial
 
 
 @dataclass(frozen=True)
 class Trial:
-    """ANEES over its ideal value, causal and final, means over logs; and the scores of each log."""
+    """Causal and final ANEES over its ideal value, means over logs, and the scores of each log."""
 
     factor: float
     causal: float
@@ -37,10 +38,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The rig with effective noise, the trial with it, and ``reached``: whether ANEES is ideal within the tolerance, or below it
-    with the least factor.
+    """The rig with adjusted noise, the trial with it, and ``reached``: whether ANEES is ideal within the tolerance, or below it
+    at the least factor.
 
-    ``trial`` is None where no log can be scored: then the rig's noise is the scatter.
+    ``trial`` is None where no log can be scored; the noise is then the scatter of the residuals.
     """
 
     rig: Rig
@@ -59,11 +60,11 @@ def make_consistent(
     change: Change,
     least: float = FACTORS[0],
 ) -> Consistency:
-    """The factor for which the estimator's ANEES is ideal on ``logs``; ``guess``: where the search begins, ``least``: its end,
-    where an estimator may be more careful than it needs to be.
+    """Find the factor on a sensor's noise for which the estimator's ANEES on ``logs`` is ideal.
 
-    ``change``: the rig with the standard deviations of a sensor multiplied by a factor. First the factor is made right for the
-    causal estimates. Where the final ones are then too sure, for the geometric mean of both.
+    ``guess``: the first factor tried; ``least``: lower bound, at which the estimator may remain conservative; ``change``:
+    returns the rig with the sensor's standard deviations multiplied by a factor. The criterion is the causal ANEES; if the
+    final estimates are then overconfident, the geometric mean of both.
     """
     trials: list[Trial] = []
 
@@ -89,7 +90,7 @@ def _both(trial: Trial) -> float:
 
 
 def _solve(at: Callable[[float], Trial], trials: list[Trial], excess: Callable[[Trial], float], least: float) -> Trial:
-    """The trial whose ``excess``, which falls with the factor, is nearest to zero: by secants of logarithms."""
+    """The trial whose ``excess``, decreasing in the factor, is nearest to zero, by the secant method in logarithms."""
     low, high = math.log(least), math.log(FACTORS[1])
     for _ in range(TRIALS):
         nearest = sorted(trials, key=lambda t: abs(excess(t)))[:2]
@@ -114,7 +115,7 @@ def _trial(factor: float, scores: Sequence[Mapping[str, Any]], logs: Sequence[Lo
 
 
 def relative_anees(scores: Sequence[Mapping[str, Any]], logs: Sequence[Log], kind: str) -> float:
-    """ANEES over its ideal value, 3 or 2 without the reference's heading: mean over the logs that can be scored, else NaN."""
+    """ANEES over its ideal value (3, or 2 without the reference's heading), mean over the logs that can be scored, else NaN."""
     found = [
         s[f"{kind}.anees"] / (3.0 if log.reference is not None and log.reference.has_heading else 2.0)
         for s, log in zip(scores, logs, strict=True)

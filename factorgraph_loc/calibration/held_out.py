@@ -1,4 +1,4 @@
-"""Stretches of logs on which an estimator judges what was learnt from the rest."""
+"""Held-out stretches of logs, on which an estimator judges what was learnt from the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +13,15 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.calibrating import Calibrator
 from factorgraph_loc.sensors.odometry.calibration.windows import odometry_of
 
-QUARTERS = 4  # that a log has
-WARM_UP = 2.0  # s of odometry before a stretch: commands act late
-LONGEST = 75.0  # s of a stretch that an estimator runs on, from its middle: longer logs do not take longer
-FEWEST_POSES = 20  # of the reference in a stretch
+QUARTERS = 4  # stretches that a log is divided into
+WARM_UP = 2.0  # s of odometry before a stretch, for the delay of commands
+LONGEST = 75.0  # s, the longest stretch that is run, about the middle of a held-out part
+FEWEST_POSES = 20  # poses of the reference that a stretch needs
 
 
 @dataclass(frozen=True)
 class Fold:
-    """``train``: what is learnt from, ``tests``: stretches that have no part in it. ``part``: of which recording these are."""
+    """A split of the logs: ``train`` to learn from, ``tests`` held out; ``part``: the recordings that ``tests`` belong to."""
 
     part: int
     train: tuple[Log, ...]
@@ -29,7 +29,7 @@ class Fold:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """The number of what each log recorded: of logs that hold the same measurements one is no test of the other."""
+    """The number of the recording behind each log: logs with the same measurements are not independent."""
     found = [one.recordings(logs) for one in _sensing(logs)]
     return next((numbers for numbers in found if len(set(numbers)) < len(logs)), list(range(len(logs))))
 
@@ -39,8 +39,9 @@ def _sensing(logs: Sequence[Log]) -> list[Calibrator]:
 
 
 def folds_of(logs: Sequence[Log]) -> tuple[Fold, ...]:
-    """Each recording is judged with what the others tell. Of a single one each quarter with what the other quarters tell, or fewer
-    and larger parts, in several stretches, where a sensor's models take long to fit."""
+    """Folds over the recordings. A single recording is split in quarters, or in fewer and larger parts of several stretches
+    each where a sensor's models take long to fit.
+    """
     parts = recordings(logs)
     if len(set(parts)) > 1:
         out = []
@@ -62,14 +63,14 @@ def folds_of(logs: Sequence[Log]) -> tuple[Fold, ...]:
 
 
 def _bounds(log: Log) -> tuple[float, float]:
-    """From when to when the log has both odometry and reference [s]."""
+    """The interval [s] in which the log has both odometry and reference."""
     assert log.reference is not None
     t = odometry_of(log).t + log.rig.time_offset("odometry")
     return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
 
 
 def _silenced(log: Log, begin: float, end: float) -> Log:
-    """The log without the reference between two shares of its time: nothing is learnt there."""
+    """The log without its reference between two fractions of its duration."""
     assert log.reference is not None
     first, last = _bounds(log)
     share = (log.reference.t - first) / max(last - first, 1e-9)
@@ -83,7 +84,7 @@ def _kept(reference: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
 
 
 def _stretches(log: Log, begin: float, end: float, count: int) -> list[Log]:
-    """``count`` stretches of a log between two shares of its time; those without reference or measurements are left out."""
+    """``count`` stretches of a log between two fractions of its duration, without those that lack reference or measurements."""
     first, last = _bounds(log)
     edges = first + (last - first) * np.linspace(begin, end, count + 1)
     out = []
@@ -91,7 +92,7 @@ def _stretches(log: Log, begin: float, end: float, count: int) -> list[Log]:
         margin = max(0.0, 0.5 * (b - a - LONGEST))
         try:
             part = cut(log, a + margin - WARM_UP, b - margin)
-        except InputError:  # nothing was measured there
+        except InputError:  # no measurements there
             continue
         reference = part.reference
         if reference is None or not len(odometry_of(part).t):

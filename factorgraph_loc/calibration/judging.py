@@ -1,9 +1,9 @@
-"""Whether an estimator is better with a parameter, by its errors and its consistency together.
+"""Comparison of an estimator with and without a parameter, by accuracy and consistency together.
 
-The mean negative logarithmic score (Gneiting, Raftery, "Strictly proper scoring rules, prediction, and estimation", 2007) of
-Gaussian estimates with mean squared errors S and mean NEES A, of d degrees of freedom, is log sqrt(det S) and, as their covariances
-are wrong by the factor A / d, (A - d - d log(A / d)) / 2 besides: the divergence of Kullback and Leibler of what is stated from the
-errors, 0 where the estimator is consistent.
+The score is the mean negative log score (Gneiting, Raftery, "Strictly proper scoring rules, prediction, and estimation", 2007)
+of Gaussian estimates with mean squared errors S and mean NEES A of d degrees of freedom: log sqrt(det S), plus (A - d - d log(A
+/ d)) / 2 for covariances that are wrong by the factor A / d. The latter is the Kullback-Leibler divergence of the stated
+distribution from the errors, 0 for a consistent estimator.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
-WORSE = 1.02  # times the error without a parameter, beyond which it is refused whatever it does for the consistency
-LEAST = 0.005  # nats a pose that a parameter has to gain
+WORSE = 1.02  # relative increase of the error beyond which a parameter is refused, whatever the consistency
+LEAST = 0.005  # nats per pose that a parameter has to gain
 SMALLEST = 1e-8  # mean squared error [m^2, rad^2]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an estimator did on S stretches. ``squared`` (S, 2, 3): of its causal and its final poses the mean squared position
-    error [m^2] and heading error [rad^2] and the mean NEES, NaN where there is none. ``scored``: (S, 2) poses. ``dof``: of the
-    NEES."""
+    """Results of an estimator on S stretches.
+
+    ``squared`` (S, 2, 3): mean squared position error [m^2], mean squared heading error [rad^2] and mean NEES of the causal and
+    final poses, NaN where missing. ``scored`` (S, 2): number of poses. ``dof``: degrees of freedom of the NEES.
+    """
 
     squared: Array
     scored: Array
@@ -35,7 +37,7 @@ class Outcome:
 
     @staticmethod
     def of(scores: Sequence[Mapping[str, Any] | None], dof: int) -> Outcome:
-        """From scores of :func:`factorgraph_loc.evaluation.metrics.score`, None where the run failed."""
+        """Build from scores of :func:`factorgraph_loc.evaluation.metrics.score`, None where the run failed."""
         squared, scored = np.full((len(scores), 2, 3), np.nan), np.zeros((len(scores), 2))
         for row, found in enumerate(scores):
             for k, kind in enumerate(KINDS):
@@ -54,11 +56,11 @@ class Outcome:
 
     @property
     def lost(self) -> NDArray[np.bool_]:
-        """Stretches (S,) on which nothing was scored."""
+        """The stretches (S,) without any scored pose."""
         return np.asarray(~np.isfinite(self.squared[:, :, 0]).all(axis=1))
 
     def figures(self, rows: NDArray[np.bool_]) -> Array:
-        """Means (2, 3) over the poses of some stretches: causal and final; position RMSE [m], heading RMSE [rad], NEES."""
+        """Position RMSE [m], heading RMSE [rad] and NEES (2, 3) over the poses of the stretches ``rows``, causal and final."""
         values, weights = self.squared[rows], np.broadcast_to(self.scored[rows][..., None], self.squared[rows].shape)
         there = np.isfinite(values)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -66,7 +68,7 @@ class Outcome:
         return np.column_stack((np.sqrt(means[:, :2]), means[:, 2]))
 
     def loss(self, rows: NDArray[np.bool_]) -> float:
-        """The score of some stretches, the mean of causal and final poses [nats a pose]: the lower, the better."""
+        """The score of the stretches ``rows``, mean of causal and final poses [nats per pose]; lower is better."""
         position, heading, nees = self.figures(rows).T
         error = np.log(np.maximum(position**2, SMALLEST))
         if self.dof == 3:
@@ -78,10 +80,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A parameter, or some that belong together, and what an estimator does with and without what was learnt of it.
+    """Comparison of an estimator with and without a learnt parameter, or several that belong together.
 
-    ``names``: of the parameters; ``gain`` in score [nats a pose] with its standard ``error``; ``new`` and ``old`` (2, 3): see
-    :meth:`Outcome.figures`, on stretches that had no part in what was learnt.
+    ``names``: the parameters; ``gain`` in score [nats per pose] with its standard ``error``; ``new`` and ``old`` (2, 3): see
+    :meth:`Outcome.figures`, on held-out stretches.
     """
 
     names: tuple[str, ...]
@@ -93,17 +95,18 @@ class Judgement:
 
     @property
     def why(self) -> str:
-        """In a few words."""
+        """The reason in a few words."""
         if self.accepted:
-            return "accepted: the estimator is better with it where it was not learnt"
+            return "accepted: it improves the estimator on held-out data"
         if _growth(self.new, self.old) > WORSE:
-            return "refused: the estimator's error is larger with it where it was not learnt"
-        return "refused: the estimator is no better with it where it was not learnt"
+            return "refused: it increases the error on held-out data"
+        return "refused: it does not improve the estimator on held-out data"
 
 
 def judged(names: tuple[str, ...], new: Outcome, old: Outcome) -> Judgement:
-    """Whether ``new`` is better than ``old``: the score gains more than chance would, by the jackknife over the stretches, and the
-    error does not grow by more than a fiftieth. One who fails on more stretches than the other is worse."""
+    """Whether ``new`` is better than ``old``: the score improves significantly (jackknife over the stretches) and the error
+    does not grow by more than 2 %. The one that fails on more stretches is worse.
+    """
     rows = ~(new.lost | old.lost)
     figures = new.figures(rows), old.figures(rows)
     if new.lost.sum() != old.lost.sum():
@@ -123,8 +126,9 @@ def judged(names: tuple[str, ...], new: Outcome, old: Outcome) -> Judgement:
 
 
 def _growth(new: Array, old: Array) -> float:
-    """By what factor the error grows: that in position, or the geometric mean over position's two directions and the heading,
-    causal or final, whichever grows most."""
+    """The factor by which the error grows: in position, or the geometric mean over two position coordinates and heading; the
+    largest of causal and final.
+    """
     position, heading = (new / old)[:, :2].T
     together = np.cbrt(position**2 * np.where(np.isfinite(heading), heading, position))
     return float(np.max((position, together)))

@@ -15,9 +15,12 @@ from factorgraph_loc.sensors.registry import functions
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What the logs say. ``rig`` has the scatter as noise; ``notes``: what could not be learnt, one line each. ``found``: what the
-    calibrators of sensors found, by the sensors' names, from which their constants are chosen; ``details``: what is learnt for
-    these, such as the noise of the odometry."""
+    """What is learnt from logs.
+
+    ``rig``: with the scatter of the residuals as noise; ``notes``: what could not be learnt, one line each. ``found``: results
+    of the sensors' calibrators, by sensor, from which the constants are selected; ``details``: what is learnt given these, such
+    as the noise of the odometry.
+    """
 
     rig: Rig
     constants: tuple[Learnt, ...]
@@ -28,12 +31,12 @@ class Knowledge:
 
 @cache
 def calibrators() -> Mapping[str, Calibrator]:
-    """Those of all sensors that have one, by name."""
+    """The calibrators of all sensors that have one, by name."""
     return dict(functions("calibrator"))
 
 
 def senses() -> tuple[str, ...]:
-    """The channels that a robot knows its place by, among those that can be calibrated."""
+    """The exteroceptive channels that can be calibrated."""
     return tuple(one.channel for one in calibrators().values() if one.senses)
 
 
@@ -45,10 +48,10 @@ def learn(
     *,
     by_log: bool = True,
 ) -> Knowledge:
-    """The rig that ``logs`` tell, starting from ``rig``, whose values stay where a log cannot tell them better.
+    """Learn a rig from ``logs``, starting from ``rig``, whose values stay where the logs do not determine better ones.
 
-    ``grids``: path and beginning of the names of files that are written, of logs with reads of tags; ``like``: what all logs tell,
-    if these are some of them. ``by_log``: see :func:`settled`. Raises InputError if a log is too short.
+    ``grids``: path prefix of the files written for logs with tag reads; ``like``: the result from all logs, if ``logs`` is a
+    part of them. ``by_log``: see :func:`settled`. Raises InputError if a log is too short.
     """
     logs = [replace(log, rig=rig) for log in logs]
     found = {}
@@ -67,11 +70,11 @@ def settled(
     *,
     by_log: bool = True,
 ) -> Knowledge:
-    """What is learnt with those constants alone that are worth it and ``accepted``, by their names with the section's; None: all
-    that are worth it.
+    """What is learnt with those constants that improve the prediction of held-out data and are in ``accepted`` (names
+    ``section.parameter``; None: all).
 
-    What depends on the constants, noise, scatter and uncertainty, is learnt for these. ``rig``: that with which ``logs`` came.
-    Unless ``by_log``, no log is looked at alone: then there are neither uncertainties nor correlations.
+    Noise, scatter and uncertainty are learnt given these constants. ``rig``: the rig of ``logs``. With ``by_log`` False, logs
+    are not fitted individually, and there are neither uncertainties nor correlations.
     """
     logs = [replace(log, rig=rig) for log in logs]
     parts = {
@@ -81,11 +84,11 @@ def settled(
     notes = [note for part in parts.values() for note in part.notes]
     if not has_heading(logs[0]):
         notes.insert(
-            0, "The reference has no headings: of the constants only the range scale is learnt, the odometry stays."
+            0, "The reference has no headings: only the range scale is learnt, the constants of the odometry stay."
         )
     if len(logs) == 1:
         notes.append(
-            "One log cannot tell what differs between runs: the uncertainties of constants are those of the input rig."
+            "Differences between runs cannot be learnt from one log: the uncertainties of constants are those of the input rig."
         )
     learnt = tuple(one for part in parts.values() for one in part.constants)
     out = rig.model_copy(update={name: settings for part in parts.values() for name, settings in part.sections.items()})
@@ -99,14 +102,14 @@ def settled(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """The rig with all exteroceptive sensors of the log, and none that the log lacks, among those that are used."""
+    """``rig`` with exactly the exteroceptive sensors that the log has, among those that are used."""
     kept = [name for name in rig.sensors if name not in senses() or name in log.streams]
     added = [name for name in senses() if name in log.streams and name not in kept]
     return rig.model_copy(update={"sensors": (*kept, *added)})
 
 
 def _uncertainties(rig: Rig, learnt: Sequence[Learnt]) -> Rig:
-    """The rig with what differs between logs, where there are several."""
+    """``rig`` with the standard deviations of constants between logs, where there are several."""
     sections: dict[str, object] = {}
     for calibrator in calibrators().values():
         settings, most = getattr(rig, calibrator.section), calibrator.uncertain
@@ -123,5 +126,5 @@ def _uncertainties(rig: Rig, learnt: Sequence[Learnt]) -> Rig:
 
 
 def has_heading(log: Log) -> bool:
-    """Whether the log's reference has headings that mean something."""
+    """Whether the log's reference has meaningful headings."""
     return log.reference is not None and log.reference.has_heading

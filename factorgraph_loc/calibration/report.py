@@ -1,4 +1,4 @@
-"""The report of a calibration: one HTML page that needs no other file, and the same as a document for programs."""
+"""The report of a calibration, as a self-contained HTML page and as a document for programs."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ th:first-child,td:last-child{text-align:left}tbody th{font-weight:normal}.wide{o
 
 
 def constants_table(constants: Sequence[Learnt]) -> Rows:
-    """Each constant before and after, and how well it is known."""
+    """The constants before and after, with standard errors."""
     header = ("constant", "input rig", "fitted", "standard error", "in the rig")
     rows: list[tuple[str, ...]] = [
         (_label(c), number(c.before), number(c.fitted), number(c.error), number(c.value) if c.kept else "as before")
@@ -29,7 +29,7 @@ def constants_table(constants: Sequence[Learnt]) -> Rows:
 
 
 def judgements_table(calibration: Calibration) -> Rows:
-    """What the estimator says of each learnt parameter, on stretches that had no part in what was learnt: with it and without."""
+    """The verdict on each learnt parameter, with results on held-out stretches with and without it."""
     figures_of = (f"{how} {name}" for name in FIGURES for how in ("new", "old"))
     header = ("parameter", "judged", "gain", "standard error", *figures_of)
     rows: list[tuple[str, ...]] = []
@@ -42,7 +42,7 @@ def judgements_table(calibration: Calibration) -> Rows:
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """The EKF on each log with the input rig, the new one, and one learnt from the other logs."""
+    """Accuracy on each log with the input rig, the new rig, and a rig learnt from the other logs."""
     header = ("log", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rigs: list[tuple[str, tuple[Scores, ...]]] = [("input", calibration.before), ("calibrated", calibration.after)]
     if calibration.held_out:
@@ -58,12 +58,12 @@ def accuracy_table(calibration: Calibration) -> Rows:
 
 
 def sensor_tables(calibration: Calibration) -> list[Rows]:
-    """What else sensors tell, such as survey, mounting and models of detection."""
+    """The tables of the sensors, such as survey, mounting and detection models."""
     return [table for calibrator, told in calibration.told() for table in calibrator.tables(told)]
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
-    """Everything of the report as plain values."""
+    """The report as plain values."""
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
 
     def scores(found: Sequence[Scores]) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
 
 
 def _parameters(names: Sequence[str]) -> str:
-    """Names of one section, which is said once."""
+    """Names of parameters of one section, with the section named once."""
     section = names[0].partition(".")[0]
     return f"{section}." + ", ".join(name.removeprefix(f"{section}.") for name in names)
 
@@ -118,16 +118,16 @@ def _figures(values: Array) -> dict[str, float]:
 
 
 def page(calibration: Calibration) -> str:
-    """The report as one HTML page, with its plots inside."""
+    """The report as one HTML page with embedded plots."""
     parts = [
         f"<h1>Calibration of {text(calibration.rig.name)}</h1>",
         f"<p>From {text(', '.join(calibration.logs))}. {text(_verdict(calibration))}</p>",
         *(f'<p class="doubt">{text(doubt)}</p>' for doubt in calibration.doubts),
         "<h2>Constants</h2>",
-        "<p>A constant is kept if it predicts data better that it was not fitted to: "
+        "<p>A constant is kept if it improves the prediction of held-out data: "
         + ("the other logs" if len(calibration.logs) > 1 else "another fifth of the log")
-        + f", and if the {_estimator(calibration)} is better with it. Else the rig keeps the value of the input. "
-        + ("<i>Each log alone</i> says how much it differs between runs." if len(calibration.logs) > 1 else "")
+        + f", and if it improves the {_estimator(calibration)}. Otherwise the rig keeps the input value. "
+        + ("The fits to each log show how much it differs between runs." if len(calibration.logs) > 1 else "")
         + "</p>",
         table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
@@ -135,11 +135,11 @@ def page(calibration: Calibration) -> str:
         *(part for calibrator, told in calibration.told() for part in calibrator.told_section(told)),
         *_judgements(calibration),
         f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
-        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is too sure. "
+        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. "
         + (
-            "The rows <i>from the other logs</i> are the honest ones: of that rig, only the factor on the noise has seen the log."
+            "The rows <i>from the other logs</i> are cross-validated: only the factor on the noise has used the log."
             if calibration.held_out
-            else "With one log there is no cross-validation: try the rig on another log before you trust it."
+            else "With one log there is no cross-validation: test the rig on another log."
         )
         + "</p>",
         table(*accuracy_table(calibration)),
@@ -180,7 +180,7 @@ def _judgements(calibration: Calibration) -> list[str]:
         return []
     whose = "the other logs" if len(set(calibration.logs)) > 1 else "the other parts of the log"
     return [
-        "<h2>What pays</h2>",
+        "<h2>Selection</h2>",
         f"<p>The {_estimator(calibration)} ran on stretches with what {whose} tell of each parameter (new), and without (old). The "
         "rig has what makes its score, which holds errors and consistency, better by more nats a pose than chance would, and no "
         "error larger by more than 2 %. What is refused has the value of the input rig.</p>",

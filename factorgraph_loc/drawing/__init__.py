@@ -1,1 +1,1 @@
-"""The style of plots, and HTML."""
+"""The style of plots, and helpers for HTML pages."""

@@ -1,6 +1,6 @@
-"""The style of all plots.
+"""The common style of all plots.
 
-Colours: Okabe and Ito, "Color Universal Design", 2008, which colour-blind readers can tell apart.
+Colours: Okabe and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_STYLES = ("-", "--", ":", "-.")  # a second cue beside colour; also tells apart more estimators than there are colours
+_STYLES = ("-", "--", ":", "-.")  # a second cue beside colour
 _WIDTH, _DPI, _PAGE_DPI = 16.0, 100, 80
-_TITLE, _LINES = 80, 3  # characters and lines of a text at most
-_LABEL, _LEGEND = 60, 160  # characters of a label, and of a line of the legend
+_TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
+_LABEL, _LEGEND = 60, 160  # maximum length of a label, and of a line of the legend
 
 
 def empty(height: float, title: str = "") -> Figure:
     """A figure without axes, ``height`` in units of 100 px."""
-    # Figure without pyplot: no global state, no display, and matplotlib is loaded only where something is plotted
+    # Figure without pyplot: no global state, no display, and matplotlib is imported only when something is plotted
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
@@ -40,7 +40,7 @@ def empty(height: float, title: str = "") -> Figure:
 
 
 def grid(rows: int, columns: int, height: float, title: str = "") -> tuple[Figure, Any]:
-    """A figure and its axes (rows, columns)."""
+    """Return a figure and its axes (rows, columns)."""
     figure = empty(height, title)
     axes = figure.subplots(rows, columns, squeeze=False)
     dress(axes.flat)
@@ -48,7 +48,7 @@ def grid(rows: int, columns: int, height: float, title: str = "") -> tuple[Figur
 
 
 def dress(axes: Iterable[Axes]) -> None:
-    """The common look: a pale grid behind the data, and letters that can be read."""
+    """Apply the common look to ``axes``: a pale grid behind the data, and readable font sizes."""
     for axis in axes:
         axis.grid(color="0.9")
         axis.set_axisbelow(True)
@@ -59,7 +59,7 @@ def dress(axes: Iterable[Axes]) -> None:
 
 
 def styles() -> Iterator[dict[str, Any]]:
-    """Colour and line style of the first, second, ... estimator."""
+    """Yield the colour and line style of the first, second, ... estimator."""
     i = 0
     while True:
         yield {"color": COLOURS[i % len(COLOURS)], "linestyle": _STYLES[i % len(_STYLES)]}
@@ -67,7 +67,7 @@ def styles() -> Iterator[dict[str, Any]]:
 
 
 def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
-    """One legend below the axes, of all that is drawn in any of them; its ``markers`` are so many times as large."""
+    """Add one legend below all ``axes``; its ``markers`` are scaled by that factor."""
     entries: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -81,8 +81,9 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
 
 @contextmanager
 def drawing(figure: Figure) -> Iterator[None]:
-    """While a figure is drawn: names in it are shown as they are written, a ``$`` as one, on a line of bounded length; and of
-    characters that the font lacks, or of names that leave no room, nobody is warned."""
+    """Context for drawing a figure: a ``$`` in a name is shown as it is, long lines are shortened, and warnings about missing
+    glyphs or about labels that leave no room are suppressed.
+    """
     named = [text for axis in figure.axes for text in (axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts)]
     for text in (*figure.texts, *named, *(text for legend in figure.legends for text in legend.get_texts())):
         text.set_parse_math(False)
@@ -93,13 +94,13 @@ def drawing(figure: Figure) -> Iterator[None]:
 
 
 def lay_out(figure: Figure) -> None:
-    """Lay a figure out once before it is saved: with a fixed aspect the layout needs a second pass."""
+    """Lay a figure out once before it is saved, as a fixed aspect ratio needs a second layout pass."""
     with drawing(figure):
         figure.draw_without_rendering()
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG image, for a page."""
+    """Return the figure as a PNG image."""
     out = io.BytesIO()
     with drawing(figure):
         figure.savefig(out, format="png", dpi=_PAGE_DPI)
@@ -107,9 +108,9 @@ def png(figure: Figure) -> bytes:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG with a palette: few colours are used, and the file is a third of what it is in full colour.
+    """Write the figure as a PNG with a palette, a third of the size of one in full colour.
 
-    An octree keeps the colours of thin lines, which the default, the median cut, mixes.
+    The octree quantizer keeps the colours of thin lines, which the default (median cut) blends.
     """
     from PIL import Image  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""The few pieces of HTML that pages are made of. Whatever comes from outside is escaped here and nowhere else."""
+"""HTML elements for reports. All values from outside are escaped here."""
 
 import base64
 import html
@@ -12,18 +12,20 @@ Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
 class Html(str):
-    """Text that is HTML already."""
+    """A string that is HTML already and needs no escaping."""
 
     __slots__ = ()
 
 
 def text(value: object) -> Html:
-    """A value as it is to be read, whatever it holds."""
+    """Return a value as escaped text."""
     return value if isinstance(value, Html) else Html(html.escape(str(value)))
 
 
 def tag(name: str, *content: object, **attributes: object) -> Html:
-    """An element; ``class_`` stands for the attribute class, ``data_x`` for data-x; attributes that are None are left out."""
+    """Return an element. ``class_`` stands for the attribute class, ``data_x`` for data-x; attributes that are None are
+    omitted.
+    """
     given = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value))}"'
         for key, value in attributes.items()
@@ -33,19 +35,21 @@ def tag(name: str, *content: object, **attributes: object) -> Html:
 
 
 def join(parts: Iterable[object], between: str = "") -> Html:
-    """Parts one after the other."""
+    """Join parts, with ``between`` as the separator."""
     return Html(between.join(text(part) for part in parts))
 
 
 def data(identity: str, content: Any) -> Html:
-    """Data for the script of the page; no string in it can end the element, or begin another."""
+    """Return a script element with JSON data, escaped such that no string in it can end the element."""
     packed = json.dumps(content, separators=(",", ":"), allow_nan=False)
     safe = packed.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
     return Html(f'<script type="application/json" id="{html.escape(identity)}">{safe}</script>\n')
 
 
 def table(header: Iterable[object], rows: Iterable[Iterable[object]], *, class_: str | None = None) -> Html:
-    """A table that scrolls sideways where it is too wide; the first column names the row. Cells may be elements td already."""
+    """Return a table that scrolls sideways where it is too wide. The first column holds row headers; a cell may be a ``td``
+    element.
+    """
     head = tag("tr", *(tag("th", cell, scope="col") for cell in header))
     lines = []
     for first, *cells in rows:
@@ -55,16 +59,16 @@ def table(header: Iterable[object], rows: Iterable[Iterable[object]], *, class_:
 
 
 def figure(title: object, caption: object, **attributes: object) -> Html:
-    """A place for a chart that the script draws, with title and caption."""
+    """Return a placeholder for a chart drawn by the page's script, with title and caption."""
     chart = tag("div", class_="chart", **attributes)
     return tag("figure", tag("h3", title), chart, tag("figcaption", caption) if caption else "")
 
 
 def image(png: bytes) -> Html:
-    """A PNG image that is part of the page."""
+    """Return a PNG image embedded in the page."""
     return Html(f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(png).decode()}">')
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number for a table, a dash where there is none."""
+    """Format a number for a table; None gives a dash."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

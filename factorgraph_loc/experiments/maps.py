@@ -262,9 +262,7 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
     prior, source = resolve_prior(log, options.prior)
     if prior is None or (options.extend and not prior.has_heading):
         if options.extend:
-            raise InputError(
-                f"{log.name}: to extend its map from odometry the start has to be known in it; give --prior"
-            )
+            raise InputError(f"{log.name}: its map can be extended from odometry only with a known start; give --prior")
         return None, "that of the start: the first pose is the origin (0, 0, 0)"
     certain = replace(prior, covariance=tag_mapping.START_SIGMA**2 * np.eye(3))
     return (prior if options.extend else certain), f"that of the start: {_in_words(prior, source)}"

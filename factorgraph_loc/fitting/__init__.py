@@ -1,1 +1,1 @@
-"""Robust fits that calibrations are made of."""
+"""Robust fits of constants, used by the calibration of sensors."""

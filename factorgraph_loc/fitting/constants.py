@@ -1,4 +1,4 @@
-"""What became of each constant that was fitted, and how well it is known."""
+"""Results of the fit of each constant, with its uncertainty."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Learnt:
-    """One constant.
+    """The result for one constant.
 
-    ``gain``: what it is worth on data it was not fitted to, in nats; ``kept``: whether the rig has ``fitted``, or still
-    ``before``. ``error``: standard error of ``fitted``. ``per_log``: of each log alone, or of the halves of a single one.
-    ``uncertainty``: how much it differs between logs, None where that is not known or the rig has no place for it.
+    ``gain``: improvement of the loss on held-out data [nats]; ``kept``: whether the rig takes the value ``fitted``, rather than
+    keeping ``before``. ``error``: standard error of ``fitted``. ``per_log``: values fitted to each log alone, or to the halves
+    of a single log. ``uncertainty``: standard deviation between logs, None where it is unknown or the rig has no field for it.
     """
 
     sensor: str
@@ -44,8 +44,9 @@ def describe(
     denied: Collection[str],
     uncertain: Collection[str],
 ) -> list[Learnt]:
-    """The table of one sensor's constants. ``alone``: fits of each log, or of the halves of a single one; ``uncertain``: names of
-    those that an estimator can learn on each run."""
+    """Return the results for the constants of one sensor. ``alone``: fits to each log, or to the halves of one log;
+    ``uncertain``: names of the constants that an estimator can learn during a run.
+    """
     values, errors = everything.as_dict(), everything.errors_as_dict()
     kept = [] if pooled is None else [c.name for c in pooled.constants]
     if pooled is not None:
@@ -56,7 +57,7 @@ def describe(
         parts = np.array([found[c.name] for found in alone if c.name in found])
         value = values[c.name] if c.name in kept else c.neutral
         spread = 0.0
-        if len(parts) > 1:  # about the mean that was fitted to them, or about a value that was not
+        if len(parts) > 1:  # about their fitted mean, or about a value that was not fitted
             spread = float(np.sqrt(np.sum((parts - value) ** 2) / (len(parts) - (c.name in kept))))
         error = max(errors[c.name], spread / np.sqrt(len(parts)) if len(parts) and c.name in kept else 0.0)
         uncertainty = None

@@ -1,9 +1,9 @@
-"""Robust fits of a few constants, and the choice of those that are worth keeping.
+"""Robust fits of a few constants, and selection of the constants worth keeping.
 
-The loss is soft-L1 of whitened residuals, quadratic near zero and linear far from it (Charbonnier et al., "Two deterministic
-half-quadratic regularization algorithms for computed imaging", 1994). Standard errors are those of the sandwich with clusters
-(Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986): residuals within a block of time may be
-correlated in any way.
+The loss is soft-L1 of whitened residuals, quadratic near zero and linear in the tails (Charbonnier et al., "Two deterministic
+half-quadratic regularization algorithms for computed imaging", 1994). Standard errors come from the cluster-robust sandwich
+estimator (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986): residuals within a block of
+time may be correlated in any way.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -15,17 +15,19 @@ from scipy.optimize import least_squares
 
 from factors.se2 import Array
 
-LOSS_SCALE = 2.0  # standard deviations at which the loss leaves the parabola
+LOSS_SCALE = 2.0  # standard deviations at which the loss changes from quadratic to linear
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
-_STEP = 1e-4  # of the numerical derivative, in typical sizes
-_ITERATIONS = 8  # of the reweighted linear fits
+_STEP = 1e-4  # step of the numerical derivative, in typical sizes
+_ITERATIONS = 8  # of the iteratively reweighted linear fit
 
 Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant that may be fitted: its ``neutral`` value (kept where it is not), ``typical`` size of a change, and bounds."""
+    """A constant that can be fitted: its ``neutral`` value (used where it is not fitted), ``typical`` size of a change, and
+    bounds.
+    """
 
     name: str
     neutral: float
@@ -34,14 +36,14 @@ class Constant:
     high: float
 
     def is_inside(self, value: float) -> bool:
-        """Whether a value is not at a bound."""
+        """Whether a value lies strictly inside the bounds."""
         margin = 1e-3 * self.typical
         return self.low + margin < value < self.high - margin
 
 
 @dataclass(frozen=True)
 class Fit:
-    """``values`` (P,) with their ``errors`` (P,); whitened ``residuals`` (M, D) and their ``jacobian`` (M, D, P) there."""
+    """Fitted ``values`` (P,) with standard ``errors`` (P,), whitened ``residuals`` (M, D) and their ``jacobian`` (M, D, P)."""
 
     constants: tuple[Constant, ...]
     values: Array
@@ -57,7 +59,7 @@ class Fit:
 
 
 def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array], Array], blocks: Integers) -> Fit:
-    """The constants (P,) that minimise the loss of ``whitened(values)`` (M, D), from a start (P,).
+    """Return the constants (P,) that minimise the loss of ``whitened(values)`` (M, D), starting from ``start`` (P,).
 
     ``blocks`` (M,): the block of time of each row, for the standard errors.
     """
@@ -90,12 +92,12 @@ def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array],
 
 
 def gains(found: Fit, folds: Integers, given_up: Collection[str] = ()) -> Array:
-    """What each constant is worth on data it was not fitted to (P, K), in nats, for K folds; above 0 it helps.
+    """Return the gain (P, K) in held-out loss [nats] of each constant on K folds; positive values favour the constant.
 
-    ``folds`` (M,): the fold of each row. Each fold is predicted by the others with all constants and with all but one, which
-    has its neutral value; the residuals are taken as linear in the constants, about the fit of all data. The constant that helps
-    least is given up for good, if it does not help, and the rest looked at again: of two that do the same only one is needed.
-    One that was stopped by a bound, or is ``given_up`` by name, is so from the beginning.
+    ``folds`` (M,): the fold of each row. Each fold is predicted from a fit to the others, once with all constants and once with
+    one constant at its neutral value; residuals are linearised about the fit to all data. Backward elimination: the constant
+    with the least gain is dropped for good if that gain is not positive, and the rest are evaluated again, so that of two
+    redundant constants one stays. Constants at a bound, and those in ``given_up``, are dropped from the start.
     """
     neutral = np.array([c.neutral for c in found.constants]) - found.values
     out = np.zeros((len(neutral), int(folds.max()) + 1))
@@ -112,12 +114,12 @@ def gains(found: Fit, folds: Integers, given_up: Collection[str] = ()) -> Array:
 
 
 def is_worth(gain: Array) -> bool:
-    """Whether gains (K,) of one constant say that it helps: in sum, and in more than half of the folds."""
+    """Whether the gains (K,) of one constant favour it: in sum, and in more than half of the folds."""
     return bool(np.sum(gain) > 0.0 and np.mean(gain > 0.0) > 0.5)
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """A number for each block of ``length`` seconds of each of several logs, one after another."""
+    """Number the blocks of ``length`` seconds of several logs consecutively, and return the block of each time."""
     out: list[Integers] = []
     for t in times:
         offset = int(out[-1].max()) + 1 if out and len(out[-1]) else 0
@@ -126,7 +128,7 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
 
 
 def folds(times: Sequence[Array], count: int) -> Integers:
-    """Folds of the rows: the logs, where there are several; else ``count`` stretches of time of the only one."""
+    """Return the fold of each row: its log where there are several, else one of ``count`` intervals of the only log."""
     if len(times) > 1:
         return np.repeat(np.arange(len(times)), [len(t) for t in times])
     ranks = np.argsort(np.argsort(times[0], kind="stable"), kind="stable")
@@ -134,19 +136,20 @@ def folds(times: Sequence[Array], count: int) -> Integers:
 
 
 def loss(residuals: Array) -> float:
-    """The soft-L1 loss of whitened residuals, half their squares where they are small."""
+    """Return the soft-L1 loss of whitened residuals, half their squares where they are small."""
     return float(np.sum(LOSS_SCALE**2 * (np.sqrt(1.0 + (residuals / LOSS_SCALE) ** 2) - 1.0)))
 
 
 def spread(values: Array) -> Array:
-    """Robust standard deviation (D,) of the columns of ``values`` (M, D) about zero."""
+    """Return the robust standard deviation (D,) about zero of the columns of ``values`` (M, D)."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 
 
 def _held_out(found: Fit, folds: Integers, free: Sequence[int], neutral: Array) -> Array:
-    """Loss (K,) on each fold of the constants ``free`` fitted on the others; the constants that are not have neutral values.
+    """Return the held-out loss (K,) of each fold, with the constants ``free`` fitted on the others and the rest at neutral
+    values.
 
-    ``neutral`` (P,): as changes from the fit of all data.
+    ``neutral`` (P,): as changes from the fit to all data.
     """
     fixed = neutral.copy()
     fixed[list(free)] = 0.0
@@ -166,7 +169,7 @@ def _held_out(found: Fit, folds: Integers, free: Sequence[int], neutral: Array) 
 
 
 def _sandwich(residuals: Array, jacobian: Array, blocks: Integers) -> Array:
-    """Covariance (P, P) of the constants."""
+    """Return the cluster-robust covariance (P, P) of the constants."""
     weight = 1.0 / np.sqrt(1.0 + (residuals / LOSS_SCALE) ** 2)
     bread = np.linalg.pinv(np.einsum("mdp,md,mdq->pq", jacobian, weight**3, jacobian))
     scores = np.einsum("mdp,md->mp", jacobian, weight * residuals)

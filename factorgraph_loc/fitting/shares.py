@@ -1,4 +1,4 @@
-"""How well a share is known by counted trials."""
+"""Confidence intervals of proportions."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,10 +9,11 @@ _Z = 1.959963984540054  # of the 95 % interval
 
 
 def wilson(successes: ArrayLike, count: ArrayLike) -> tuple[Array, Array]:
-    """The 95 % interval (low, high) of a share, of which ``successes`` (N,) of ``count`` (N,) trials were seen.
+    """Return the bounds (low, high) of the 95 % confidence interval of a proportion, given ``successes`` (N,) in ``count`` (N,)
+    trials.
 
-    Wilson, "Probable inference, the law of succession, and statistical inference", Journal of the American Statistical Association
-    22(158), 1927.
+    Wilson, "Probable inference, the law of succession, and statistical inference", Journal of the American Statistical
+    Association 22(158), 1927.
     """
     n = np.asarray(count, dtype=float)
     share = np.asarray(successes, dtype=float) / n

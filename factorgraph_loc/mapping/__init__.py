@@ -1,1 +1,1 @@
-"""Maps made from logs: landmarks, tags, and points that a camera sees."""
+"""Maps made from logs: landmarks, tags, and 3-D points from images."""

@@ -1,8 +1,8 @@
-"""Bundle adjustment: points and the cameras that see them, all in one graph of GTSAM.
+"""Bundle adjustment of points and cameras in one GTSAM graph.
 
-After Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000: projection factors with Huber's loss,
-a prior on each camera from where its pose is known, Levenberg-Marquardt. What does not fit is left out and the rest
-adjusted again. Covariances come from the Schur complement on the cameras, which are few beside the points.
+After Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000: projection factors with Huber
+loss, a prior on each camera pose, Levenberg-Marquardt. Outliers are removed and the rest is adjusted again. Covariances come
+from the Schur complement on the cameras, which are few compared to the points.
 """
 
 from __future__ import annotations
@@ -24,22 +24,24 @@ ROUNDS = 3
 LOOSE, OUTLIER = (
     6.0,
     3.5,
-)  # standard deviations of a pixel beyond which an observation is left out, in the first round and later
+)  # standard deviations of a pixel beyond which an observation is an outlier, in the first round and later
 ITERATIONS = 20
 RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
-FOCAL_SIGMA = 0.1  # of an unknown focal length, as a share
-FIXED = 1e-5  # standard deviation of those constants of a calibration that are known
-SOMEWHERE = 1000.0  # m, standard deviation of a point of which nothing is known
-CHUNK = 500  # points whose covariances are computed at a time
+FOCAL_SIGMA = 0.1  # standard deviation of an unknown focal length, relative
+FIXED = 1e-5  # standard deviation of the known calibration constants
+SOMEWHERE = 1000.0  # m, standard deviation of a point without a prior
+CHUNK = 500  # points whose covariances are computed at once
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """What was adjusted: ``model`` (its focal length too, if that was a variable), ``cameras``, and ``points`` (T, 3) [m] of
-    ``tracks``, whose observations agree; ``old`` (T,): their numbers before. ``errors`` (N, 2) [px]: of the observations.
+    """Result of :func:`adjust`: ``model`` (with the adjusted focal length, if that was a variable), ``cameras``, and ``points``
+    (T, 3) [m] of ``tracks`` without outliers; ``old`` (T,): indices of the points in the input. ``errors`` (N, 2) [px]: of the
+    observations.
 
-    ``camera_covariances`` (F, 6, 6): of the cameras' perturbations in their own frames, turn first, then shift;
-    ``point_covariances`` (T, 3, 3) [m^2]: marginal ones, the cameras' uncertainty included, that of the focal length not."""
+    ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first; ``point_covariances`` (T, 3,
+    3) [m^2]: marginals, including the uncertainty of the cameras but not of the focal length.
+    """
 
     model: CameraModel
     cameras: Cameras
@@ -53,20 +55,20 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Those of the ``points`` (M,) of which a map knows the ``positions`` (M, 3) [m] with ``covariances`` (M, 3, 3)."""
+    """Those of the ``points`` (M,) with prior ``positions`` (M, 3) [m] and ``covariances`` (M, 3, 3) from a map."""
 
     points: Integers
     positions: Array
     covariances: Array
 
     def kept(self, left: Integers) -> Known:
-        """What is known of the points ``left`` (T',), ascending, by their new numbers."""
+        """The priors of the points ``left`` (T',), ascending, by their new indices."""
         rows = np.isin(self.points, left)
         return Known(np.searchsorted(left, self.points[rows]), self.positions[rows], self.covariances[rows])
 
 
 class Motion(Protocol):
-    """What is known of the motion from camera to camera."""
+    """A motion model between consecutive cameras."""
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """Add factors on the poses ``X(0)``, ``X(1)``, ..."""
@@ -84,10 +86,10 @@ def adjust(
     focal: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
-    """Adjust ``points`` (T, 3) and the ``cameras``, whose poses are known with ``covariances`` (F, 6, 6), see :class:`Bundle`.
+    """Adjust ``points`` (T, 3) and ``cameras``, whose prior poses have ``covariances`` (F, 6, 6), see :class:`Bundle`.
 
-    ``known``: what is known of some of the points, ``motion``: of how the camera moves; the covariances do not tell of the latter.
-    ``focal``: the focal lengths are not known. RuntimeError where the graph cannot be solved.
+    ``known``: priors of some of the points; ``motion``: a motion model, which the covariances of the result do not include.
+    ``focal``: whether to estimate the focal lengths. Raises RuntimeError if the graph cannot be solved.
     """
     known = known or Known(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
     old = np.arange(len(points))
@@ -117,8 +119,7 @@ def adjust(
 def agreeing(
     model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float, least: Integers
 ) -> Truths:
-    """Which observations (N,) are at most ``limit`` standard deviations off, of points that then still are seen as often as
-    ``least`` (T,) says."""
+    """Observations (N,) with residuals of at most ``limit`` standard deviations, of points that retain ``least`` (T,) of them."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     seen = np.bincount(tracks.track[right], minlength=tracks.count)
@@ -133,8 +134,9 @@ def marginals(
     points: Array,
     known: Known | None = None,
 ) -> tuple[Array, Array]:
-    """Marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised here; ``information`` (F, 6, 6): of the
-    cameras' priors."""
+    """Marginal covariances of the cameras (F, 6, 6) and points (T, 3, 3), linearised at the input; ``information`` (F, 6, 6):
+    of the cameras' priors.
+    """
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
@@ -162,12 +164,11 @@ def marginals(
 
 
 def pose3(position: Array, rotation: Array) -> gtsam.Pose3:
-    """A pose as GTSAM has it."""
     return gtsam.Pose3(gtsam.Rot3(rotation), position)
 
 
 def robust_noise(model: CameraModel) -> Any:
-    """The noise of a pixel under Huber's loss."""
+    """Pixel noise with Huber loss."""
     huber = gtsam.noiseModel.mEstimator.Huber.Create(model.robust)
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
 
@@ -216,7 +217,7 @@ def _optimized(
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
-    """The matrix that has ``blocks`` (N, r, c) at those places, counted in blocks."""
+    """The sparse block matrix with ``blocks`` (N, r, c) at block indices ``rows`` and ``columns``."""
     _, height, width = blocks.shape
     i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
     j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)

@@ -1,4 +1,4 @@
-"""Where the camera of a log was at each of its images, and how well that is known."""
+"""Camera poses at the images of a log, with covariances."""
 
 from __future__ import annotations
 
@@ -16,30 +16,28 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
 from factors.se2 import Array
 
-MAX_GAP = 0.5  # s between the stamps of a reference, across which it is not interpolated
-ASKEW, AFLOAT = 0.003, 0.003  # rad, m: how much a robot on the floor tilts and heaves
+MAX_GAP = 0.5  # s between stamps of a reference, beyond which it is not interpolated
+ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height of a robot on the floor
 
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """F frames with features, and the ``cameras`` that took them; ``covariances`` (F, 6, 6) of these in their own frames, turn
-    first, then shift."""
+    """F frames with features, and their ``cameras``; ``covariances`` (F, 6, 6) in the cameras' own frames, rotation first."""
 
     frames: list[CameraFrame]
     cameras: Cameras
     covariances: Array
 
     def __getitem__(self, index: Integers) -> PosedFrames:
-        """The frames of an index array."""
         return PosedFrames([self.frames[i] for i in index.tolist()], self.cameras[index], self.covariances[index])
 
 
 def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames:
-    """The frames of a log with features, at the poses of its reference, in the plane or in space.
+    """The frames of a log with features, at the poses of its reference (in the plane or in space).
 
-    ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis where the reference has no
-    covariances. Frames that lie outside of the reference or in its gaps are left out. InputError where a camera, features or a
-    reference are missing, or nothing is left.
+    ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis for a reference without
+    covariances. Frames outside of the reference or in its gaps are omitted. Raises InputError if a camera, features or a
+    reference are missing, or no frame remains.
     """
     t, found = frames_of(log)
     if log.rig.find(CameraSettings) is None:
@@ -72,7 +70,7 @@ def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array,
     if reference.covariances is None:
         return cameras, np.repeat(usual[None], len(t), axis=0)
     nearest = np.clip(np.searchsorted(reference.t, t), 0, len(reference.t) - 1)
-    # by (x, y, heading) in the world: the heading turns about z, and swings the camera around the robot
+    # by (x, y, heading) in the world: the heading rotates about z, and moves the camera around the robot
     by_pose = np.zeros((len(t), 6, 3))
     by_pose[:, 2, 2] = by_pose[:, 3, 0] = by_pose[:, 4, 1] = 1.0
     arm = cameras.positions[:, :2] - poses[:, :2]

@@ -1,7 +1,7 @@
 """Features of images with known camera poses, matched and chained into tracks.
 
-Poses say where in another image a feature can be: near its epipolar line (Hartley and Zisserman, "Multiple View Geometry", 2004,
-chapter 9). Matching there alone keeps features that look alike apart, and finds more of them.
+Matches are searched near epipolar lines only (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9), which
+separates features that look alike and yields more matches.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,15 @@ RANKS = (
     12,
     20,
     33,
-)  # which of the frames that overlap with a frame, the nearest first, it is matched with
-APART, ASKEW = 1.0, 0.8  # m and rad: two cameras farther from each other are taken to see different things
+)  # ranks of the overlapping frames, nearest first, that a frame is matched with
+APART, ASKEW = 1.0, 0.8  # m and rad: cameras farther apart are assumed not to overlap
 RATIO = 0.85
 
 
 def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
-    """Indices of frames: the first, and each that is ``distance`` [m] or ``angle`` [rad] away from all that are chosen before, so
-    that a place that is visited again adds none."""
+    """Indices of keyframes: the first, and each at ``distance`` [m] or ``angle`` [rad] from all chosen before, so that
+    revisiting a place adds none.
+    """
     chosen: list[int] = []
     for i in range(len(cameras)):
         near = np.linalg.norm(cameras.positions[chosen] - cameras.positions[i], axis=1) < distance
@@ -40,7 +41,7 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
 
 
 def overlapping_pairs(cameras: Cameras, *, apart: float = APART, askew: float = ASKEW) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of frames that see mostly the same, near ones and some farther ones of each."""
+    """Pairs (i, j), i < j, of frames that overlap: for each frame the nearest ones, and some farther ones."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
@@ -56,15 +57,18 @@ def overlapping_pairs(cameras: Cameras, *, apart: float = APART, askew: float = 
 def near_epipolar_lines(
     model: CameraModel, cameras: Cameras, i: int, j: int, first: Array, second: Array, gate: float
 ) -> Truths:
-    """Which pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j may show one point: at most
-    ``gate`` pixels from each other's epipolar line."""
+    """Which pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j are consistent with one point:
+    at most ``gate`` pixels from each other's epipolar line.
+    """
     rotation = cameras.rotations[j].T @ cameras.rotations[i]
     shift = cameras.rotations[j].T @ (cameras.positions[i] - cameras.positions[j])
     x, y, z = shift
     essential = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ rotation
     a, b = (np.column_stack((undistorted(model, pixels), np.ones(len(pixels)))) for pixels in (first, second))
     lines_j, lines_i = (lines.astype(np.float32) for lines in (a @ essential.T, b @ essential))
-    off = np.abs(lines_j @ b.T.astype(np.float32))  # single precision is a thousandth of a pixel, and half of the time
+    off = np.abs(
+        lines_j @ b.T.astype(np.float32)
+    )  # single precision is accurate to 0.001 px and takes half of the time
     limit = np.float32(gate / np.sqrt(model.fx * model.fy))
     return np.asarray(
         (off <= limit * np.hypot(lines_j[:, 0], lines_j[:, 1])[:, None]) & (off <= limit * np.hypot(*lines_i[:, :2].T))
@@ -74,8 +78,9 @@ def near_epipolar_lines(
 def matched_pairs(
     model: CameraModel, cameras: Cameras, frames: Sequence[CameraFrame], pairs: Sequence[tuple[int, int]], gate: float
 ) -> list[tuple[int, int, Integers, Array]]:
-    """For each of ``pairs`` (i, j): indices (K, 2) of the features that match, and their distances (K,) in units of
-    the typical one of that pair. ``gate`` [px]: see :func:`near_epipolar_lines`."""
+    """For each of ``pairs`` (i, j): indices (K, 2) of matching features, and their distances (K,) relative to the typical
+    distance of that pair. ``gate`` [px]: see :func:`near_epipolar_lines`.
+    """
     out = []
     for i, j in pairs:
         a, b = frames[i], frames[j]
@@ -90,7 +95,7 @@ def matched_pairs(
 
 
 def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
-    """Tracks of features that match: the best matches first, and none that would bring two features of a frame into a track."""
+    """Tracks chained from matches, best first; a match that would join two features of one frame is rejected."""
     starts = np.cumsum([0, *(len(frame.pixels) for frame in frames)])
     frame_of = np.repeat(np.arange(len(frames)), np.diff(starts))
     first = np.concatenate([starts[i] + indices[:, 0] for i, _, indices, _ in matches] or [np.empty(0, dtype=np.int64)])
@@ -99,7 +104,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     )
     order = np.argsort(np.concatenate([d for *_, d in matches] or [np.empty(0)]), kind="stable")
     root = list(range(int(starts[-1])))
-    members: dict[int, dict[int, int]] = {}  # of each root: its feature by frame
+    members: dict[int, dict[int, int]] = {}  # features by frame, for each root
 
     def find(k: int) -> int:
         while root[k] != k:

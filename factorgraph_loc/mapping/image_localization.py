@@ -1,10 +1,10 @@
-"""Where a camera was at each of its images, in a map of points made from others: image by image, and all of them in one graph.
+"""Localization of images in a map of points: each image alone, or a sequence of images in one graph.
 
-Image by image: relocalization, then what the map predicts to be seen from there is looked for and the pose refined.
+A single image is relocalized; points that the map predicts to be visible are then matched and the pose is refined.
 
-In one graph: poses in space; the points of the map, as well as they are known; points that the map lacks, followed from image
-to image; and a camera that moves on as it did. It is an offline smoother: later images help earlier ones. What no map point
-tells follows from points that well-placed neighbours share, so that images of places beside the map are located too.
+A sequence is an offline smoothing problem with poses in space, map points with their uncertainty, points tracked from image to
+image that the map lacks, and a constant-velocity motion model. Images that see few map points are located through tracked
+points shared with well-located neighbours.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,22 +28,23 @@ from factorgraph_loc.vision.relocalization import located
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-GUESSED = (0.01, 0.01)  # rad, m: what a pose found may be off besides what its points say, when others are looked for
+GUESSED = (0.01, 0.01)  # rad, m: additional standard deviations of a relocalized pose for guided matching
 SURE = (0.005, 0.005)  # the same of a pose from the graph
 FEWEST = 12  # points that must agree
-REFINED = 2  # rounds of looking for what the map predicts
-ROUNDS = 2  # of the graph: what it finds is looked for again
+REFINED = 2  # rounds of guided matching
+ROUNDS = 2  # rounds of graph optimisation and guided matching
 EPIPOLAR = 15.0  # px from epipolar lines of cameras that were located one by one
-UNKNOWN = (1.0, 3.0)  # rad, m: standard deviations of a pose that only the images tell
-GROWN = 5  # times that the map is extended by what located images see besides
+UNKNOWN = (1.0, 3.0)  # rad, m: standard deviations of a pose without a prior
+GROWN = 5  # times that the map is extended by points from located images
 NEW = PointSettings(distance=0.0, angle=0.0)
 NOTHING: Integers = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """``position`` (3,) [m] and ``rotation`` (3, 3) of the camera in the world, ``covariance`` (6, 6) of its perturbation in its
-    own frame, turn first, then shift; ``points`` and ``features`` (M,): which of the map's points are which features."""
+    """``position`` (3,) [m] and ``rotation`` (3, 3) of the camera in the world, ``covariance`` (6, 6) of a perturbation in its
+    own frame, rotation first; ``points`` and ``features`` (M,): indices of matched map points and features.
+    """
 
     position: Array
     rotation: Array
@@ -53,7 +54,7 @@ class Located:
 
 
 class ImageLocalizer:
-    """A map of points and a camera to be found in it."""
+    """Localizes a camera in a map of points."""
 
     def __init__(self, points: PointMap, model: CameraModel) -> None:
         self._points = points
@@ -61,7 +62,7 @@ class ImageLocalizer:
         self._associator = Associator(points, model)
 
     def one(self, frame: CameraFrame) -> Located | None:
-        """The pose of one image without any other; None where the map does not tell."""
+        """The pose of a single image, None if the map does not determine it."""
         found = self._associator.relocalized(frame)
         if found is None:
             return None
@@ -81,8 +82,11 @@ class ImageLocalizer:
         ones: Sequence[Located | None],
         progress: Callable[[float], None] = lambda _: None,
     ) -> list[Located | None]:
-        """The poses of a sequence of images, taken at ``t`` (F,) [s], from one graph; ``ones``: what :meth:`one` says of each,
-        which is the answer where the graph cannot be solved. None for all where the map tells too few."""
+        """The poses of a sequence of images, taken at ``t`` (F,) [s], from one graph.
+
+        ``ones``: results of :meth:`one` for each image, returned if the graph cannot be solved. All None if too few were
+        located.
+        """
         places = self._extended(frames, ones)
         cameras = smooth_start(t, places)
         if cameras is None:
@@ -95,7 +99,7 @@ class ImageLocalizer:
         for i in range(ROUNDS):
             try:
                 adjusted = self._solved(frames, t, cameras, seen, tracks)
-            except RuntimeError:  # GTSAM's of a system that is not determined
+            except RuntimeError:  # raised by GTSAM for an underdetermined system
                 return places
             cameras, covariances = adjusted.cameras, adjusted.camera_covariances
             found = [
@@ -107,7 +111,7 @@ class ImageLocalizer:
         return [replace(place, covariance=c) for place, c in zip(found, covariances, strict=True)]
 
     def _extended(self, frames: Sequence[CameraFrame], places: Sequence[Located | None]) -> list[Located | None]:
-        """The places, and those of images that see too little of the map, but enough of what located images see besides."""
+        """``places``, extended by images that see too little of the map, but enough points seen by located images."""
         found = list(places)
         for _ in range(GROWN):
             there = np.array([i for i, place in enumerate(found) if place is not None], dtype=np.int64)
@@ -129,7 +133,7 @@ class ImageLocalizer:
         return found
 
     def _looked_for(self, frame: CameraFrame, place: Located, spread: tuple[float, float]) -> Located | None:
-        """The place again, from what the map says is seen there."""
+        """The pose refined by guided matching with the map's predictions."""
         wide = replace(place, covariance=place.covariance + np.diag(np.repeat(np.square(spread), 3)))
         seen = self._associated(frame, wide)
         if len(seen.points) < FEWEST:
@@ -154,7 +158,7 @@ class ImageLocalizer:
         seen: Sequence[Located | None],
         tracks: Tracks,
     ) -> Bundle:
-        """The graph of all images."""
+        """The optimised graph of all images."""
         model = self._model
         of_map, shown, new = _divided(tracks, frames, seen)
         found = triangulate(model, cameras, new)
@@ -174,8 +178,9 @@ class ImageLocalizer:
 
 
 def smooth_start(t: Array, places: Sequence[Located | None]) -> Cameras | None:
-    """Poses (F) of all frames at ``t`` (F,) from those that were located: the others in between, at the ends as the nearest.
-    None where fewer than two were."""
+    """Initial poses (F) of all frames at ``t`` (F,), interpolated between located frames, constant before and after. None if
+    fewer than two were located.
+    """
     there = [i for i, place in enumerate(places) if place is not None]
     if len(there) < 2:
         return None
@@ -189,9 +194,10 @@ def smooth_start(t: Array, places: Sequence[Located | None]) -> Cameras | None:
 def _divided(
     tracks: Tracks, frames: Sequence[CameraFrame], seen: Sequence[Located | None]
 ) -> tuple[Tracks, Integers, Tracks]:
-    """What shows points of the map, these points' numbers in the map, and the tracks of points that the map lacks.
+    """Observations of map points, the indices of these points in the map, and the tracks of other points.
 
-    A track of which some features show one point of the map, and none another, shows it in all its frames."""
+    A track of which some features match one map point, and none another, observes that point in all its frames.
+    """
     point_of = {
         (i, k): point
         for i, place in enumerate(seen)

@@ -1,4 +1,4 @@
-"""The picture of a map, of landmarks, tags or points: what was given, what was learnt, and where the robot was."""
+"""Plots of a map of landmarks, tags or points, with the given map and the trajectory."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from factors.se2 import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CORNERS = 60  # of an ellipse that is drawn as a polygon
-FAR = 10.0  # median absolute deviations, of points that are left out of the picture
-LABEL = 4  # last characters of a tag's EPC, that the picture has room for
+CORNERS = 60  # vertices of the polygon of an ellipse
+FAR = 10.0  # median absolute deviations beyond which points are not drawn
+LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Given and learnt tags as of :func:`figure`, labelled by the end of the EPC; where ambiguous ones may be, and those
-    of the given map that were not located."""
+    """Plot given and learnt tags as :func:`figure` does, labelled by the end of the EPC, with the candidates of ambiguous tags
+    and given tags that were not located.
+    """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]
     for name, modes in made.modes.items():
@@ -46,7 +47,7 @@ def dropped_figure(
     poses: Array,
     walls: Sequence[tuple[float, ...]] = (),
 ) -> Figure:
-    """Tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
+    """Plot tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
     everything = np.concatenate((np.array(list(places.values())), poses[:, :2]))
     width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
@@ -67,7 +68,7 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Given and learnt landmarks, these with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
+    """Plot given landmarks, learnt ones with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
     places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
@@ -95,9 +96,9 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
 
 
 def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
-    """Points from above, those of one height in one colour, and where the camera was, ``cameras`` (F, 3)."""
+    """Plot points from above, coloured by height, and the camera positions ``cameras`` (F, 3)."""
     off = np.abs(points.positions - np.median(points.positions, axis=0))
-    # a few points far off would make all others small
+    # a few distant points would shrink all others
     shown = points.positions[np.all(off <= np.maximum(FAR * np.median(off, axis=0), 1.0), axis=1)]
     everything = np.concatenate((shown[:, :2], cameras[:, :2]))
     width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
@@ -115,12 +116,12 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
 
 
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
-    """A given map that could not be brought together with the new one has another frame."""
+    """Whether a given landmark is in the new map's frame: a given map that could not be aligned is not."""
     return made.judged or verdict == "given"
 
 
 def _ellipse(centre: Array, covariance: Array) -> Array:
-    """Outline (2, CORNERS) of two standard deviations."""
+    """Outline (2, CORNERS) at two standard deviations."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     circle = np.stack((np.cos(angle), np.sin(angle)))

@@ -1,13 +1,13 @@
-"""Maps of identified landmarks, made from the landmarks that a run has estimated, and what they say about a given map.
+"""Maps of identified landmarks from the landmarks that a run estimated, and comparison with a given map.
 
-A run without a map has a frame of its own. Its landmarks are brought onto those of a given map by one rotation and translation,
-robustly, as landmarks of the given map may be wrong: by sample consensus over pairs of landmarks (Fischler and Bolles, "Random
-sample consensus", 1981) with the truncated cost of Torr and Zisserman ("MLESAC", 2000), in units of the scale of the least median
-of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5), then by weighted least squares on the
-inliers, which are chosen anew after each iteration.
+A run without a map has a frame of its own. Its landmarks are aligned with those of a given map by one rotation and translation,
+robustly, as some given landmarks may be wrong: by sample consensus over pairs of landmarks (Fischler and Bolles, "Random sample
+consensus", 1981) with the truncated cost of Torr and Zisserman ("MLESAC", 2000), scaled by the least median of squares
+(Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5), then by weighted least squares on the
+inliers, which are selected again after each iteration.
 
-The covariances of the run hold how the robot drifted between its start and the landmarks. That is common to all landmarks and the
-alignment takes it away, so they are scaled by the variance of unit weight that the inliers show (Koch, "Parameter Estimation and
+The covariances of the run include the drift between its start and the landmarks, which is common to all landmarks and removed
+by the alignment; they are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter Estimation and
 Hypothesis Testing in Linear Models", 1999).
 """
 
@@ -29,8 +29,8 @@ from factors.se2 import Array
 
 GATE = 13.816  # 99.9 % of chi-square with two degrees of freedom
 MEDIAN = 1.386  # 50 % of the same
-TOLERANCE = 0.15  # m; no landmark is doubted below this, however sure the run is of it
-# verdicts that are not on a wrong landmark, and how a summary counts them
+TOLERANCE = 0.15  # m; a smaller deviation of a landmark is never significant
+# verdicts on landmarks that are not wrong, and how a summary counts them
 VERDICTS = {
     "agrees": "agreeing with the given one",
     "given": "as given",
@@ -38,17 +38,18 @@ VERDICTS = {
     "not seen": "not seen",
     "not judged": "not judged",
 }
-MIN_COMMON = 3  # landmarks: two can always be brought onto two others of the same distance
-FACTORS = (0.01, 4.0)  # bounds of the variance factor: nothing that is stated is wrong by more
-MAX_PAIRS = 5000  # above, as many pairs are drawn
+MIN_COMMON = 3  # landmarks: two can always be aligned with two others at the same distance
+FACTORS = (0.01, 4.0)  # bounds of the variance factor
+MAX_PAIRS = 5000  # if there are more, this many are drawn at random
 MAX_ITERATIONS = 20
 CONVERGED = 1e-9  # m and rad
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One landmark: its ``given`` position (2,) or None; what was ``learnt`` of it, in the new map's frame, or None; and the
-    verdict, ``flagged`` where that is that the given map is wrong."""
+    """One landmark: its ``given`` position (2,) or None; its ``learnt`` position in the new map's frame or None; and the
+    verdict, ``flagged`` if the given position is wrong.
+    """
 
     landmark: str
     given: Array | None
@@ -58,23 +59,23 @@ class Entry:
 
     @property
     def distance(self) -> float | None:
-        """From the given to the learnt position [m]."""
+        """Distance between the given and the learnt position [m]."""
         if self.given is None or self.learnt is None:
             return None
         return float(np.hypot(*(self.learnt.position - self.given)))
 
     @property
     def sigma(self) -> float | None:
-        """Standard deviation [m] of what was learnt, in its least certain direction."""
+        """Standard deviation [m] of the learnt position in its least certain direction."""
         return None if self.learnt is None else float(np.sqrt(np.linalg.eigvalsh(self.learnt.covariance)[-1]))
 
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """A map and how it came about.
+    """A map, and how it was made.
 
-    ``frame`` (3,): pose of the run's frame in the map's. ``judged``: whether the log's map was compared with it, and their frames
-    are the same. ``notes``: what people should know, one line each.
+    ``frame`` (3,): pose of the run's frame in the map's. ``judged``: whether the log's map was compared with it, so that both
+    have one frame. ``notes``: remarks for the user, one line each.
     """
 
     world: World
@@ -89,7 +90,7 @@ class LandmarkMap:
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
     def summary(self, what: str = "landmarks") -> str:
-        """One sentence on what was found."""
+        """A summary in one sentence."""
         counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
         text = f"{len(self.world.landmarks)} {what} are in the new map"
         parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
@@ -100,8 +101,9 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Alignment:
-    """``pose`` (3,) that brings points onto targets; its ``covariance`` (3, 3) of (x, y, angle); how many points agree; and the
-    ``factor`` by which their covariances are to be multiplied."""
+    """``pose`` (3,) that moves points onto targets, its ``covariance`` (3, 3) of (x, y, angle), the number of inliers, and the
+    ``factor`` by which the points' covariances are to be multiplied.
+    """
 
     pose: Array
     covariance: Array
@@ -115,19 +117,18 @@ IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
 def make_map(
     log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
 ) -> LandmarkMap:
-    """The map of the ``learnt`` landmarks of a run on ``log``.
+    """Make a map of the ``learnt`` landmarks of a run on ``log``.
 
-    ``extend``: the run used the log's map and learnt what it lacks; its landmarks stay as they are. Otherwise the run has used no
-    map: where the log has one, the learnt landmarks are brought into its frame (unless they are ``in_frame`` already) and its
-    landmarks are judged. A landmark is wrong
-    where it lies more than ``TOLERANCE`` from the learnt one, and the square of that distance, in units of its covariance, is
-    beyond ``GATE``. The covariance is the sum of the learnt landmark's, the alignment's and the survey's.
+    ``extend``: the run used the log's map and learnt what it lacks; its landmarks stay as they are. Otherwise the run used no
+    map; if the log has one, the learnt landmarks are aligned with it (unless they are ``in_frame`` already) and its landmarks
+    are judged. A given landmark is wrong if it lies more than ``TOLERANCE`` from the learnt one and the squared Mahalanobis
+    distance exceeds ``GATE``; the covariance is the sum of the learnt landmark's, the alignment's and the survey's.
 
     Raises RunFailedError if nothing was learnt.
     """
     if not learnt and not extend:
         raise RunFailedError(
-            f"{log.name}: no landmark was sighted twice in agreement with odometry, so none was mapped"
+            f"{log.name}: no landmark was sighted twice consistently with odometry, so none was mapped"
         )
     given = log.world.landmarks
     common = [name for name in given if name in learnt]
@@ -143,7 +144,7 @@ def make_map(
     surveys = np.array([_survey(given[name]) for name in common])
     alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
     if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
-        note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map at a time"
+        note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map under one alignment"
         return _unjudged(log, learnt, note)
     moved = {name: _moved(point, alignment) for name, point in learnt.items()}
     wrong = [n for n in common if _differ(moved[n], given[n])]
@@ -157,7 +158,7 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """The rotation and translation on which more than half of K ``points`` agree with their ``targets`` (K, 2).
+    """The rotation and translation that align more than half of K ``points`` with their ``targets`` (K, 2).
 
     ``surveys`` (K, 2, 2): covariances of the targets. K must be at least ``MIN_COMMON``.
     """
@@ -166,7 +167,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     count = len(points)
 
     def errors(pose: Array) -> tuple[Array, Array, Array]:
-        """Errors (K, 2), the inverses (K, 2, 2) of their stated covariances, and their squares (K,) in these units."""
+        """Errors (K, 2), the inverses (K, 2, 2) of their covariances, and squared Mahalanobis distances (K,)."""
         turn = _rotation(pose)
         information = np.linalg.inv(turn @ covariances @ turn.T + surveys)
         error = se2.transform_from(pose, positions) - targets
@@ -178,7 +179,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Truncated; what is within the tolerance of a landmark's place counts as within the gate."""
+        """Truncated cost; errors below the tolerance count as within the gate."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
@@ -200,7 +201,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
 
 
 def _pairs(count: int) -> list[list[int]]:
-    """All pairs of ``count`` landmarks, or ``MAX_PAIRS`` of them, always the same."""
+    """All pairs of ``count`` landmarks, or ``MAX_PAIRS`` of them drawn with a fixed seed."""
     if count * (count - 1) // 2 <= MAX_PAIRS:
         return [list(pair) for pair in combinations(range(count), 2)]
     rng = np.random.default_rng(0)
@@ -221,7 +222,7 @@ def _rotation(pose: Array) -> Array:
 
 
 def _by_alignment(pose: Array, positions: Array) -> Array:
-    """Jacobians (K, 2, 3) of aligned positions by the alignment's (x, y, angle)."""
+    """Jacobians (K, 2, 3) of aligned positions with respect to the alignment (x, y, angle)."""
     x, y = (se2.transform_from(pose, positions) - pose[:2]).T
     jacobian = np.zeros((len(positions), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
@@ -238,7 +239,7 @@ def _survey(landmark: Landmark) -> Array:
 
 
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
-    """Whether a learnt point lies significantly off a landmark."""
+    """Whether a learnt point differs significantly from a landmark."""
     error = point.position - np.array((landmark.x, landmark.y))
     covariance = point.covariance + _survey(landmark)
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)
@@ -255,8 +256,8 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: str) -> LandmarkMap:
-    """The map in the frame of the start, without the given one, which cannot be brought together with it."""
-    notes = [f"{note}: it is not judged, and the new map is in the frame of the run's start, without it"]
+    """The map in the frame of the start, without the given one, which cannot be aligned with it."""
+    notes = [f"{note}: it is not judged; the new map is in the frame of the run's start"]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
 
@@ -271,7 +272,7 @@ def _assemble(
     judged: bool = False,
     notes: Sequence[str] = (),
 ) -> LandmarkMap:
-    """The map with the landmarks of the given one in their order, then the new ones; those to ``keep`` are the given ones."""
+    """The map with the landmarks of the given one in their order, then the new ones; those in ``keep`` are the given ones."""
     entries, landmarks = [], {}
     for name in (*log.world.landmarks, *sorted(set(learnt) - set(log.world.landmarks), key=_natural)):
         point = learnt.get(name)
@@ -286,5 +287,5 @@ def _assemble(
 
 
 def _natural(name: str) -> tuple[int, str]:
-    """10 after 9, and words after numbers as text."""
+    """Sort key: 10 after 9, names without numbers after those with numbers."""
     return (int(name), "") if name.isdecimal() else (10**9, name)

@@ -1,8 +1,8 @@
-"""A map of 3-D points learnt from images with known camera poses: the paper's "bearing-only" learning of its landmarks.
+"""Maps of 3-D points from images with known camera poses.
 
-Keyframes are chosen, features matched near epipolar lines and chained into tracks, these triangulated under enough
-parallax, and points and cameras adjusted together. What is seen often enough and known well enough is kept, with what it looks like
-from a few sides.
+Keyframes are chosen, features are matched near epipolar lines and chained into tracks, tracks with enough parallax are
+triangulated, and points and cameras are adjusted together. Points with enough observations and small enough covariances are
+kept, with descriptors from a few directions.
 """
 
 from collections.abc import Callable
@@ -22,18 +22,18 @@ from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 MOST_KEYFRAMES = 600
-WIDER = 1.3  # between keyframes, until there are not too many
-DEPTH = 2.0  # m, typical: at it a camera's shift counts as pixels
-GATE = 3.0  # standard deviations, of the distance to an epipolar line
+WIDER = 1.3  # factor on the distance of keyframes, until there are not too many
+DEPTH = 2.0  # m, typical depth at which a camera's translation is converted to pixels
+GATE = 3.0  # standard deviations of the distance to an epipolar line
 NARROW, WIDE = 3.0, 25.0  # px, bounds of that gate
 
 
 @dataclass(frozen=True)
 class PointSettings:
-    """``distance`` [m] and ``angle`` [rad] between keyframes, 0 for all frames. ``focal``: the focal length is adjusted too.
+    """``distance`` [m] and ``angle`` [rad] between keyframes, 0 for all frames. ``focal``: whether to adjust the focal length.
 
-    A point is kept that is seen in ``observations`` keyframes or more, under a ``parallax`` [rad] at least, with a standard
-    deviation of at most ``sigma`` [m] in its worst direction, and with the looks of at most ``views`` keyframes.
+    A point is kept if it is seen in ``observations`` keyframes, under a ``parallax`` [rad] at least, with a standard deviation
+    of at most ``sigma`` [m] in its worst direction; it keeps the descriptors of at most ``views`` keyframes.
     """
 
     distance: float = 0.1
@@ -47,9 +47,10 @@ class PointSettings:
 
 @dataclass(frozen=True)
 class PointReport:
-    """Counts on the way; errors of the kept observations: root mean square and median absolute value [px] of their coordinates;
-    medians of the parallax [rad] and of the points' worst standard deviation [m]; how far the cameras were ``shifted`` [m] and
-    ``turned`` [rad] from where they were said to be, medians; the ``focal`` length fx [px]."""
+    """Counts at each stage; errors of the kept observations: root mean square and median absolute value [px] of their
+    coordinates; medians of the parallax [rad] and of the points' worst standard deviation [m]; median corrections of the camera
+    poses, ``shifted`` [m] and ``turned`` [rad]; the ``focal`` length fx [px].
+    """
 
     keyframes: int
     pairs: int
@@ -68,7 +69,7 @@ class PointReport:
 
 @dataclass(frozen=True, eq=False)
 class MadePoints:
-    """The map, the ``cameras`` of its keyframes as they were adjusted, with the camera's ``model``, and what there is to report."""
+    """The map, the adjusted ``cameras`` of its keyframes, the camera ``model``, and the report."""
 
     points: PointMap
     cameras: Cameras
@@ -82,9 +83,9 @@ def map_points(
     settings: PointSettings | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadePoints:
-    """The map of what is seen in ``posed`` frames; RunFailedError where nothing is seen from several places.
+    """Make a map of the points seen in ``posed`` frames.
 
-    ``progress`` is given the share done.
+    ``progress`` is called with the fraction done. Raises RunFailedError if no point is observed from several places.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -96,7 +97,7 @@ def map_points(
         progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
     tracks = chained(posed.frames, matches)
     found = triangulate(model, posed.cameras, tracks)
-    # the poses' errors are in the rays' too, until all is adjusted
+    # until all is adjusted, the rays contain the errors of the poses
     good = found.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
@@ -111,7 +112,7 @@ def map_points(
             focal=settings.focal,
             progress=lambda share: progress(0.7 + 0.3 * share),
         )
-    except RuntimeError as error:  # GTSAM's of a system that is not determined
+    except RuntimeError as error:  # raised by GTSAM for an underdetermined system
         raise RunFailedError(f"points and cameras cannot be adjusted: {told(error)}") from error
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
@@ -136,7 +137,7 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Indices of the frames that are used, far enough apart that there are not too many."""
+    """Indices of the keyframes, with a spacing that bounds their number."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
     while True:
@@ -147,7 +148,7 @@ def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
 
 
 def epipolar_gate(model: CameraModel, covariances: Array) -> float:
-    """How far [px] from its epipolar line a feature may be, as the cameras' ``covariances`` (F, 6, 6) say."""
+    """Gate [px] on the distance from an epipolar line, given the cameras' ``covariances`` (F, 6, 6)."""
     turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
     sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
     return float(np.clip(GATE * sigma, NARROW, WIDE))
@@ -156,7 +157,7 @@ def epipolar_gate(model: CameraModel, covariances: Array) -> float:
 def point_map(
     posed: PosedFrames, cameras: Cameras, tracks: Tracks, points: Array, covariances: Array, views: int
 ) -> PointMap:
-    """The map of ``points`` (T, 3), each with at most ``views`` of its looks."""
+    """The map of ``points`` (T, 3), each with the descriptors of at most ``views`` observations."""
     shown = _different_views(cameras, tracks, points, views)
     seen = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
     return PointMap(
@@ -172,7 +173,7 @@ def point_map(
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
-    """Tracks, positions, covariances and parallaxes of what is good enough."""
+    """Tracks, positions, covariances and parallaxes of the points that fulfil the settings."""
     tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
     angles = parallax(adjusted.cameras, points, tracks)
     good = (
@@ -189,8 +190,9 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
 
 
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
-    """Observations (V,), at most ``views`` of each point: the one nearest to their mean, then each time the one that differs
-    most, in direction or in the logarithm of the distance, from those chosen."""
+    """Observations (V,), at most ``views`` of each point: the one nearest to their mean, then repeatedly the one that differs
+    most, in direction or log distance, from those chosen.
+    """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")
     for rows in np.split(order, np.cumsum(tracks.lengths())[:-1]):
@@ -215,7 +217,7 @@ def _worst(covariances: Array) -> Array:
 
 
 def _moved(before: Cameras, after: Cameras) -> tuple[Array, Array]:
-    """How far each camera was shifted (F,) [m] and turned (F,) [rad]."""
+    """Change of each camera's position (F,) [m] and orientation (F,) [rad]."""
     trace = np.einsum("nij,nij->n", before.rotations, after.rotations)
     shift = np.linalg.norm(after.positions - before.positions, axis=1)
     return shift, np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

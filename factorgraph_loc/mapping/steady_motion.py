@@ -1,7 +1,7 @@
-"""A camera that moves on as it did: constant velocity in SE(3) from frame to frame.
+"""Constant-velocity motion model in SE(3) between consecutive frames.
 
-The change of velocity between two frames is white noise, as of the impulses of Davison, Reid, Molton, Stasse, "MonoSLAM", PAMI
-29(6), 2007, section 3.4.
+Velocity increments are white noise, as the impulses of Davison, Reid, Molton, Stasse, "MonoSLAM", PAMI 29(6), 2007, section
+3.4.
 """
 
 from dataclasses import dataclass
@@ -14,20 +14,21 @@ from gtsam.symbol_shorthand import X
 from factors.se2 import Array
 
 TURN, SHIFT = 6.0, 4.0  # rad/s^2, m/s^2
-UNEVEN = 0.5  # share by which two intervals may differ
+UNEVEN = 0.5  # relative difference of two intervals that is allowed
 ROBUST = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyMotion:
-    """Camera i was taken at ``t`` (F,) [s], ascending; ``longest`` [s]: the interval up to which frames tell of
-    their neighbours."""
+    """Motion model of a camera with frames at ``t`` (F,) [s], ascending; ``longest`` [s]: the largest interval between frames
+    that is modelled.
+    """
 
     t: Array
     longest: float = 0.5
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """A factor on each three frames that follow each other evenly enough."""
+        """Add a factor on each three consecutive frames at sufficiently even intervals."""
         steps = np.diff(self.t)
         for i, (first, second) in enumerate(zip(steps[:-1].tolist(), steps[1:].tolist(), strict=True)):
             if max(first, second) > self.longest or abs(second - first) > UNEVEN * min(first, second):
@@ -42,8 +43,12 @@ class SteadyMotion:
 def change_of_velocity(
     first: gtsam.Pose3, second: gtsam.Pose3, third: gtsam.Pose3, ratio: float
 ) -> tuple[Array, list[Array]]:
-    """How much more (6,) the pose changes from ``second`` to ``third`` than it did from ``first`` to ``second``, ``ratio`` being
-    that of the intervals, turn first, then shift; and its Jacobians (6, 6) by the body-frame perturbations of the three."""
+    """The change of velocity (6,), rotation first, and its Jacobians (6, 6) with respect to body-frame perturbations of the
+    poses.
+
+    It is the increment from ``second`` to ``third``, minus ``ratio`` (that of the intervals) times that from ``first`` to
+    ``second``.
+    """
     one, two = first.between(second), second.between(third)
     by_one, by_two = gtsam.Pose3.LogmapDerivative(one), gtsam.Pose3.LogmapDerivative(two)
     error = gtsam.Pose3.Logmap(two) - ratio * gtsam.Pose3.Logmap(one)

@@ -1,4 +1,4 @@
-"""What a log tells of its RFID tags: all looks of all antennas, and what is given of each tag beside its place."""
+"""The tag reads of a log as counts per antenna and tag, with the known properties of the tags."""
 
 from dataclasses import dataclass
 
@@ -19,11 +19,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class TagLooks:
-    """K looks at T tags, in order of time.
+    """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
 
-    ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): places in the ``model``; ``rounds`` (K,); ``hits`` (K, T). ``heights``
-    (T,) [m] and ``facing`` (T,) [rad], in the world, NaN where not known; ``positions`` (T, 2): as the log's map has them, in the
-    world, NaN where it does not.
+    ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): indices in the ``model``; ``rounds`` (K,); ``hits`` (K, T).
+    ``heights`` (T,) [m] and ``facing`` (T,) [rad] in the world, NaN where unknown; ``positions`` (T, 2): from the log's map,
+    NaN where it has none.
     """
 
     model: RfidModel
@@ -37,17 +37,17 @@ class TagLooks:
     positions: Array
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """The looks ``which`` at all tags, made from ``poses`` (K', 3) in the world, as seen from the world's origin."""
+        """Read counts of the observations ``which``, from robot ``poses`` (K', 3) in the world, relative to the world's origin."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
 def tag_looks(log: Log, height: float | None = None) -> TagLooks:
-    """All looks of a log at the tags that it read or that its map has.
+    """All antenna observations of the tags that a log read or that its map contains.
 
-    Height and facing of a tag are those of the map. Where that lacks the tag, its ``height`` [m] is the one given, else that of
-    the antennas on average, and its facing is not known.
+    Heights and facings come from the map. For other tags the height is ``height`` [m], by default the mean height of the
+    antennas, and the facing is unknown.
 
-    Raises InputError if the log has no reads, or its rig no antennas that made one.
+    Raises InputError if the log has no reads, or none by an antenna of its rig.
     """
     scans = whole_scans(log)
     found = {epc for scan in scans for epc in scan.tags}
@@ -85,10 +85,10 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
 def _rows(
     m: RfidScan, antennas: dict[str, int], index: dict[str, int]
 ) -> list[tuple[float, int, int, NDArray[np.int64]]]:
-    """A look for each antenna of the rig that listened: time, antenna, rounds, and hits (T,)."""
+    """Antenna observations of a scan: time, antenna, rounds, and hits (T,)."""
     places = [antennas.get(name, -1) for name in m.antennas]
     out = {a: (m.t, a, places.count(a), np.zeros(len(index), dtype=np.int64)) for a in sorted(set(places) - {-1})}
-    # a tag counts once a round, as often as it may answer in it
+    # a tag counts once per round, even if it answers several times
     for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
         if places[number] >= 0:
             out[places[number]][3][index[name]] += 1

@@ -1,6 +1,6 @@
-"""Maps of RFID tags from a log: along its reference, or from odometry and reads alone, and what they say about a given map.
+"""Maps of RFID tags from a log, along its reference or from odometry and reads alone, and comparison with a given map.
 
-What is written is in the frame of the survey of the log's rig (``[survey]``), so that the map works with that rig as it is.
+The map is written in the frame of the survey of the log's rig (``[survey]``), so that it fits that rig.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,16 +26,17 @@ from factors import se2
 from factors.se2 import Array
 
 START_SIGMA = 1e-3  # m and rad
-MAX_GAP = 0.5  # s between poses of the reference that are interpolated
+MAX_GAP = 0.5  # s between poses of the reference, beyond which it is not interpolated
 
 Poses = Literal["reference", "odometry"]
 
 
 @dataclass(frozen=True)
 class MadeTags:
-    """A map of tags: ``world`` to be written; ``made``: the same in the world's frame as of landmarks, with verdicts on the given
-    map; ``poses`` (N, 3): the way of the robot in that frame; ``open``: by EPC, why a tag was not located; ``modes``: where
-    ambiguous tags may be, in that frame."""
+    """A map of tags: ``world`` as written to a file; ``made``: the same as landmarks in the world frame, with verdicts on the
+    given map; ``poses`` (N, 3): the trajectory in that frame; ``open``: by EPC, why a tag was not located; ``modes``: candidate
+    positions of ambiguous tags in that frame.
+    """
 
     world: World
     made: LandmarkMap
@@ -45,7 +46,7 @@ class MadeTags:
 
     @property
     def rms(self) -> float | None:
-        """Root mean square distance [m] from the given to the learnt places, None where no tag has both."""
+        """Root mean square distance [m] between given and learnt positions, None if no tag has both."""
         distances = [e.distance for e in self.made.entries if e.distance is not None and e.verdict != "given"]
         return float(np.sqrt(np.mean(np.square(distances)))) if distances and self.made.judged else None
 
@@ -59,12 +60,12 @@ def map_tags(
     height: float | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadeTags:
-    """The map of the tags that a log read.
+    """Make a map of the tags that a log read.
 
-    ``poses``: the reference's, or estimated together with the tags, from ``prior`` on, which defines the frame. Without a prior
-    the first pose is the origin, and the facings of the log's map, which mean nothing there, are not used. ``extend``: the tags of
-    the log's map stay as they are, and help to estimate the poses; else the map's places are only compared. ``height`` [m]: of
-    tags that the map lacks; else that of the antennas.
+    ``poses``: those of the reference, or estimated together with the tags, starting from ``prior``, which defines the frame.
+    Without a prior the first pose is the origin, and the facings of the log's map are not used. ``extend``: the tags of the
+    log's map are kept as they are and used to estimate the poses; otherwise they are only compared. ``height`` [m]: of tags
+    that the map lacks, by default the mean height of the antennas.
 
     Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
     """
@@ -77,13 +78,13 @@ def map_tags(
     else:
         if prior is None:
             if extend:
-                raise InputError(f"{log.name}: to extend its map from odometry the start has to be known in it")
+                raise InputError(f"{log.name}: its map can be extended from odometry only with a known start")
             prior = PosePrior(log.span()[0], np.zeros(3), START_SIGMA**2 * np.eye(3))
             looks = replace(looks, facing=np.full(len(given), np.nan))
         slam = tag_slam(log, looks, prior, known, progress)
         learnt, facing, found, way = slam.tags, slam.facing, slam.found, slam.poses
     if not learnt and not extend:
-        raise RunFailedError(f"{log.name}: no tag was read so often, from such places, that it could be located")
+        raise RunFailedError(f"{log.name}: no tag was read often enough, from different enough places, to be located")
     names = looks.names
     landmarks = {n: _as_landmark(log, n, p) for n, p, g in zip(names, looks.positions, given, strict=True) if g}
     stand_in = replace(log, world=World(landmarks=landmarks))
@@ -106,11 +107,11 @@ def map_tags(
 
 
 def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint], Array, list[Found], Array]:
-    """Each tag on its own, by number; facings (T,); all that was found; and the poses (K, 3) of the looks."""
+    """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one, or that the poses come from odometry")
     if not log.reference.has_heading:
-        raise InputError(f"{log.name}: the heading of its reference means nothing, expected poses from odometry")
+        raise InputError(f"{log.name}: its reference has no headings, expected poses from odometry")
     at = log.reference.at(looks.t, max_gap=MAX_GAP)
     which = np.asarray(np.isfinite(at).all(axis=1))
     if not which.any():
@@ -129,12 +130,12 @@ def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint],
 
 
 def _why(one: Found, reads: int) -> str:
-    """Why a tag is not in the map, in words."""
+    """The reason why a tag is not in the map."""
     if not reads:
         return "never read"
     count = f"read {reads} times" if reads > 1 else "read once"
     if not one.is_explained:
-        return f"{count}: no place explains that clearly better than chance"
+        return f"{count}: no position explains that significantly better than chance"
     if one.is_ambiguous:
         places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in one.modes[:3]]
         return f"{count}: ambiguous, {' or '.join(places)}"
@@ -142,7 +143,7 @@ def _why(one: Found, reads: int) -> str:
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
-    """A given tag in the world's frame."""
+    """A given tag in the world frame."""
     tag = log.world.tags[name]
     x, y = position.tolist()
     if tag.covariance is None:
@@ -161,7 +162,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 
 
 def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool) -> World:
-    """The map as it is written: learnt tags in the frame of the rig's survey, those that were kept as they were given."""
+    """The map as written: learnt tags in the frame of the rig's survey, kept tags as they were given."""
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()
     tags: dict[str, Tag] = {}
@@ -185,6 +186,6 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
             facing=None if np.isnan(direction) else se2.wrap_scalar(direction),
             covariance=covariance,
         )
-    # what else the log's map holds is right only in its frame
+    # other parts of the log's map are valid in its frame only
     rest = log.world if in_given_frame else World()
     return World(name=f"{log.name}-map", landmarks=rest.landmarks, tags=tags, walls=rest.walls)

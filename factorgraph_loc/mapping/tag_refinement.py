@@ -1,4 +1,4 @@
-"""Places of tags brought to the most likely ones near them, by Fisher scoring of the likelihood of all looks, many at once."""
+"""Refinement of tag positions to the nearest local optimum, by Fisher scoring on the likelihood of all antenna observations."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array
 
-LEAST = 0.05  # probability of a read below which an antenna does not reach
+LEAST = 0.05  # probability of a read that defines the reach of an antenna
 ITERATIONS = 30
 CONVERGED = 1e-3  # m
 MAX_DAMPING = 1e6
 LARGEST_STEP = 0.5  # m
-STEP = 0.02  # m, for the curvature
-CHUNK = 256  # candidates that are refined at once, to bound the memory
+STEP = 0.02  # m, of the numerical curvature
+CHUNK = 256  # candidates refined at once, to bound the memory
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """C places (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
+    """C candidate positions (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
 
     tag: NDArray[np.int64]
     places: Array
@@ -34,7 +34,7 @@ class Candidates:
 
 
 def reach(model: RfidModel) -> float:
-    """The distance [m], seen from the robot, at which its antennas begin to read."""
+    """The distance [m] from the robot within which its antennas read."""
     out = 0.0
     bearings = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     for antenna in model.antennas:
@@ -51,7 +51,7 @@ def reach(model: RfidModel) -> float:
 def refine(
     model: RfidModel, looks: TagReadCounts, heights: Array, candidates: Candidates
 ) -> tuple[Candidates, Array, Array]:
-    """Candidates at the optimum nearest to each, its negative log-likelihood (C,) and covariance (C, 2, 2)."""
+    """Candidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
     prior = np.eye(2) / reach(model) ** 2
@@ -67,7 +67,7 @@ def refine(
 
 @dataclass(frozen=True, eq=False)
 class _Refinement:
-    """C places at once, each by looks of its own column of hits."""
+    """C positions at once, each with its own column of hits."""
 
     model: RfidModel
     looks: TagReadCounts
@@ -79,8 +79,9 @@ class _Refinement:
         return RfidLikelihood(self.model, tags).by_tag(np.zeros(3), self.looks)
 
     def solve(self, places: Array) -> tuple[Array, Array, Array]:
-        """Places (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2): the curvature where that is
-        positive definite, else Fisher's."""
+        """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2): the observed curvature where
+        it is positive definite, else the Fisher information.
+        """
         nll, gradient, information = self.at(places)
         places, damping = places.copy(), np.full(len(places), 1e-3)
         moving = np.arange(len(places))

@@ -1,10 +1,10 @@
-"""Where a tag may be, from looks along a known way: all places that explain the reads, not only the best one.
+"""Search for the position of a tag, given known robot poses: all modes of the likelihood, not only the best one.
 
-A lattice of places is searched with the likelihood of all looks, and its best ones are refined by Fisher scoring. After a straight
-pass a tag on the left of the robot may be as likely as one on the right, where the antennas do not tell them apart: then there are
-two modes, and their weights say so. Weights are those of Laplace's method under a uniform prior.
+The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher scoring.
+After a straight pass a tag on the left of the robot may be as likely as one on the right: there are then two modes with weights
+from Laplace's method under a uniform prior.
 
-A facing that matters to the model and is not known is tried in :data:`DIRECTIONS`, then between the best of them.
+An unknown facing that matters to the model is tried in :data:`DIRECTIONS`, then between the best of them.
 """
 
 import math
@@ -21,22 +21,22 @@ from factors.se2 import Array, wrap, wrap_scalar
 CELL = 0.4  # m, of the lattice
 LEVEL = 0.2  # m: tags of about the same height share a lattice
 DIRECTIONS = 8
-CANDIDATES = 6  # of a tag, that are refined
-CUT = 40.0  # above the best of the lattice: a place is not a candidate, however far its optimum may be from the lattice
-APART = 0.9  # m or, of facings, rad, between candidates
-SAME = 0.05  # m between optima that are one
+CANDIDATES = 6  # per tag, that are refined
+CUT = 40.0  # nats above the minimum on the lattice, beyond which a position is not refined
+APART = 0.9  # m or (for facings) rad, between candidates
+SAME = 0.05  # m between optima that are considered equal
 MERGED = 0.5  # m, or
-OVERLAP = 9.0  # squared distance in units of their covariances, between modes that are counted as one
-COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad that looks may be apart to be merged, on the lattice and after
-GAIN = 8.0  # of the log-likelihood: less, the best of a few thousand places also gives to false reads
-SURE = 0.95  # weight of a mode that is the only one
+OVERLAP = 9.0  # squared Mahalanobis distance, between modes that are counted as one
+COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad within which observations are merged, on the lattice and after
+GAIN = 8.0  # of the log-likelihood; false reads can reach less at the best of a few thousand positions
+SURE = 0.95  # weight above which a mode is unique
 LARGEST_SIGMA = 1.0  # m
-LOOKS = 2000  # that are taken to the lattice at once, to bound the memory
+LOOKS = 2000  # observations evaluated on the lattice at once, to bound the memory
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A place where a tag may be: ``position`` (2,) [m], its ``covariance`` (2, 2), ``facing`` [rad] or NaN; weights sum to one."""
+    """A mode of a tag's position: ``position`` (2,) [m], ``covariance`` (2, 2), ``facing`` [rad] or NaN, and its weight."""
 
     weight: float
     position: Array
@@ -46,8 +46,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Found:
-    """What a search for one tag found: ``modes``, the heaviest first; ``reads``: rounds that read it; ``gain``: by how much its
-    tempered log-likelihood at the best place is above that of a tag that is out of reach."""
+    """Search result of one tag: ``modes``, by descending weight (sum 1); ``reads``: rounds that read it; ``gain``: tempered
+    log-likelihood at the best position, relative to a tag out of reach.
+    """
 
     modes: tuple[Mode, ...]
     reads: int
@@ -55,17 +56,17 @@ class Found:
 
     @property
     def is_explained(self) -> bool:
-        """Whether a place explains the reads clearly better than chance does."""
+        """Whether a position explains the reads significantly better than chance."""
         return bool(self.modes) and self.gain > GAIN
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether another place is not clearly worse than the best."""
+        """Whether another position is about as likely as the best."""
         return bool(self.modes) and self.modes[0].weight < SURE
 
     @property
     def is_located(self) -> bool:
-        """Whether there is one place, and its uncertainty is small enough to be of use."""
+        """Whether there is a single mode with a small enough uncertainty."""
         return self.is_explained and not self.is_ambiguous and sigma(self.modes[0].covariance) < LARGEST_SIGMA
 
 
@@ -75,15 +76,16 @@ def sigma(covariance: Array) -> float:
 
 
 def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[Found]:
-    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: from known poses, as
-    seen from the world's origin."""
+    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: read counts from known poses,
+    relative to the world's origin.
+    """
     looks = merged(looks, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
     nothing = math.log1p(-model.false_read) * looks.rounds.sum()
     reads = looks.hits.sum(axis=0)
     odds = math.log(max(model.false_read, 1e-12)) - math.log1p(-model.false_read)
     nowhere = -model.tempering * (nothing + reads * odds)
-    # a tag with fewer reads cannot be located, wherever it is
+    # a tag with fewer reads cannot be located
     searched = -model.tempering * reads * odds > GAIN
     coarse = _lattice_search(
         model, merged(looks, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
@@ -103,7 +105,7 @@ def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array
 
 
 def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """The looks, those of one antenna counted together while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
+    """Read counts with those of one antenna added up while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
     group = np.empty(len(looks.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -127,7 +129,7 @@ def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts
 def _lattice_search(
     model: RfidModel, looks: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> Candidates:
-    """The best places of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
+    """The best candidates of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
     cells = _cells(looks.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
@@ -149,7 +151,7 @@ def _lattice_search(
 
 
 def _cells(places: Array, distance: float) -> Array:
-    """The lattice (G, 2) within a distance of any place."""
+    """The lattice points (G, 2) within ``distance`` of any place."""
     low, high = places.min(axis=0) - distance, places.max(axis=0) + distance
     axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True)]
     x, y = np.meshgrid(*axes, indexing="ij")
@@ -182,7 +184,7 @@ def _nll(
 
 
 def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, float, float]]:
-    """The best places (x, y, facing), apart from each other."""
+    """The best candidates (x, y, facing), separated from each other."""
     nll = np.stack([column for column, _ in table])
     directions = np.array([direction for _, direction in table])
     out: list[tuple[float, float, float]] = []
@@ -199,7 +201,7 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
 
 
 def _modes(found: Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...]:
-    """Optima of one tag, the best first, as modes: those that are near each other, which differ in facing, are one."""
+    """Optima of one tag, best first, as modes; neighbouring ones, which differ in facing, are merged."""
     kept: list[int] = []
     for i in range(len(nll)):
         apart = np.hypot(*(found.places[kept] - found.places[i]).T)

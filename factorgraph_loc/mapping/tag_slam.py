@@ -1,9 +1,9 @@
-"""Tags and the robot's way at once, from odometry and reads alone.
+"""Joint estimation of tag positions and robot trajectory from odometry and reads.
 
-The way is built a stretch at a time, so that odometry drifts little beyond what is known of the tags: the poses of a stretch and
-all before are optimised with the tags that are in the map (:class:`factors.rfid.tag_factor.RfidTagFactor`), then those that are not
-are searched along the way (:mod:`factorgraph_loc.mapping.tag_search`), and come in as soon as one place alone explains their
-reads. At the end all tags are searched once more along the whole way, and the problem is solved again where one lies elsewhere.
+The trajectory grows in stretches, to bound the drift of the odometry: all poses so far are optimised with the mapped tags
+(:class:`factors.rfid.tag_factor.RfidTagFactor`), then the remaining tags are searched
+(:mod:`factorgraph_loc.mapping.tag_search`) and added to the map once a single position explains their reads. At the end all
+tags are searched again along the whole trajectory, and the problem is solved again if one has moved.
 """
 
 from collections.abc import Callable
@@ -36,11 +36,11 @@ from factors.rfid.tag_factor import RfidTagFactor
 from factors.se2 import Array
 
 INTERVAL = 1.0  # s between keyframes
-STRETCH = 15  # keyframes that are added at a time
-WINDOW = 90  # keyframes back from the newest along which new tags are searched
-MARGIN = 1.0  # m beyond the reach: farther from a keyframe a tag that was not read there is left out
+STRETCH = 15  # keyframes per stretch
+WINDOW = 90  # latest keyframes along which new tags are searched
+MARGIN = 1.0  # m beyond the reach, outside of which missed reads of a tag are ignored
 ITERATIONS, FINAL_ITERATIONS = 4, 40
-ROUNDS = 3  # of searching all tags once more
+ROUNDS = 3  # of searching all tags again at the end
 ELSEWHERE = 13.8  # 99.9 % of chi-square with two degrees of freedom
 
 Factors = list[tuple[Factor, tuple[int, ...]]]
@@ -48,8 +48,9 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 
 @dataclass(frozen=True)
 class TagSlam:
-    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: by number, those that were located; ``facing`` (T,);
-    ``found``: what the last search said of each of T tags."""
+    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: the located ones by index; ``facing`` (T,); ``found``: result
+    of the last search for each of T tags.
+    """
 
     t: Array
     poses: Array
@@ -61,24 +62,24 @@ class TagSlam:
 def tag_slam(
     log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
 ) -> TagSlam:
-    """Map the tags that are not ``known`` (T,); those stay where ``looks.positions`` has them. The frame is the prior's."""
-    way = _Way(log, looks, prior, known)
-    count = len(way.t)
+    """Map the tags that are not ``known`` (T,); known ones stay at ``looks.positions``. The frame is that of the prior."""
+    problem = _Problem(log, looks, prior, known)
+    count = len(problem.t)
     for end in (*range(STRETCH, count, STRETCH), count):
-        way.extend(end)
-        way.solve(ITERATIONS)
-        way.take_in(way.search(~way.mapped, max(0, end - WINDOW)))
+        problem.extend(end)
+        problem.solve(ITERATIONS)
+        problem.add_located(problem.search(~problem.mapped, max(0, end - WINDOW)))
         progress(end / count)
     for _ in range(ROUNDS):
-        way.solve(FINAL_ITERATIONS)
-        found = way.search(~known, 0)
-        if not way.take_in(found):
+        problem.solve(FINAL_ITERATIONS)
+        found = problem.search(~known, 0)
+        if not problem.add_located(found):
             break
-    return way.result(found)
+    return problem.result(found)
 
 
-class _Way:
-    """The problem as far as it has been built."""
+class _Problem:
+    """The optimisation problem as built so far."""
 
     def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = looks, prior, known
@@ -103,14 +104,14 @@ class _Way:
         self._count = 1
 
     def extend(self, count: int) -> None:
-        """Poses up to ``count`` keyframes, by odometry."""
+        """Add poses up to keyframe ``count`` by odometry."""
         for i in range(self._count, count):
             step = self._recalibrated(self._steps[i - 1])
             self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)
         self._count = max(self._count, count)
 
     def search(self, wanted: NDArray[np.bool_], first: int) -> list[Found]:
-        """Search the ``wanted`` (T,) tags by the looks from keyframe ``first`` on; nothing is found of the others."""
+        """Search the ``wanted`` (T,) tags in observations from keyframe ``first`` on; the result of the others is empty."""
         which = self._used & (self._keyframe >= first) & (self._keyframe < self._count)
         poses = se2.compose(self._poses()[self._keyframe[which]], self._offsets[which])
         along = self._looks.along(poses, which)
@@ -123,8 +124,8 @@ class _Way:
                 out[tag] = one
         return out
 
-    def take_in(self, found: list[Found]) -> bool:
-        """Put tags where the search located them, those that are in the map only if that is clearly elsewhere; whether any."""
+    def add_located(self, found: list[Found]) -> bool:
+        """Add located tags, and move mapped ones that were located significantly elsewhere; whether anything changed."""
         changed = False
         for tag, one in enumerate(found):
             if self._known[tag] or not one.is_located:
@@ -200,8 +201,9 @@ class _Way:
 
 
 def _keyframes(begin: float, end: float, stamps: Array) -> Array:
-    """Times ``INTERVAL`` apart from ``begin`` to ``end`` [s], without those inside of long gaps between ``stamps``: a clock that
-    jumps makes no keyframes. Before the first stamp behind a gap there is one."""
+    """Times [s] at intervals of ``INTERVAL`` from ``begin`` to ``end``, without those inside of long gaps between ``stamps``,
+    and with one before the first stamp after a gap.
+    """
     measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
     gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)
     firsts = np.append(0, ((measured[gaps + 1] - begin) / INTERVAL).astype(np.int64))

@@ -1,4 +1,4 @@
-"""Where a robot can drive: cells of a grid that are free, distances to walls, and shortest paths over the cells."""
+"""Space in which a robot can drive: free cells of a grid, distances to walls, and shortest paths."""
 
 import math
 from dataclasses import dataclass
@@ -14,14 +14,17 @@ from factorgraph_loc.maps.walls import Walled
 from factors.se2 import Array
 
 CELL = 0.2  # m
-SPACING = 0.05  # m, between the points of a path
+SPACING = 0.05  # m, between points of a path
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Cells of :data:`CELL` that are free and connected: ``centres`` (K, 2), the ``graph`` (K, K) of distances between neighbours,
-    ``index`` (NX, NY): places among them, -1 elsewhere, and ``origin`` (2,) of the first cell's corner. ``distance`` (NX, NY) [m]:
-    from the middle of each cell to the nearest wall; ``clearance`` [m]: what free cells keep to walls."""
+    """The largest connected set of K free cells of size :data:`CELL`.
+
+    ``centres`` (K, 2) [m]; ``graph`` (K, K): distances between neighbours [m]; ``index`` (NX, NY): number of each cell, -1
+    where it is not free; ``origin`` (2,) [m]: corner of the first cell; ``distance`` (NX, NY) [m]: from the centre of each cell
+    to the nearest wall; ``clearance`` [m]: the least distance of free cells from walls.
+    """
 
     centres: Array
     graph: sparse.csr_matrix
@@ -31,19 +34,22 @@ class FreeSpace:
     clearance: float
 
     def cells(self, points: Array) -> NDArray[np.int64]:
-        """Places (N,) among the free cells of those in which points (N, 2) lie, -1 where they are not free."""
+        """Return the numbers (N,) of the free cells that contain points (N, 2), -1 where a point is not in one."""
         places = np.floor((points - self.origin) / CELL).astype(np.int64)
         inside = np.all((places >= 0) & (places < self.index.shape), axis=-1)
         i, j = np.where(inside[:, None], places, 0).T
         return np.where(inside, self.index[i, j], -1)
 
     def clear(self, a: Array, b: Array) -> bool:
-        """Whether the straight line between two points runs over free cells alone."""
+        """Whether the straight line between two points crosses free cells only."""
         return bool(_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
 def free_space(world: Walled, clearance: float) -> FreeSpace:
-    """Where a robot may be that keeps ``clearance`` [m] to all walls of the world; the largest connected part."""
+    """Return the space in which a robot keeps ``clearance`` [m] from all walls: its largest connected part.
+
+    Raises InputError if the world has no walls, or no cell has that clearance.
+    """
     walls = np.array(world.walls).reshape(-1, 2, 2)
     if not len(walls):
         raise InputError(f"world {world.name}: has no walls, expected some around the space to drive in")
@@ -74,13 +80,15 @@ def distance_to_walls(world: Walled, points: Array) -> Array:
 
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
-    """Corners (N, 2) of a short path between two cells: a shortest one on the grid, straightened where the way is clear."""
+    """Return the corners (N, 2) of a short path between two cells: the shortest one on the grid, straightened where possible."""
     _, before = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
     return straightened(space, space.centres[chain(before, start)])
 
 
 def chain(before: NDArray[np.int32], start: int) -> list[int]:
-    """The cells from ``start`` to the root of a tree of shortest paths, of which ``before`` (K,) has each cell's next."""
+    """Return the cells from ``start`` to the root of a tree of shortest paths, given the predecessor ``before`` (K,) of each
+    cell.
+    """
     cells = [start]
     while before[cells[-1]] >= 0:
         cells.append(int(before[cells[-1]]))
@@ -88,10 +96,10 @@ def chain(before: NDArray[np.int32], start: int) -> list[int]:
 
 
 def straightened(space: FreeSpace, points: Array) -> Array:
-    """Those of the points (N, 2) of a path that are its corners, once the way is straight wherever that is clear."""
+    """Return the corners of a path (N, 2) after replacing visible stretches by straight lines."""
     corners, i = [0], 0
     while i < len(points) - 1:
-        # the farthest point in sight, by bisection: nearer ones are in sight where farther ones are, nearly always
+        # bisection for the farthest visible point: nearer ones are visible where farther ones are, nearly always
         low, high = i + 1, len(points) - 1
         while low < high:
             middle = (low + high + 1) // 2
@@ -102,14 +110,14 @@ def straightened(space: FreeSpace, points: Array) -> Array:
 
 
 def dense(corners: Array, spacing: float = SPACING) -> Array:
-    """Points ``spacing`` [m] apart on the way through ``corners`` (N, 2), the first left out."""
+    """Return points at intervals of ``spacing`` [m] along the path through ``corners`` (N, 2), without the first."""
     along = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
     s = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))[1:]
     return np.column_stack((np.interp(s, along, corners[:, 0]), np.interp(s, along, corners[:, 1])))
 
 
 def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
-    """Edges to the eight neighbours; to the diagonal ones only where both cells beside them are free."""
+    """Return edges to the eight neighbours; diagonal ones only where both adjacent cells are free."""
     rows, columns, weights = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
         nx, ny = index.shape

@@ -1,4 +1,4 @@
-"""Fiducial markers of a map: squares whose four corners a camera sees as points with names."""
+"""Fiducial markers of a map: squares whose four corners a camera observes as named points."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from factorgraph_loc.files.models import Coordinate, FileModel
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
-# AprilTags as tagBITShDISTANCE, others by the side of their grid of bits and how many there are
+# AprilTags as tagBITShDISTANCE, others by the side of their grid of bits and their number
 MarkerFamily = Literal[
     "tag16h5",
     "tag25h9",
@@ -39,15 +39,15 @@ MarkerFamily = Literal[
 ]
 
 Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
-# right and up as seen from the front, in the order in which detectors of ArUco markers name them
+# right and up seen from the front, in the corner order of ArUco detectors
 CORNERS = np.array(((0.0, -0.5, 0.5), (0.0, 0.5, 0.5), (0.0, 0.5, -0.5), (0.0, -0.5, -0.5)))
 
 
 class Marker(FileModel):
-    """A square marker: its middle [m] in the world, the length of its sides (``size`` [m], of the black square), and how it hangs.
+    """A square marker: ``position`` of its centre [m] in the world, ``size`` [m] of the black square, and orientation.
 
-    ``facing``: where its front looks, as of a tag; ``pitch``: how far that is upwards, -pi/2 on a ceiling; ``roll``: how it is
-    turned counter-clockwise, seen from the front. ``sigma`` [m]: standard deviation of each coordinate of a corner.
+    ``facing``: heading of its normal, as of a tag; ``pitch``: upward tilt of the normal, -pi/2 on a ceiling; ``roll``:
+    counter-clockwise rotation seen from the front. ``sigma`` [m]: standard deviation of each coordinate of a corner.
     """
 
     x: Coordinate
@@ -60,24 +60,24 @@ class Marker(FileModel):
     sigma: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
 
     def corners(self) -> Array:
-        """The corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
+        """Return the corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
         turn = Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
         return np.asarray(turn.apply(self.size * CORNERS) + np.array((self.x, self.y, self.z)))
 
 
 class MarkerSettings(FileModel):
-    """Which markers are looked for in a log's images."""
+    """Which markers to detect in a log's images."""
 
     family: MarkerFamily
 
 
 def corner_names(marker: str) -> list[str]:
-    """The names of its corners as points of a map, in the order of :meth:`Marker.corners`."""
+    """Return the names of a marker's corners as points of a map, in the order of :meth:`Marker.corners`."""
     return [f"{marker}/{i}" for i in range(len(CORNERS))]
 
 
 def corner_points(markers: Mapping[str, Marker]) -> PointMap:
-    """The corners of all markers as points that are known by name."""
+    """Return the corners of all markers as a map of named points."""
     names = [name for marker in markers for name in corner_names(marker)]
     positions = np.array([marker.corners() for marker in markers.values()]).reshape(-1, 3)
     spread = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(-1, 3, 3)

@@ -1,4 +1,4 @@
-"""Occupancy maps of ROS's map_server as walls: an image of cells and a YAML file that says what its greys mean."""
+"""Walls from occupancy maps of ROS's map_server: an image of cells and a YAML file that defines its grey levels."""
 
 import math
 from pathlib import Path
@@ -19,17 +19,17 @@ from factors.se2 import Array
 Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-TOLERANCE = 0.75  # cells that a wall may lie off the middles of the cells: an aslant line is half a cell off them
-MIN_EXTENT = 2.0  # cells: less is noise of the sensor that made the map
+TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for an oblique line
+MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
 
 
 def _zero_or_one(value: Any) -> Any:
-    """``negate`` as Nav2 also takes it: true or false."""
+    """Accept true and false for ``negate``, as Nav2 does."""
     return {"false": 0, "true": 1}.get(value.lower(), value) if isinstance(value, str) else value
 
 
 class MapFile(FileModel):
-    """What map_server of ROS or of Nav2 writes. ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
+    """The YAML file of map_server (ROS or Nav2). ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
 
     image: str
     resolution: Annotated[float, Field(ge=1e-4, le=10.0, description="m per cell")]
@@ -42,17 +42,17 @@ class MapFile(FileModel):
 
 
 def read_walls(path: Path) -> tuple[Wall, ...]:
-    """The outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
+    """Read the outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
 
-    They run through the middles of the outermost occupied cells, within :data:`TOLERANCE`; groups of less than :data:`MIN_EXTENT`
-    are left out. InputError names the file and what is wrong.
+    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`; groups smaller than
+    :data:`MIN_EXTENT` are omitted. Raises InputError with the file and what is wrong.
     """
     stated = parse_model(MapFile, read_yaml(path), path)
     if stated.free_thresh >= stated.occupied_thresh:
         raise bad_field(
             path, "free_thresh", stated.free_thresh, f"less than occupied_thresh, {stated.occupied_thresh:g}"
         )
-    # maps made by a saver name their image without a folder, but nav stacks also write absolute paths
+    # map savers name the image without a folder, but some navigation stacks write absolute paths
     image = inside(path.parent, Path(stated.image).name if Path(stated.image).is_absolute() else stated.image, path)
     occupied = _occupied(image, stated)
     if not occupied.any():
@@ -70,13 +70,13 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
 
 
 def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
-    """Which cells (rows, columns) are occupied; a transparent one is unknown."""
+    """Return which cells (rows, columns) are occupied; a transparent cell is unknown."""
     with opened(path, IMAGE) as file, pillow_image(file, path) as image:
-        # colours count by the mean of their channels, as in map_server
+        # a colour counts by the mean of its channels, as in map_server
         channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
     values = np.asarray(channels, dtype=np.uint8)
     grey = values[:, :, :3].mean(axis=2)
-    if stated.mode == "raw":  # the occupancy in percent, 255 where it is unknown
+    if stated.mode == "raw":  # occupancy in percent, 255 where unknown
         return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))
     occupancy = grey / 255.0 if stated.negate else 1.0 - grey / 255.0
     opaque = values[:, :, 3] > 0 if values.shape[2] == 4 else np.ones(grey.shape, dtype=bool)
@@ -84,7 +84,7 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
 
 
 def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Segments (W, 4) of column, row, column, row."""
+    """Return segments (W, 4) as column, row, column, row."""
     import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
 
     contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -94,6 +94,6 @@ def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
             continue
         corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0].tolist()
         for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            if start != end:  # a wall of one cell is followed there and back
+            if start != end:  # a wall one cell wide is traced in both directions
                 found[(*min(start, end), *max(start, end))] = None
     return np.array(list(found), dtype=np.int64).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""A map of 3-D points with what they look like, kept as ``NAME.points.parquet`` beside a world."""
+"""Maps of 3-D points with image descriptors, stored as ``NAME.points.parquet`` beside a world file."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
-LARGEST_VALUE = 1e6  # of a descriptor
-ROUNDING = 1e-9  # of an eigenvalue, as a share of the largest
+LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
+ROUNDING = 1e-9  # rounding error of an eigenvalue, relative to the largest
 
 
 @dataclass(frozen=True, eq=False)
 class PointMap:
     """P points and V views of them.
 
-    ``names``: P, unique; ``positions`` (P, 3) [m] in the world's frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
-    the views' ``descriptors`` (V, D), empty where points are identified by name alone (V = 0). ``owners`` (V,): which point a view
-    shows; ``seen_from`` (V, 3) [m]: where the camera was; ``sizes`` (V,) [px]: of the feature in that image.
+    ``names``: P, unique; ``positions`` (P, 3) [m] in the world frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
+    the views' ``descriptors`` (V, D), empty where points are identified by name only (V = 0). ``owners`` (V,): the point of
+    each view; ``seen_from`` (V, 3) [m]: the camera's position; ``sizes`` (V,) [px]: size of the feature in the image.
     """
 
     names: tuple[str, ...]
@@ -60,12 +60,12 @@ class PointMap:
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """The place of each name."""
+        """The index of each name."""
         return {name: i for i, name in enumerate(self.names)}
 
     @classmethod
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
-        """Points that are known by name alone; exact where no covariances are given."""
+        """Return a map of points that are identified by name only; exact if no covariances are given."""
         spread = np.zeros((len(names), 3, 3)) if covariances is None else covariances
         nothing = np.empty(0)
         return cls(
@@ -80,9 +80,9 @@ class PointMap:
         )
 
     def with_points(self, others: PointMap, source: object) -> PointMap:
-        """The same with ``others`` that are known by name alone; InputError at a name that is there already."""
+        """Return this map with the named points ``others`` added. Raises InputError if a name exists already."""
         if double := [name for name in others.names if name in self.index]:
-            raise InputError(f"{source}: the point {double[0]} is there twice, expected names that differ")
+            raise InputError(f"{source}: the point {double[0]} is there twice, expected unique names")
         return replace(
             self,
             names=(*self.names, *others.names),
@@ -92,7 +92,7 @@ class PointMap:
 
 
 def write_points(points: PointMap, path: Path) -> None:
-    """Write ``NAME.points.parquet``: one row a view; a point without views has one row without a descriptor."""
+    """Write ``NAME.points.parquet``: one row per view, and one row without a descriptor for a point without views."""
     seen = np.zeros(len(points), dtype=bool)
     seen[points.owners] = True
     unseen = np.flatnonzero(~seen)
@@ -114,9 +114,9 @@ def write_points(points: PointMap, path: Path) -> None:
 
 
 def read_points(path: Path) -> PointMap:
-    """Read ``NAME.points.parquet``; InputError names file, row (from 1) and column of what is wrong.
+    """Read ``NAME.points.parquet``. Raises InputError with the file, row (from 1) and column of what is wrong.
 
-    Rows of one point must agree on its place. Covariances must be positive semi-definite.
+    All rows of a point must have the same position. Covariances must be positive semi-definite.
     """
     table = read_parquet(path)
     missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
@@ -164,7 +164,7 @@ def read_points(path: Path) -> PointMap:
 
 
 def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
-    """The numbers (R,) of a column in ``rows`` (R,), within its bounds."""
+    """Return the numbers (R,) of a column in ``rows`` (R,), checked against its bounds."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
     values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]

@@ -1,4 +1,4 @@
-"""Lines of sight and walls."""
+"""Walls, and lines of sight."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -10,7 +10,7 @@ from factors.se2 import Array
 
 
 class Walled(Protocol):
-    """What has walls, such as a world: its ``name``, and segments (x1, y1, x2, y2) [m]."""
+    """Anything with walls, such as a world: its ``name``, and segments (x1, y1, x2, y2) [m]."""
 
     @property
     def name(self) -> str: ...

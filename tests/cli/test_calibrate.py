@@ -47,7 +47,7 @@ def test_what_the_estimator_accepts_and_what_it_refuses_is_listed_with_its_figur
     assert rows
     assert rows[0][1] in {"accepted", "refused"}
     assert float(rows[0][4]) > 0.0
-    assert "What pays" in report.read_text()
+    assert "Selection" in report.read_text()
 
 
 def test_what_is_there_is_not_replaced_unasked(fgloc, short_log, calibrated):

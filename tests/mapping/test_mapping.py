@@ -178,7 +178,7 @@ def test_too_few_common_landmarks_are_not_judged():
 def test_a_map_of_another_place_is_not_judged():
     made = make_map(log(world(places(8, seed=5))), learnt(places(8), stated=0.01))
     assert not made.judged
-    assert "landmarks agree with the given map at a time" in made.notes[0]
+    assert "landmarks agree with the given map under one alignment" in made.notes[0]
 
 
 def test_many_landmarks_are_aligned_by_a_sample_of_pairs():
