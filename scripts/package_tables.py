@@ -1,9 +1,9 @@
-"""The packages of the project in layers, and what each imports: the table of docs/architecture.md."""
+"""The packages of the project in layers, what each imports and what it shows: the tables of docs/architecture.md."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -35,21 +35,56 @@ def package_of(module: str) -> str:
     return top if top == "factors" else below.partition(".")[0]
 
 
-def imported(module: str, *, at_once: bool = False) -> set[str]:
-    """The modules of this project that a module imports, or names in a string; ``at_once``: when it is itself imported."""
-    tree = ast.parse(MODULES[module].read_text())
-    found: set[str] = set()
+def named(module: str, *, at_once: bool = False) -> set[tuple[str, str]]:
+    """What a module of this project imports, or names in a string, as (module, name in it), the name "" where it is the module
+    itself; ``at_once``: when it is itself imported."""
+    return names_in(MODULES[module], at_once=at_once)
+
+
+def names_in(path: Path, *, at_once: bool = False) -> set[tuple[str, str]]:
+    """Those of a file, see :func:`named`."""
+    tree = ast.parse(path.read_text())
+    found: set[tuple[str, str]] = set()
     for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {m if (m := f"{node.module}.{alias.name}") in MODULES else node.module for alias in node.names}
+            found |= {(node.module, alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            found |= {(alias.name, "") for alias in node.names}
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not at_once:
-            found.add(node.value.partition(":")[0])
+            place, _, name = node.value.partition(":")
+            found.add((place, name))
+    return {(place, name) for place, name in found if place in MODULES}
+
+
+def imported(module: str, *, at_once: bool = False) -> set[str]:
+    """The modules of this project that a module imports, or names in a string; ``at_once``: when it is itself imported."""
+    found = {m if (m := f"{place}.{name}") in MODULES else place for place, name in named(module, at_once=at_once)}
     if at_once:  # and the packages that they are in
         found |= {".".join(parts[:i]) for m in found for parts in (m.split("."),) for i in range(2, len(parts))}
         found = {m for m in found if not module.startswith(f"{m}.")}
     return {m for m in found if m in MODULES and m != module}
+
+
+def steps(place: str, name: str, user: str = "") -> Iterator[tuple[str, str]]:
+    """The (package, module or name in it) that whoever imports ``name`` from ``place`` passes, from the outside in, leaving out
+    the packages that ``user``, the module that imports it, is in itself."""
+    parts = [*place.split("."), *([name] if name else [])]
+    for i in range(1, len(parts)):
+        package = ".".join(parts[:i])
+        if package in FACES and not f"{user}.".startswith(f"{package}."):
+            yield package, parts[i]
+
+
+def _face(path: Path) -> tuple[str, ...]:
+    """What a package lists as ``__all__``: what other packages may import of it."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "__all__":
+            return tuple(ast.literal_eval(node.value))
+    return ()
+
+
+# of each package below factorgraph_loc, whose own names are for scripts
+FACES = {m: _face(path) for m, path in MODULES.items() if path.name == "__init__.py" and m != "factorgraph_loc"}
 
 
 def tables() -> Iterator[str]:
@@ -59,7 +94,19 @@ def tables() -> Iterator[str]:
     for packages in reversed(LAYERS):
         for package in packages:
             if package:
-                yield f"| `{package}` | {_what(package)} | {', '.join(f'`{name}`' for name in _below(package))} |"
+                yield f"| `{package}` | {_what(package)} | {_listed(_below(package))} |"
+    yield from ("", "## What a package shows", "")
+    yield "Other packages import nothing but what a package lists as `__all__`, here: its public modules and names. The rest is"
+    yield "its inside, and may change without notice."
+    yield from ("", "| package | modules | of these private | public |", "|---|---|---|---|")
+    for package, face in sorted(FACES.items()):
+        inside = {m.rpartition(".")[2] for m in MODULES if m.rpartition(".")[0] == package}
+        name = package.removeprefix("factorgraph_loc.")
+        yield f"| `{name}` | {len(inside)} | {len(inside - set(face))} | {_listed(face)} |"
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def _below(package: str) -> list[str]:

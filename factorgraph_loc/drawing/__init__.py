@@ -1,1 +1,3 @@
 """The style of plots, and helpers for HTML pages."""
+
+__all__ = ["figures", "markup"]

@@ -10,9 +10,8 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.registry import channels, functions, moving
-from factorgraph_loc.sensors.usage import Prepared, Use
+from factorgraph_loc.sensors.usage import Prepared, Use, lacking_section
 from factorgraph_loc.text import listed, quoted
 
 
@@ -83,14 +82,6 @@ def fill_cache(uses: Iterable[Use]) -> None:
     """
     with suppress(FglocError):
         any(prepare(use).images for use in uses)
-
-
-def lacking_section(rig: Rig, sensor: str) -> str:
-    """The section without which a sensor tells nothing, if the rig lacks it."""
-    channel = channels().get(sensor)
-    if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
-        return ""
-    return channel.section
 
 
 def _told_columns(log: Log) -> tuple[str, ...]:

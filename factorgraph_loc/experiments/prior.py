@@ -6,19 +6,16 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FARTHEST
-from factorgraph_loc.model.belief import PosePrior, SpacePose
+from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior, SpacePose
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.space_pose import planar_estimate
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.registry import moving
-from factorgraph_loc.slam.space_pose import planar_estimate
 from factorgraph_loc.text import quoted
 
 # of a start read from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
-# of a start that a person typed
-POSITION_SIGMA = 0.05  # m
-HEADING_SIGMA = 0.05  # rad
 
 KNOWN = "reference, log or X,Y,HEADING"
 EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"

@@ -1,1 +1,3 @@
 """The library for a robot that drives."""
+
+__all__ = ["localizer"]

@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.experiments.preparation import lacking_section
-from factorgraph_loc.experiments.prior import HEADING_SIGMA, POSITION_SIGMA
 from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.files.values import numbers, seconds_of
-from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.registry import sensor_of
+from factorgraph_loc.sensors.usage import lacking_section
 from factorgraph_loc.text import quoted
 
 # m and rad, as a covariance has them; wider than either no place is known, and narrower none is measured

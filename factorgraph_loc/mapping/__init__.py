@@ -1,1 +1,11 @@
 """Maps made from logs: landmarks, tags, and 3-D points from images."""
+
+__all__ = [
+    "camera_poses",
+    "image_localization",
+    "map_figure",
+    "mapping",
+    "point_mapping",
+    "tag_mapping",
+    "triangulation",
+]

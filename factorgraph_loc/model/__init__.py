@@ -1,1 +1,27 @@
 """Values that all packages share: logs, rigs, worlds, trajectories, beliefs, diagnostics."""
+
+__all__ = [
+    "belief",
+    "diagnostics",
+    "learnt",
+    "log",
+    "measurement",
+    "motion",
+    "planar",
+    "result",
+    "rig",
+    "scoring",
+    "sections",
+    "settings",
+    "setup",
+    "simulation_units",
+    "space_pose",
+    "stream",
+    "survey",
+    "ticks",
+    "trajectory",
+    "trajectory3",
+    "units",
+    "variable",
+    "world",
+]

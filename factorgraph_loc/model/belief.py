@@ -10,6 +10,10 @@ import numpy as np
 
 from factors.se2 import Array
 
+# of a start that is told as a pose alone
+POSITION_SIGMA = 0.05  # m
+HEADING_SIGMA = 0.05  # rad
+
 Status = Literal["unlocalized", "ambiguous", "localized"]
 
 

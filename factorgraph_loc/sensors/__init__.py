@@ -1,1 +1,22 @@
 """A package for each sensor: its measurement, stream, settings, map, simulation, calibration and summary."""
+
+__all__ = [
+    "base",
+    "binding",
+    "calibrating",
+    "camera",
+    "forecast",
+    "known_position",
+    "landmarks",
+    "marks",
+    "measurements",
+    "odometry",
+    "pushed",
+    "registry",
+    "rfid",
+    "simulated",
+    "summary",
+    "tables",
+    "twist",
+    "usage",
+]

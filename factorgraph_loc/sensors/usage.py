@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.registry import channels
 
 
 @dataclass(frozen=True)
@@ -29,3 +31,11 @@ class Prepared:
     warnings: tuple[str, ...] = ()
     images: int = 0
     seconds: float = 0.0
+
+
+def lacking_section(rig: Rig, sensor: str) -> str:
+    """The section without which a sensor tells nothing, if the rig lacks it."""
+    channel = channels().get(sensor)
+    if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
+        return ""
+    return channel.section

@@ -22,6 +22,7 @@ from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.model.space_pose import planar_estimate, planar_trajectory
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
@@ -45,7 +46,6 @@ from factorgraph_loc.slam.space_motion import (
     planar,
     standstill,
 )
-from factorgraph_loc.slam.space_pose import planar_estimate, planar_trajectory
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import positive, se2

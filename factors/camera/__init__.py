@@ -1,1 +1,3 @@
 """Pixels of points in space: model, kernels, factors."""
+
+__all__ = ["factor", "inverse_depth", "kernels", "model", "native", "update_kernels", "visual_odometry"]

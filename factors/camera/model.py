@@ -87,6 +87,15 @@ def mounting(roll: float, pitch: float, yaw: float) -> Array:
     return np.asarray(about_z @ about_y @ about_x @ FORWARD)
 
 
+def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a camera whose optical axes stand in the robot's frame as ``rotation`` (3, 3): the inverse of
+    :func:`mounting`."""
+    turned = rotation @ FORWARD.T
+    yaw = math.atan2(turned[1, 0], turned[0, 0])
+    pitch = math.atan2(-turned[2, 0], math.hypot(turned[0, 0], turned[1, 0]))
+    return math.atan2(turned[2, 1], turned[2, 2]), pitch, yaw
+
+
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
     """The model with ``changes`` (8,) of the constants :data:`PARAMETERS`; the time offset is the caller's business."""
     turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())

@@ -2,4 +2,18 @@
 
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel
 
-__all__ = ["BeamModel", "DetectionModel", "GridModel", "LogisticModel"]
+__all__ = [
+    "BeamModel",
+    "DetectionModel",
+    "GridModel",
+    "LogisticModel",
+    "detection",
+    "factor",
+    "kernels",
+    "model",
+    "phase",
+    "strength",
+    "tag_factor",
+    "tag_states",
+    "update",
+]

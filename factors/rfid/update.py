@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import positive, se2, se2_kernels
 from factors.odometry.kernels import FAR, ROUNDING
@@ -16,11 +15,10 @@ from factors.rfid import kernels as rfid_kernels
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.factor import RfidFactor, TagScore
 from factors.rfid.model import Packed
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 _Tags = tuple[Array, Array]  # points and normals
-_Integers = NDArray[np.int64]
-_Seen = tuple[Array, _Integers, _Integers, _Integers, Array]  # offsets, antennas, rounds, hits and odds
+_Seen = tuple[Array, Integers, Integers, Integers, Array]  # offsets, antennas, rounds, hits and odds
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
 ITERATIONS = 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.readers.motions import between_poses, between_ways
+from factorgraph_loc.io.motions import between_poses, between_ways
 from factors import se2
 
 STEP = np.array((0.05, 0.0, 0.02))  # in 0.1 s

@@ -1,18 +1,28 @@
-"""Imports run downwards: no package imports one that stands above it, none imports another in a circle, no estimator a sensor.
+"""Imports run downwards: no package imports one that stands above it, none imports another in a circle, no estimator a sensor,
+and none what is inside another: what that does not list as ``__all__``, or what begins with an underscore.
 
 ``EXCEPTIONS`` are imports that still do: whoever removes one takes it off the list, and nothing is put onto it.
 """
 
+import importlib
+import re
+import tomllib
 from collections import defaultdict
 from graphlib import TopologicalSorter
 
-from package_tables import HEIGHT, MODULES, ROOT, imported, package_of, tables
+from package_tables import FACES, HEIGHT, MODULES, ROOT, imported, named, names_in, package_of, steps, tables
 
 EXCEPTIONS: set[tuple[str, str]] = set()
 
 # what estimators and sensors know of each other
 CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position", "registry")}
 IMPORTS = {module: imported(module) for module in MODULES}
+# what is imported, by whom: by our modules, by the package of another that the docs show, by commands, and by readers of the docs
+NAMED = {(module, *found) for module in MODULES for found in named(module)}
+NAMED |= {("", *found) for path in sorted((ROOT / "tests/compass/package").rglob("*.py")) for found in names_in(path)}
+COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].values()
+NAMED |= {("", *command.split(":")) for command in COMMANDS}
+NAMED |= {("", shown, "") for shown in re.findall(r"automodule:: (\S+)", (ROOT / "docs/api.md").read_text())}
 
 
 def test_every_package_has_a_layer():
@@ -54,6 +64,35 @@ def test_no_circle_of_packages():
             if (module, other) not in EXCEPTIONS and package_of(other) != package_of(module):
                 graph[package_of(module)].add(package_of(other))
     assert list(TopologicalSorter(graph).static_order())
+
+
+def test_no_import_of_the_inside_of_another_package():
+    # whoever needs a module of another package lists it in the `__all__` of its `__init__.py`, if it is not better moved
+    inside = {
+        (user, f"{package}.{name}")
+        for user, *found in NAMED
+        for package, name in steps(*found, user=user)
+        if name not in FACES[package]
+    }
+    assert not inside
+
+
+def test_no_import_of_a_private_name():
+    private = {
+        (user, place, name)
+        for user, place, name in NAMED
+        if any(part.startswith("_") and part != "__version__" for part in (*place.split("."), *name.split(".")))
+        and user.rpartition(".")[0] != place.rpartition(".")[0]
+    }
+    assert not private
+
+
+def test_what_is_public_is_there_and_is_used():
+    used = {step for user, *found in NAMED for step in steps(*found, user=user)}
+    public = {(package, name) for package, face in FACES.items() for name in face}
+    modules = {(package, name) for package, name in public if f"{package}.{name}" in MODULES}
+    assert modules <= used, "no other package imports these: take them off the `__all__` of their package"
+    assert all(hasattr(importlib.import_module(package), name) for package, name in public - modules)
 
 
 def test_every_folder_is_a_package():

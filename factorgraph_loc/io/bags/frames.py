@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from dataclasses import dataclass, field
 
@@ -19,7 +18,6 @@ from factorgraph_loc.model.planar import on_floor
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import listed, quoted
-from factors.camera.model import FORWARD
 from factors.se2 import Array
 
 STATIC = "/tf_static"
@@ -160,12 +158,3 @@ def matrices(table: Array) -> Array:
     out[:, :3, 3] = table[:, :3]
     out[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix()
     return out
-
-
-def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a camera whose optical axes stand in the robot's frame as ``rotation`` (3, 3): the inverse of
-    :func:`factors.camera.model.mounting`."""
-    turned = rotation @ FORWARD.T
-    yaw = math.atan2(turned[1, 0], turned[0, 0])
-    pitch = math.atan2(-turned[2, 0], math.hypot(turned[0, 0], turned[1, 0]))
-    return math.atan2(turned[2, 1], turned[2, 2]), pitch, yaw

@@ -8,12 +8,12 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, nearest
+from factorgraph_loc.io import motions
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
 from factorgraph_loc.io.bags.poses import POSES, Poses
 from factorgraph_loc.io.bags.rows import Rows
-from factorgraph_loc.io.readers import motions
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import quoted

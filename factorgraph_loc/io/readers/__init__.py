@@ -4,4 +4,25 @@ from factorgraph_loc.io.readers.load import load, read_log
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
 from factorgraph_loc.plugins import READERS
 
-__all__ = ["READERS", "Dataset", "Manifest", "describe", "load", "read_log", "read_manifest", "verify"]
+__all__ = [
+    "READERS",
+    "Dataset",
+    "Manifest",
+    "bounds",
+    "describe",
+    "euroc",
+    "kitti_odometry",
+    "load",
+    "manifests",
+    "mapped",
+    "mrclam",
+    "plaza",
+    "read_log",
+    "read_manifest",
+    "rf_robot",
+    "sevenscenes",
+    "starry_night",
+    "tum_rgbd",
+    "utias_woods",
+    "verify",
+]

@@ -15,7 +15,6 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.models import FileModel, inside, parse_model
 from factorgraph_loc.files.yaml import read_yaml
-from factorgraph_loc.io.bags.frames import angles_of_camera
 from factorgraph_loc.io.readers.space_poses import ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -23,6 +22,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.tables import make_images
 from factorgraph_loc.text import listed
+from factors.camera.model import angles_of_camera
 from factors.se2 import Array
 
 TRUTHS = ("state_groundtruth_estimate0", "state_groundtruth0")

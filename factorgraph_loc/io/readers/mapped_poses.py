@@ -11,7 +11,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
 from factorgraph_loc.files.columns import LENGTH
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
-from factorgraph_loc.io.readers import motions
+from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers.space_poses import read_kitti
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows

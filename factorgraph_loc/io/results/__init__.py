@@ -1,1 +1,3 @@
 """The files of a result folder."""
+
+__all__ = ["estimates", "layout"]

@@ -3,6 +3,22 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
+__all__ = [
+    "SENSOR",
+    "bound",
+    "columns",
+    "draw",
+    "frontend",
+    "live",
+    "markers",
+    "measurement",
+    "prepare",
+    "sensor",
+    "settings",
+    "stream",
+    "tables",
+]
+
 SENSOR = SensorType(
     "camera",
     channels=(

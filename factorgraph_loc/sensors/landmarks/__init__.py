@@ -3,6 +3,8 @@
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
+__all__ = ["SENSOR", "columns", "located", "map", "mapping", "measurement", "settings", "stream"]
+
 SENSOR = SensorType(
     "landmarks",
     channels=(

@@ -3,6 +3,24 @@
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
+__all__ = [
+    "SENSOR",
+    "calibration",
+    "columns",
+    "forecast",
+    "grids",
+    "map",
+    "measurement",
+    "pushed",
+    "recorded",
+    "rounds",
+    "settings",
+    "stream",
+    "tables",
+    "tag_map",
+    "whole",
+]
+
 SENSOR = SensorType(
     "rfid",
     channels=(

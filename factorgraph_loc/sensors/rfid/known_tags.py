@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
@@ -12,8 +11,7 @@ from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import TagMap, tag_map
 from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.tag_states import TagStates
-from factors.rfid.update import _Integers
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 EXACT = 0.2  # a survey that is so much better than what a pass tells (as a share of that) is taken as exact
 
@@ -39,7 +37,7 @@ class KnownTags:
         settings = setup.rig.rfid if "rfid" in setup.sensors else None
         self._diagnostics = diagnostics
         self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
-        self._rounds: dict[tuple[str, ...], tuple[list[int], _Integers, _Integers]] = {}
+        self._rounds: dict[tuple[str, ...], tuple[list[int], Integers, Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
         self.likelihood, self.trust = None, 1.0
         if settings is not None:
@@ -98,7 +96,7 @@ class KnownTags:
         if len(believed):
             told.update(zip((self.map.names[i] for i in believed), self.states.dead[believed].tolist(), strict=True))
 
-    def _listening(self, names: tuple[str, ...]) -> tuple[list[int], _Integers, _Integers]:
+    def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """Of antennas that listened: the rows of their looks, -1 of those that the rig lacks; of each row its antenna's place in
         the rig, and how many rounds there were. It is kept, as scan after scan is of the same antennas."""
         if names not in self._rounds:
@@ -109,7 +107,7 @@ class KnownTags:
             self._rounds = {names: (rows, np.array(used, dtype=np.int64), np.array(counts, dtype=np.int64))}
         return self._rounds[names]
 
-    def places(self, m: RfidScan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def places(self, m: RfidScan) -> tuple[Integers, Integers]:
         """Of each read of a scan the places of its antenna in the rig and of its tag in the map, -1 where these lack it."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)

@@ -3,6 +3,8 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
+__all__ = ["SENSOR", "measurement", "settings", "stream", "use"]
+
 SENSOR = SensorType(
     "twist",
     channels=(
