@@ -1,8 +1,7 @@
-"""Indoor localization from wheel odometry and landmarks: a GTSAM smoother and the filters that it is compared with.
+"""Indoor robot localization from wheel odometry, RFID tags, landmarks and cameras.
 
-What a script needs is imported from here: the verbs of the command line as functions, such as
-``factorgraph_loc.run(log, "ekf")``, the values that they take and return, their files, and the ``Localizer`` of a robot that
-drives. What a name needs is imported when it is first used.
+The public names are imported from here: the commands as functions, such as ``factorgraph_loc.run(log, "ekf")``, the types of
+their arguments and results, functions that read and write files, and the online ``Localizer``. Imports are lazy.
 """
 
 from __future__ import annotations
@@ -130,7 +129,7 @@ __all__ = [
     "write_world",
 ]
 
-# names by their module, below this package; all others are in `api`. To read a table, nothing that estimates is needed.
+# module of each public name; names that are not listed are in `api`. Tables can be read without importing the estimators
 _MODULES = {
     "errors": ("FglocError", "InputError", "RunFailedError"),
     "evaluation.inference": ("contrast",),
@@ -166,7 +165,7 @@ _MODULES = {
     "sensors.twist.stream": ("TwistStream",),
     "vision.frame": ("CameraFrame",),
 }
-sys.meta_path.insert(0, OldPlaces())  # before folders of old modules that an upgrade has left empty
+sys.meta_path.insert(0, OldPlaces())  # first, because an upgrade may leave empty folders of old modules behind
 _ELSEWHERE = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 
 

@@ -1,9 +1,9 @@
-"""The verbs of the command line as functions: they do what ``fgloc VERB`` does, and return it instead of printing it.
+"""The commands of ``fgloc`` as functions that return their results instead of printing them.
 
-All of them are reached from the package, as ``factorgraph_loc.run``. Where a log is expected, its name will do. Wrong input raises
-:class:`~factorgraph_loc.errors.InputError` with one line on what is wrong, a run without a usable result
-:class:`~factorgraph_loc.errors.RunFailedError`. Functions that take ``jobs`` spawn processes, as does :func:`simulate` with images,
-so a script that calls them needs the usual ``if __name__ == "__main__"``.
+They are available as ``factorgraph_loc.run`` and so on. A log may be given by its name. Invalid input raises
+:class:`~factorgraph_loc.errors.InputError`, and a run without a usable result :class:`~factorgraph_loc.errors.RunFailedError`.
+Functions with ``jobs``, and :func:`simulate` with images, spawn processes, so a script that calls them needs
+``if __name__ == "__main__"``.
 """
 
 import os
@@ -67,25 +67,24 @@ FEATURES = ("colour", "sift", "orb")
 
 @dataclass(frozen=True)
 class Run:
-    """What a run gave: ``result`` with trajectories and covariances, and ``scores``, the figures of ``metrics.json``."""
+    """The outcome of a run: its ``result``, and its ``scores`` as in ``metrics.json``."""
 
     result: RunResult
     scores: dict[str, Any]
 
 
 def datasets(data_root: str | Path | None = None) -> list[Dataset]:
-    """The logs that are known by name; ``present``: whether their files are there."""
+    """The logs that are known by name; ``present`` tells whether their files exist."""
     return describe(data_root)
 
 
 def info(log: LogLike) -> Inspection:
-    """What a log holds, and what looks wrong with it."""
+    """Summarize a log, with warnings about its content."""
     return inspect(_one(log))
 
 
 def convert(log: LogLike, out: str | Path, *, format: Literal["csv", "parquet"] = "csv") -> None:
-    """Write a log in the native format into a new folder, with tables of ``format``, or, where ``out`` ends with .bag, .mcap or
-    .db3, as a ROS bag."""
+    """Write a log as a new folder in the native format, or as a ROS bag if ``out`` ends with .bag, .mcap or .db3."""
     write_log(_one(log), out, format=format)
 
 
@@ -103,9 +102,10 @@ def run(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Run:
-    """Run one estimator on one log, and score it. See :class:`~factorgraph_loc.experiments.run.RunConfig` for what is given.
+    """Run one estimator on one log and score the result.
 
-    With ``out`` the folder gets the files of ``fgloc run``, plots included.
+    For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``out``: folder for the files that ``fgloc run``
+    writes.
     """
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
@@ -136,14 +136,14 @@ def compare(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> comparing.Comparison:
-    """Run several estimators on several logs, with every seed, in ``jobs`` processes; write tables and plots into ``out``.
+    """Run several estimators on several logs with each seed, in ``jobs`` processes, and write tables and plots to ``out``.
 
-    ``settings``: by estimator. See :func:`factorgraph_loc.experiments.compare.compare`.
+    ``settings`` are given per estimator. See :func:`factorgraph_loc.experiments.compare.compare`.
     """
     comparing.check_free(Path(out), overwrite=overwrite)
     named = settings or {}
     if others := [name for name in named if name not in estimators]:
-        raise InputError(f"settings are given of {others[0]}, which is not run here; run: {listed(estimators)}")
+        raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
     used = None if sensors is None else tuple(sensors)
     chosen = list(seeds)
     configs = [
@@ -164,17 +164,17 @@ def simulate(
     out: str | Path | None = None,
     progress: Progress = lambda _done, _total: None,
 ) -> Log:
-    """A log with known truth.
+    """Simulate a log with known ground truth. The same seed gives the same bytes.
 
-    ``what``: a preset, a TOML file, or settings; ``changes`` as nested tables, such as ``{"drive": {"duration": 60.0}}``.
-    ``recorded``: logs whose reads are drawn from, or what is kept of them. ``out``: a new folder that the log is written to in the
-    native format; needed with ``images``, which are rendered into it. The same seed gives the same bytes.
+    ``what``: a preset, a TOML file, or settings. ``changes``: nested tables, such as ``{"drive": {"duration": 60.0}}``.
+    ``recorded``: logs whose RFID reads are resampled, or the reads extracted from them. ``out``: a new folder for the log in the
+    native format; required with ``images``, which are rendered into it.
     """
     if isinstance(what, SimulationSettings) and changes:
-        raise InputError("changes are for a preset or a file, but settings are given")
+        raise InputError("changes apply to a preset or a file, but settings are given")
     settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
     if images and out is None:
-        raise InputError("images are files: expected out, a folder to write the log to")
+        raise InputError("images need out, a folder to write the log to")
     if recorded is not None and not isinstance(recorded, RecordedLooks):
         recorded = recorded_looks(_all(recorded))
     log = make_log(settings, seed, recorded)
@@ -198,15 +198,15 @@ def calibrate(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> calibration.Calibration:
-    """Learn a rig from logs with reference poses; write it to ``out`` (``NAME.rig.toml``), and ``NAME.report.html`` beside it."""
+    """Calibrate a rig from logs with reference poses. Writes ``out`` (``NAME.rig.toml``) and ``NAME.report.html`` next to it."""
     rig, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = _all(logs)
-    # learnt grids lie here until the rig is written: nothing is left of a calibration that fails
+    # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / rig.name.removesuffix(RIG)
         found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
         try:
-            with replacing(page) as temporary:  # both are there or none
+            with replacing(page) as temporary:  # write both files or none
                 temporary.write_text(rig_report.page(found), encoding="utf-8")
                 write_rig(found.rig, rig)
         except OSError as error:
@@ -215,7 +215,7 @@ def calibrate(
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
-    """The path of the report beside a rig; InputError if the rig's name is not one, or something is there already."""
+    """The path of the report of a rig; InputError if the rig's name is invalid or the file exists."""
     return output.beside(out, RIG, ".report.html", overwrite=overwrite)
 
 
@@ -232,9 +232,9 @@ def map(
     prior: str | None = None,
     overwrite: bool = False,
 ) -> maps.MadeMap:
-    """Make a map of the landmarks, RFID tags or points in a log; write it to ``out`` (``NAME.world.toml``), with a picture beside.
+    """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
 
-    See :class:`~factorgraph_loc.experiments.maps.MapOptions` for what is given.
+    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior)
@@ -255,12 +255,12 @@ def experiment(
     verify: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Make the runs of an experiment's file whose results are not there yet.
+    """Execute those runs of an experiment file that have no stored result yet.
 
-    ``changes``: other values of its dotted keys, as of ``--set``. ``out``: folder of the results, else what the file says.
-    ``jobs``: processes, else one per core; ``scheduler``: address of a ``dask.distributed`` cluster in place of them.
-    ``verify``: what is stored is compared with its checksums, and made again where it is damaged.
-    ``progress`` is given the number of runs done, of all, and of failures. A run that fails is a row and a line of ``failures``.
+    ``changes``: values for dotted keys of the file, as with ``--set``. ``out``: folder of the results, by default the file's.
+    ``jobs``: number of processes, by default one per core. ``scheduler``: address of a ``dask.distributed`` cluster to use
+    instead. ``verify``: check the checksums of stored results and repeat damaged runs. ``progress`` is called with the numbers of
+    finished, all and failed runs. A failed run is recorded as a row and in ``failures``; it raises nothing.
     """
     prepared = _prepared(file, changes, out, data_root, verify=verify)
     executor = None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed)
@@ -275,10 +275,10 @@ def report(
     data_root: str | Path | None = None,
     page: str | Path | None = None,
 ) -> Path:
-    """Write the results of an experiment as one HTML page, ``report.html`` in its folder or ``page``, and return its path. Damaged
-    results are named there, and left out.
+    """Write the results of an experiment as an HTML page, and return its path: ``page``, by default ``report.html`` in its
+    folder.
 
-    ``changes``, ``out`` and ``data_root`` as they were given to :func:`experiment`.
+    Damaged results are listed on the page and left out. For the other arguments see :func:`experiment`.
     """
     return report_experiment(_prepared(file, changes, out, data_root), None if page is None else Path(page)).page
 
@@ -294,7 +294,7 @@ def images(
     overwrite: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> image_localization.ImageResults:
-    """Map some images of a log with their reference, locate those of each of ``queries``, and write the errors into ``out``."""
+    """Map some images of a log with their reference poses, localize the images of each query, and write the errors to ``out``."""
     image_localization.check_free(Path(out), overwrite=overwrite)
     loaded = _one(log)
     results = image_localization.evaluate_images(loaded, features, count, mapped, queries, progress)
@@ -311,7 +311,7 @@ def features(
     overwrite: bool = False,
     progress: Progress = lambda _done, _total: None,
 ) -> feature_scores.FeatureScores:
-    """Compare point features on images of flat scenes: folders of sequences, or photographs, which are warped."""
+    """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
     feature_scores.check_free(Path(out), overwrite=overwrite)
     chosen = [feature(name, count) for name in features]
     scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)
@@ -332,25 +332,25 @@ def _prepared(
 
 
 def _one(log: LogLike) -> Log:
-    """A log, or the one that a name stands for."""
+    """The log, loaded if it is given by name."""
     if isinstance(log, Log):
         return log
     return read_log(log)
 
 
 def _all(logs: LogLike | Sequence[LogLike]) -> list[Log]:
-    """Logs, and those that names stand for."""
+    """The logs, loaded if they are given by name."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
     return [one for log in several for one in ([log] if isinstance(log, Log) else load(log))]
 
 
 def _score(log: Log) -> dict[str, Any]:
-    """The scores of the EKF on a log, with the log's rig and its sensors; of the smoother where tags are read."""
+    """Scores of the EKF, or of the smoother if the log has RFID, with the log's rig and its sensors."""
     return run(log, calibration.estimator_for(log.rig)).scores
 
 
 def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Progress) -> None:
-    """The images go to a folder beside the log's first, so that there is a whole log or none."""
+    """Render the images into a temporary folder first, so that the log is written completely or not at all."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as beside:

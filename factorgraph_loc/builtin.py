@@ -1,4 +1,4 @@
-"""The sensors, estimators, mappers and readers that this project brings itself, and where each stands."""
+"""The module paths of the sensors, estimators, mappers and readers of this project."""
 
 from factorgraph_loc.plugins import ESTIMATORS, MAPPERS, READERS, SENSORS
 

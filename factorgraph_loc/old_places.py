@@ -1,4 +1,4 @@
-"""Modules of version 0.1.0 whose content is elsewhere now: what is imported from them comes with a DeprecationWarning."""
+"""Import paths of version 0.1.0 that have moved. Importing from them gives a DeprecationWarning."""
 
 import importlib
 import warnings
@@ -67,7 +67,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     ),
 }
 _PACKAGES = ("factorgraph_loc.estimators", "factorgraph_loc.readers")
-_SCRIPTS = {  # what the project's own benchmarks need alone
+_SCRIPTS = {  # used by the project's own benchmarks only
     "factorgraph_loc.evaluation.ensembles": "benchmarking/statistics.py",
     "factorgraph_loc.evaluation.grid_filter": "rfid_benchmark/grid_filter.py",
     "factorgraph_loc.evaluation.paper_figures": "paper_figures.py",
@@ -80,20 +80,20 @@ _SCRIPTS = {  # what the project's own benchmarks need alone
 
 
 class OldPlaces(MetaPathFinder, Loader):
-    """Finds those modules for the import system."""
+    """Import hook that finds the old modules."""
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """The module, if it is one of them."""
+        """The spec of the module, if it is an old one."""
         if name in _MODULES or name in _PACKAGES:
             return ModuleSpec(name, self, is_package=name in _PACKAGES)
         if name in _SCRIPTS:
             raise ImportError(
-                f"{name} is not installed any more: it is scripts/{_SCRIPTS[name]} of the sources", name=name
+                f"{name} is no longer installed: it is scripts/{_SCRIPTS[name]} in the source repository", name=name
             )
         return None
 
     def exec_module(self, module: ModuleType) -> None:
-        """Let the module look for its names where they are now."""
+        """Let the module resolve its names at their new locations."""
 
         def found(name: str) -> Any:
             for place in _MODULES.get(module.__name__, ()):

@@ -1,6 +1,6 @@
-"""Sensors, estimators, readers and mappers by name: ours, which :mod:`factorgraph_loc.builtin` lists, and those of other packages.
+"""Registries of sensors, estimators, readers and mappers by name, loaded lazily.
 
-Each is named by its place, and imported when it is first used. Another package adds its own by entry points of the groups
+Those of this project are listed in :mod:`factorgraph_loc.builtin`. Other packages register theirs by entry points of the groups
 ``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and ``factorgraph_loc.mappers``.
 """
 
@@ -17,45 +17,47 @@ Place = str  # "package.module:name", or "package.module"
 
 
 def load(place: Place) -> Any:
-    """What stands at a place. ImportError or AttributeError if it is not there."""
+    """Import the object at ``place``. ImportError or AttributeError if it does not exist."""
     module, _, name = place.partition(":")
     found = importlib.import_module(module)
     return getattr(found, name) if name else found
 
 
-MOVED: dict[str, Callable[..., Any]] = {}  # what methods of a rig were in version 0.1.0, as functions of the rig
+MOVED: dict[str, Callable[..., Any]] = {}  # methods of the rig in version 0.1.0, as functions of the rig
 
 
 class Group(Mapping[str, Any]):
-    """Things of one kind by name, ours first; each is loaded when it is asked for.
+    """A registry of one kind of plug-in: name to loaded object, built-in ones first.
 
-    ``kind``: what they are called; ``own``: the places of ours; ``needs``: attributes that one has. InputError if another package's
-    cannot be loaded, lacks one of them, or has a name that is taken.
+    ``kind``: the kind's name; ``own``: places of the built-in ones; ``needs``: attributes that each must have. InputError if an
+    object of another package cannot be loaded, lacks a required attribute, or has a name that is taken.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:
         self.kind, self.needs = kind, needs
         self.own: dict[str, Place] = {}
-        self._others: dict[str, tuple[Place, str]] | None = None  # with the name of the package
+        self._others: dict[str, tuple[Place, str]] | None = None  # place and name of the package
 
     def forget(self) -> None:
-        """Look once more for what other packages bring, when that is asked for next."""
+        """Search for entry points again at the next access."""
         self._others = None
 
     def place(self, name: str) -> Place:
-        """Where one stands; KeyError if there is none of that name."""
+        """The place of a name; KeyError if it is unknown."""
         return self.own[name] if name in self.own else self._installed()[name][0]
 
     def _installed(self) -> dict[str, tuple[Place, str]]:
         if self._others is None:
-            from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need ours alone
+            from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need built-in ones only
 
             found: dict[str, tuple[Place, str]] = {}
             for entry in entry_points(group=f"factorgraph_loc.{self.kind}"):
                 package = entry.dist.name if entry.dist else "another package"
                 if entry.name in self.own or entry.name in found:
                     owner = "this project" if entry.name in self.own else found[entry.name][1]
-                    raise InputError(f"{self.kind}: {package} brings {plain(entry.name)}, which {owner} has already")
+                    raise InputError(
+                        f"{self.kind}: {package} registers {plain(entry.name)}, which {owner} already registers"
+                    )
                 found[entry.name] = entry.value, package
             self._others = found
         return self._others
@@ -67,10 +69,10 @@ class Group(Mapping[str, Any]):
         what = f"{self.kind}: {plain(name)} of {package}"
         try:
             found = load(place)
-        except Exception as error:  # whatever the code of others raises
+        except Exception as error:  # code of another package may raise anything
             raise InputError(f"{what} cannot be loaded from {place}: {told(error)}") from error
         if missing := [needed for needed in self.needs if not hasattr(found, needed)]:
-            raise InputError(f"{what} has no {missing[0]}, expected one that the docs describe")
+            raise InputError(f"{what} has no {missing[0]}, which the interface requires")
         return found
 
     def __iter__(self) -> Iterator[str]:

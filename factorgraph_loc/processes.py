@@ -1,6 +1,6 @@
-"""Processes that this one starts, all in one place: each ends with the process that started it, however that one ends.
+"""Child processes that always end with their parent, however it ends.
 
-What this module imports must be light: it is the first that a new process loads, and the last before it is tied to its parent.
+This module must import light modules only: a new process loads it before it is tied to its parent.
 """
 
 import ctypes
@@ -23,9 +23,9 @@ from typing import Any, TypeVar
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.threads import use_one_thread
 
-BEAT = 0.3  # s between two calls of what wants to be called while jobs are made
+BEAT = 0.3  # s between two calls of the heartbeat function
 READY = "ready"
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by which a user or the system ends a command
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that end a command
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 Job = TypeVar("Job")
@@ -33,21 +33,21 @@ Value = TypeVar("Value")
 
 
 class ProcessDiedError(RunFailedError):
-    """A process ended without a result: killed, out of memory, or a crash in native code."""
+    """A process ended without a result: it was killed, ran out of memory, or crashed in native code."""
 
 
 class Child(SpawnProcess):
-    """A spawned process that ends with its parent, and may have children of its own, which end with it."""
+    """A spawned process that ends with its parent; its own children end with it."""
 
     def run(self) -> None:
         _end_with_parent()
-        self.daemon = False  # it has been told by now; what is a daemon may not start processes
+        self.daemon = False  # a daemon could not start processes of its own
         super().run()
 
 
 @dataclass(eq=False)
 class Started:
-    """A process, this end of the connection that its function was given, and the index of the job that it makes, if any."""
+    """A worker process, the parent's end of its connection, and the index of its current job or None."""
 
     process: Child
     connection: Connection
@@ -55,17 +55,17 @@ class Started:
     at: int | None = None
 
     def end(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
 
 
 def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]:
-    """Start a process that calls ``function`` with a connection and ``args``; it, and this end of the connection.
+    """Spawn a process that calls ``function(connection, *args)``. Returns the process and the parent's end of the connection.
 
-    It is spawned, so a script needs the usual ``if __name__ == "__main__"``. The module of ``function`` must be light: the process
-    is not tied to this one before it has loaded that. An interrupt from the keyboard is not for it but for this process.
+    A script that calls this needs ``if __name__ == "__main__"``. The module of ``function`` must be light, because the process is
+    tied to this one only after loading it. The process ignores keyboard interrupts.
     """
     use_one_thread()
     here, there = Pipe()
@@ -84,12 +84,11 @@ def run_each(
     lasting: bool = False,
     beat: Callable[[], None] | None = None,
 ) -> Iterator[tuple[int, Value | Exception]]:
-    """Call ``function`` on each job, in at most ``workers`` processes at a time, and yield index and outcome as they come.
+    """Call ``function`` on each job in at most ``workers`` processes. Yields (index, value or exception) as jobs finish.
 
-    An exception is an outcome like any other. Each job has a process of its own, so that one that dies takes nothing with it and
-    its peak memory is its own; with ``lasting`` a process makes several, and loads what is slow to load once. ``beat`` is called
-    every :data:`BEAT` seconds, if given. When the caller stops listening, the processes end at once. Function, jobs and values
-    must be picklable; the processes are spawned, so a script that calls this needs the usual ``if __name__ == "__main__"``.
+    Each job runs in a process of its own, so a crash affects that job only and peak memory is measured per job; with ``lasting``
+    a process runs several jobs. ``beat`` is called every :data:`BEAT` seconds. Closing the iterator ends the processes. Function,
+    jobs and values must be picklable, and a script that calls this needs ``if __name__ == "__main__"``.
     """
     waiting = deque(range(len(jobs)))
     team: list[Started] = []
@@ -102,7 +101,7 @@ def run_each(
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
                 heard = _hear(worker)
-                if isinstance(heard, ProcessDiedError) and worker.at is None and waiting:  # before it began
+                if isinstance(heard, ProcessDiedError) and worker.at is None and waiting:  # died before its first job
                     worker.at = waiting.popleft()
                 at, worker.at = worker.at, None
                 if isinstance(heard, ProcessDiedError) or (at is not None and not lasting):
@@ -121,30 +120,30 @@ def run_each(
 
 
 def _send(worker: Started, content: object) -> None:
-    with suppress(OSError):  # it has died, which the next look tells
+    with suppress(OSError):  # it has died; the next `_hear` reports that
         worker.connection.send(content)
 
 
 def _hear(worker: Started) -> Any:
-    """What a process says: ``READY``, a value, or the exception of its job."""
+    """Receive ``READY``, a value, or the exception of the job."""
     try:
         heard, told = worker.connection.recv()
     except (EOFError, OSError):
-        return ProcessDiedError("the process died without a word (killed, out of memory, or a crash in native code)")
+        return ProcessDiedError("the process died (killed, out of memory, or a crash in native code)")
     if told:
         heard.__cause__ = RemoteError(told)
     return heard
 
 
 class RemoteError(Exception):
-    """Where an exception was raised in another process, as the cause of that exception here."""
+    """The traceback of an exception from another process, attached as its cause."""
 
     def __str__(self) -> str:
         return f'\n"""\n{self.args[0]}"""'
 
 
 def _serve(connection: Connection) -> None:
-    """Take a function, then answer each job that comes with what the function makes of it."""
+    """Main loop of a worker: receive a function, then answer each job with its value or exception."""
     function = connection.recv()
     connection.send((READY, ""))
     while True:
@@ -154,33 +153,35 @@ def _serve(connection: Connection) -> None:
             return
         try:
             answer = function(job), ""
-        except Exception as error:  # any fault of a job is its outcome
+        except Exception as error:  # a failure is the job's outcome
             answer = _portable(error), "".join(traceback.format_exception(error))
         try:
             connection.send(answer)
-        except (pickle.PicklingError, TypeError, AttributeError) as error:  # nothing was sent of what cannot be
+        except (
+            pickle.PicklingError,
+            TypeError,
+            AttributeError,
+        ) as error:  # the value cannot be pickled; nothing was sent
             connection.send((_portable(error), "".join(traceback.format_exception(error))))
 
 
 def _portable(error: Exception) -> Exception:
-    """The exception, or one that says the same where it cannot be sent."""
+    """The exception if it can be pickled, else a RuntimeError with the same message."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever the constructor of another's exception may raise
+    except Exception:  # constructors of foreign exceptions may raise anything
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
 
 
 def _end_with_parent() -> None:
-    """End this process within moments of its parent's end.
-
-    A thread waits for that; where another holds the interpreter for long, in native code, the kernel ends the process, if it can.
-    """
+    """End this process when its parent ends: by a waiting thread, and on Linux by the kernel, as native code may block the
+    thread."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent.pid:  # it ended before the kernel was told
+        if os.getppid() != parent.pid:  # the parent ended before the call above
             os._exit(1)
 
     def watch() -> None:
@@ -192,9 +193,8 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """What starts meanwhile never hears of an interrupt from the keyboard; this process hears of signals afterwards, as one that
-    is half started would complain."""
-    resource_tracker.ensure_running()  # it is started with the first process, and would let interrupts through
+    """Start processes that ignore keyboard interrupts; signals to this process are deferred until the block ends."""
+    resource_tracker.ensure_running()  # otherwise it is started with the first process, and unblocks interrupts
     came: list[int] = []
     before = {}
     if threading.current_thread() is threading.main_thread():

@@ -1,62 +1,59 @@
-"""How names and values that others wrote are shown to people: bounded in length, on one line, and without a character that a
-terminal would obey in place of showing it."""
+"""Safe display of names and values of foreign origin: bounded length, one line, no control characters."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence, Set
 from itertools import islice
 
 MESSAGE = 300  # characters of a message at most
-NAME = 120  # of a name, a path or a foreign message within it
-VALUE = 80  # of a value within it
-LISTED = 10  # names of a list that are shown
-ITEMS = 5  # of a value that is a list or a table
-DEPTH = 3  # of values within values
-LONG_NUMBER = 40  # digits beyond which a whole number is only described
+NAME = 120  # characters of a name, a path or a foreign message
+VALUE = 80  # characters of a value
+LISTED = 10  # names shown of a list
+ITEMS = 5  # items shown of a value that is a list or a table
+DEPTH = 3  # nesting levels shown of a value
+LONG_NUMBER = 40  # digits above which an integer is described instead of printed
 CUT = "..."
 
 
 def plain(text: object, limit: int | None = NAME) -> str:
-    """``text`` as it may stand on a line: what is no printable character (control characters, ends of lines, marks that turn
-    the direction of writing, lone surrogates) as an escape, and of more than ``limit`` characters the middle left out."""
+    """``text`` on one line: non-printable characters are escaped, and the middle of a text above ``limit`` characters is cut."""
     whole = str(text)
     if limit is not None:
-        whole = shortened(whole, limit)  # before it is escaped: of megabytes little is looked at
+        whole = shortened(whole, limit)  # first, so that little of a very long text is processed
     if not whole.isprintable():
         whole = "".join(c if c.isprintable() else _escape(c) for c in whole)
     return whole if limit is None else shortened(whole, limit)
 
 
 def quoted(value: object, limit: int = VALUE) -> str:
-    """``value`` as Python writes it, text in quotes, in at most ``limit`` characters: of long text the middle is left out, of
-    long lists the end, and a whole number of very many digits is described."""
+    """The ``repr`` of ``value`` in at most ``limit`` characters. Long texts, long lists and huge integers are abbreviated."""
     return plain(_written(value, limit, DEPTH), limit)
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
-    """``a, b, c``: of more than ``most`` names the first, and how many more there are."""
+    """``a, b, c``: the first ``most`` names, and the number of the others."""
     every = list(names)
     shown = ", ".join(plain(name) for name in every[:most])
     return shown if len(every) <= most else f"{shown} and {len(every) - most} more"
 
 
 def told(error: BaseException) -> str:
-    """What an exception of other code says, on one line; the kind of exception where it says nothing."""
+    """The message of a foreign exception on one line, or its class name if it has none."""
     says = " ".join(str(getattr(error, "strerror", None) or error).split())
     return plain(says or type(error).__name__)
 
 
 def well_formed(text: str) -> str:
-    """``text`` as every file and table can hold it: lone surrogates, the bytes of file names that are not UTF-8, as escapes."""
+    """``text`` with lone surrogates (undecodable bytes of file names) escaped, so that it can be encoded as UTF-8."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def one_line(message: str) -> str:
-    """A message as errors carry it."""
+    """A message on one line, with at most :data:`MESSAGE` characters."""
     return plain(message.strip(), MESSAGE)
 
 
 def shortened(text: str, limit: int) -> str:
-    """``text`` if it has at most ``limit`` characters, else its beginning and its end."""
+    """``text``, with the middle cut out if it has more than ``limit`` characters."""
     if len(text) <= limit:
         return text
     end = (limit - len(CUT)) * 2 // 5
@@ -64,15 +61,15 @@ def shortened(text: str, limit: int) -> str:
 
 
 def _escape(character: str) -> str:
-    """As in Python, but beyond ASCII always in the way that JSON and TOML know too."""
+    """Escape a character as in Python; beyond ASCII as in JSON and TOML."""
     code = ord(character)
     return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def _written(value: object, limit: int, depth: int) -> str:
-    """As ``repr``, of which no more is computed than is shown."""
+    """Like ``repr``, but computes no more than is shown."""
     if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
-        value = value.item()  # a scalar of numpy, whose own repr names its type
+        value = value.item()  # a numpy scalar, whose repr includes its type
     if isinstance(value, (str, bytes)):
         return repr(shortened(value, limit) if isinstance(value, str) else value[:limit])
     if isinstance(value, int) and (digits := int(value.bit_length() * math.log10(2)) + 1) > LONG_NUMBER:
@@ -81,7 +78,7 @@ def _written(value: object, limit: int, depth: int) -> str:
         return _collection(value, limit, depth)
     try:
         return " ".join(repr(value).split())
-    except Exception:  # whatever another's type raises: its name can be shown
+    except Exception:  # the repr of a foreign type may raise anything
         return f"<{type(value).__name__}>"
 
 

@@ -1,7 +1,6 @@
-"""One thread for the linear algebra of a process.
+"""Limits the linear algebra of a process to one thread, which is fastest for small matrices and for parallel runs.
 
-The matrices of an estimator are small: more threads cost time, and runs in parallel processes would fight for the cores.
-This module must be importable without numpy, and the function be called before anything imports numpy.
+This module must be importable without numpy; call the function before numpy is imported.
 """
 
 import os
@@ -10,6 +9,6 @@ _VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 
 def use_one_thread() -> None:
-    """Ask BLAS, OpenMP and numba for one thread, unless the user's environment says otherwise; inherited by workers."""
+    """Set one thread for BLAS, OpenMP and numba, unless the environment says otherwise; child processes inherit it."""
     for variable in _VARIABLES:
         os.environ.setdefault(variable, "1")

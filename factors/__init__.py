@@ -1,8 +1,5 @@
-"""Sensor models on plain arrays, and the GTSAM factors made of them.
-
-Everything that we believe about a sensor is written here once; particle filter, EKF and smoother all call it.
-This package knows nothing of logs, rigs or files.
-"""
+"""Sensor models on plain arrays, and GTSAM factors made of them. All estimators use them; they do not depend on logs, rigs or
+files."""
 
 __all__ = [
     "camera",

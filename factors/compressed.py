@@ -1,12 +1,12 @@
-"""Any negative log-likelihood as residuals of least squares: as many rows as it has variables, and one more.
+"""A negative log-likelihood as a least-squares residual, with one row more than it has variables.
 
-A cost nll >= 0 with gradient g and positive semi-definite curvature H = L L^T (Fisher's information, or Gauss-Newton's) becomes the
-residual ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` with the Jacobian ``[L^T; 0]``. Half of its square is nll exactly, its gradient is g
-and its curvature H, so a solver of least squares takes the scoring step, and judges it by the likelihood itself.
+A cost nll >= 0 with gradient g and positive semi-definite curvature H = L L^T (Fisher information or Gauss-Newton) becomes the
+residual ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` with the Jacobian ``[L^T; 0]``. Half its square is nll exactly, its gradient is g
+and its curvature H, so a least-squares solver takes the scoring step and evaluates the exact likelihood.
 
-The last row needs ``g^T H^-1 g <= 2 nll``: the parabola's lowest point must not lie below zero, which no likelihood does. Where it
-would, as with too little curvature for the gradient, the curvature along g is raised just so far: ``H + t g g^T`` with
-``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. Without any curvature that is Gauss-Newton's of the plain residual sqrt(2 nll).
+The last row requires ``g^T H^-1 g <= 2 nll``: the minimum of the parabola must not be negative. Otherwise the curvature is too
+small for the gradient, and it is raised along g to ``H + t g g^T`` with ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. Without curvature
+this is Gauss-Newton on the residual sqrt(2 nll).
 """
 
 import math
@@ -16,9 +16,9 @@ import numpy as np
 
 from factors.se2 import Array
 
-RELATIVE_RIDGE = 1e-9  # of the mean curvature, so that a direction without any can be divided by
+RELATIVE_RIDGE = 1e-9  # of the mean curvature, against division by zero
 RIDGE = 1e-10
-LEAST = 1e-12  # a cost of zero has no slope to represent
+LEAST = 1e-12  # a cost of zero has no gradient
 
 
 @numba.njit(cache=True)
@@ -34,7 +34,7 @@ def _cholesky(matrix: Array, lower: Array) -> None:
 
 @numba.njit(cache=True)
 def _whitened(lower: Array, vector: Array, out: Array) -> float:
-    """L^-1 v into ``out``; its square is returned."""
+    """Compute L^-1 v into ``out`` and return its squared norm."""
     squared = 0.0
     for i in range(len(vector)):
         total = vector[i]
@@ -72,8 +72,8 @@ def _compress(nll: float, gradient: Array, information: Array, residual: Array, 
 
 
 def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and ``information`` (d, d), which is
-    symmetric and positive semi-definite; see the module. All are finite whatever the rank of the information."""
+    """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and symmetric positive semi-definite
+    ``information`` (d, d); see the module. All are finite for any rank of the information."""
     d = len(gradient)
     residual = np.empty(d + 1)
     jacobian = np.zeros((d + 1, d))

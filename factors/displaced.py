@@ -1,4 +1,4 @@
-"""What factors of sightings share: a pose variable that lies a known motion before the sighting, and noise that is widened."""
+"""Common parts of sighting factors: a pose variable at a known motion before the sighting, and additional noise."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from factors.se2 import Array
 def displaced(
     error: Array, blocks: list[Array], offset: Array | None, spread: Array | None
 ) -> tuple[Array, list[Array]]:
-    """Whitened residuals (K, 2) with Jacobians (K, 2, d), the first of them by the pose at the sighting's time, as those of a
-    factor on the pose ``offset`` (3,) before it, with ``spread`` (K, 2, 2) added to the unit noise; None where there is none."""
+    """Convert whitened residuals (K, 2) with Jacobians (K, 2, d), the first by the pose at the sighting, to those of a factor on
+    the pose ``offset`` (3,) before it, with covariance ``spread`` (K, 2, 2) added to the unit noise; None for no change."""
     if spread is not None:
         whitener = positive.whitener(np.eye(2) + spread)
         error = np.einsum("kij,kj->ki", whitener, error)
@@ -21,18 +21,18 @@ def displaced(
 
 
 def carried(jacobian: Array, covariance: Array) -> Array:
-    """The covariance (K, 2, 2) that a ``covariance`` (..., d, d) makes through a ``jacobian`` (K, 2, d)."""
+    """The covariance (K, 2, 2) of a ``covariance`` (..., d, d) propagated through a ``jacobian`` (K, 2, d)."""
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
 
 
 def common_error(jacobian: Array, covariance: Array, count: int | None = None) -> Array:
-    """The covariance (K, 2, 2) of each of ``count`` sightings, by default K, that have one error of this ``covariance`` (d, d) in
-    common: as many times as large as that of one alone, so that together they do not seem to be rid of it."""
+    """The covariance (K, 2, 2) added to each of ``count`` sightings (default K) for an error with ``covariance`` (d, d) that is
+    common to all: multiplied by their number, so that it does not average out."""
     return (len(jacobian) if count is None else count) * carried(jacobian, covariance)
 
 
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
-    """The ``offset`` (3,) of a sighting that came so much later, of a robot with the velocity ``twist`` (3,)."""
+    """The ``offset`` (3,) of a sighting that is ``seconds`` later, for a robot with velocity ``twist`` (3,)."""
     if twist is None or seconds == 0.0:
         return offset
     later = se2.exp(twist * seconds)

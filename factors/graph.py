@@ -1,9 +1,8 @@
-"""From our factors to GTSAM's.
+"""Conversion of this package's factors to GTSAM's.
 
-A factor of this package has ``linearize(values)``, with the values of its variables as arrays: poses (3,), vectors (P,). It
-returns the whitened, robustly weighted residual and one Jacobian a variable, by body-frame perturbation. The functions here wrap it
-so that it can neither crash nor corrupt a solver: GTSAM takes a Jacobian of wrong shape without a word, and an exception inside
-a callback leaves iSAM2 half updated.
+A factor has ``linearize(values)``, whose values are arrays: poses (3,), vectors (P,). It returns the whitened, robustly weighted
+residual and one Jacobian per variable, by body-frame perturbation. The functions here validate both, because GTSAM silently accepts
+Jacobians of wrong shape, and an exception in a callback leaves iSAM2 in an inconsistent state.
 """
 
 import math
@@ -18,13 +17,13 @@ from factors.se2 import Array
 
 
 class Factor(Protocol):
-    """What :func:`custom_factor` and :func:`jacobian_factor` take."""
+    """A factor that :func:`custom_factor` and :func:`jacobian_factor` accept."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, weighted residual (m,) and a Jacobian (m, d) for each variable."""
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The loss, robust where the factor is."""
+        """The loss, robust if the factor is."""
 
 
 def pose_array(pose: gtsam.Pose2) -> Array:
@@ -52,7 +51,7 @@ def custom_factor(
 ) -> gtsam.NonlinearFactor:
     """``factor`` on the variables ``keys``, read by ``readers``, with tangent ``dimensions`` and ``rows`` residuals.
 
-    A residual or Jacobian that is not finite or has a wrong shape is replaced by zeros, and ``on_failure`` is told.
+    A residual or Jacobian that is not finite or has a wrong shape is replaced by zeros and reported to ``on_failure``.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Array:
@@ -79,7 +78,7 @@ def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]
 
 
 class PriorFactor:
-    """A Gaussian on one pose: ``mean`` (3,) and the ``covariance`` (3, 3) of its body-frame perturbation."""
+    """A Gaussian prior of a pose: ``mean`` (3,) and the ``covariance`` (3, 3) of its body-frame perturbation."""
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean
@@ -97,7 +96,7 @@ class PriorFactor:
 
 
 class VectorPriorFactor:
-    """A Gaussian on one vector: ``mean`` (P,), and standard deviations (P,) or a covariance (P, P)."""
+    """A Gaussian prior of a vector: ``mean`` (P,), and standard deviations (P,) or a covariance (P, P)."""
 
     def __init__(self, mean: Array, spread: Array) -> None:
         self._mean = mean
@@ -115,6 +114,6 @@ class VectorPriorFactor:
 def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:
     if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, d) for d in dimensions]:
         raise ValueError(f"shapes {residual.shape}, {[b.shape for b in blocks]}, expected {rows} rows")
-    # one that is not finite makes the sum so
+    # the sum is not finite if any value is not
     if not math.isfinite(float(residual.sum()) + sum(float(b.sum()) for b in blocks)):
         raise ValueError("a residual or Jacobian is not finite")

@@ -1,4 +1,4 @@
-"""A factor with some of its values held: what is not known of them widens its noise."""
+"""A sighting factor with some of its values marginalized: their uncertainty is added to its noise."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from factors.update import Sightings
 
 @dataclass(frozen=True)
 class Marginalized:
-    """A factor of sightings on the pose alone: its other values are ``values``, with covariances ``spreads``, None for exact ones.
+    """A sighting factor on the pose only: its other values are fixed at ``values``, with covariances ``spreads``, None for exact
+    ones.
 
-    An error of a value is common to all K sightings, so it counts K times as much: see :func:`~factors.displaced.common_error`.
+    An error of a value is common to all K sightings: see :func:`~factors.displaced.common_error`.
     """
 
     factor: Sightings
@@ -47,11 +48,11 @@ class Marginalized:
         return self.factor.weight(squared)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss, as the weights have it."""
+        """The robust loss, consistent with the weights."""
         residual, _ = self.whitened(values)
         squared = np.einsum("ki,ki->k", residual, residual)
         return float(0.5 * np.sum(self.weight(squared) * squared))
 
     def dof(self) -> int:
-        """How many numbers were measured."""
+        """Number of measured values."""
         return self.factor.dof()

@@ -1,4 +1,4 @@
-"""Increments of motion, and how a covariance grows along them."""
+"""Motion increments and the propagation of covariances."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,8 +13,8 @@ from factors.se2 import Array
 class Increment:
     """Relative motion between two times.
 
-    ``delta`` (3,): pose of the end in the frame of the start. ``covariance`` (3, 3): of the body-frame perturbation at the
-    end. ``duration`` [s], and ``still`` [s], how much of it the robot was at rest.
+    ``delta`` (3,): pose of the end in the frame of the start. ``covariance`` (3, 3): of the body-frame perturbation at the end.
+    ``duration`` [s], and ``still`` [s], the part of it at rest.
     """
 
     delta: Array
@@ -24,13 +24,13 @@ class Increment:
 
     @property
     def moving(self) -> float:
-        """How long [s] the robot moved."""
+        """Time [s] in motion."""
         return self.duration - self.still
 
 
 class ChainState(NamedTuple):
-    """Where the odometry is at a time: pose in its own frame, path [m], turned angle [rad], time without odometry [s],
-    time at rest [s]."""
+    """State of the integrated odometry: pose in its own frame, path length [m], accumulated rotation [rad], time without odometry
+    [s], time at rest [s]."""
 
     t: float
     x: float
@@ -43,5 +43,5 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """A body-frame covariance (3, 3) carried along an increment."""
+    """A body-frame covariance (3, 3) propagated along an increment."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))

@@ -1,8 +1,8 @@
-"""Covariances that rounding has taken from being positive definite: what stands for them where they are inverted.
+"""Operations on covariances that may be numerically singular.
 
-A matrix whose largest part is more than 1e16 times its smallest is singular as numbers go, although what it stands for is not. In
-units of its own standard deviations that part is small for every covariance that means something; what is below :data:`LEAST`
-there is a matter of rounding, and is raised to that. Covariances that need no help are taken as they are, to the last bit.
+A covariance with components of very different scales is singular in floating point although it is well conditioned in units of its
+standard deviations. Eigenvalues of its correlation matrix below :data:`LEAST` are rounding errors and are raised to that.
+Well-conditioned covariances are used unchanged.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from scipy.linalg.lapack import dpotrf
 
 from factors.se2 import Array
 
-LEAST = 1e-12  # the smallest eigenvalue of a correlation matrix that can be inverted
-CLEAR = 1e-9  # a determinant of one
+LEAST = 1e-12  # minimum eigenvalue of an invertible correlation matrix
+CLEAR = 1e-9  # determinant of a clearly invertible correlation matrix
 
 
 def nearest(covariances: Array) -> Array:
-    """Covariances (..., D, D) that are symmetric and can be inverted, next to those given. LinAlgError where a variance is not
-    above zero or not finite."""
+    """The nearest symmetric, invertible covariances (..., D, D). LinAlgError if a variance is not positive or not finite."""
     sigmas, values, vectors = _parts(covariances)
     shares = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     shares = (shares + np.swapaxes(shares, -1, -2)) / 2.0
@@ -26,20 +25,20 @@ def nearest(covariances: Array) -> Array:
 
 
 def sound(covariance: Array) -> Array:
-    """The covariance (D, D) itself where it can be inverted, else the :func:`nearest` that can."""
+    """The covariance (D, D) itself if it is invertible, else the :func:`nearest` invertible one."""
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if not np.all(sigmas > 0.0):
         return nearest(covariance)
     shares = covariance / sigmas[:, None] / sigmas
     root, failed = dpotrf(shares, lower=1)
-    # with such a determinant the smallest eigenvalue of a correlation matrix is far above the least: det < e * smallest
+    # the smallest eigenvalue of a correlation matrix with this determinant is far above LEAST: det < e * smallest
     if not failed and np.prod(root.diagonal()) ** 2 > CLEAR:
         return covariance
     return covariance if np.linalg.eigvalsh(shares)[0] > LEAST else nearest(covariance)
 
 
 def whitener(covariances: Array) -> Array:
-    """The inverses of the lower roots of covariances (..., D, D); of other roots, which whiten as well, where there are none."""
+    """Inverses of the lower Cholesky roots of covariances (..., D, D), or other whitening matrices if there are no roots."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
     except np.linalg.LinAlgError:
@@ -55,7 +54,7 @@ def root(covariances: Array) -> Array:
 
 
 def solve(covariances: Array, right: Array) -> Array:
-    """What covariances (..., D, D) must be multiplied with to give ``right`` (..., D, N)."""
+    """The solution of ``covariances @ x = right`` for covariances (..., D, D) and ``right`` (..., D, N)."""
     try:
         return np.asarray(np.linalg.solve(covariances, right))
     except np.linalg.LinAlgError:
@@ -84,7 +83,7 @@ def squared(errors: Array, covariances: Array) -> Array:
 
 
 def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draws (count, D) from a Gaussian of zero mean whose covariance (D, D) may be singular."""
+    """Draws (count, D) from a zero-mean Gaussian whose covariance (D, D) may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
@@ -96,12 +95,12 @@ def _whitener(covariances: Array) -> Array:
 
 
 def _parts(covariances: Array) -> tuple[Array, Array, Array]:
-    """Standard deviations (..., D), and eigenvalues (..., D), raised, with eigenvectors (..., D, D) of the correlations."""
+    """Standard deviations (..., D), and eigenvalues (..., D), raised, and eigenvectors (..., D, D) of the correlations."""
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
     if not (np.all(np.isfinite(covariances)) and np.all(variances > 0.0)):
-        raise np.linalg.LinAlgError("a covariance is not finite, or not above zero")
+        raise np.linalg.LinAlgError("a covariance is not finite, or not positive")
     sigmas = np.sqrt(variances)
-    # by parts, as products of the largest and the smallest may be beyond numbers
+    # divided separately, because the product may overflow
     shares = covariances / sigmas[..., :, None] / sigmas[..., None, :]
     values, vectors = np.linalg.eigh((shares + np.swapaxes(shares, -1, -2)) / 2.0)
     return sigmas, np.maximum(values, LEAST), vectors

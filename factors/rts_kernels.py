@@ -1,4 +1,4 @@
-"""One step back of the Rauch-Tung-Striebel smoother (1965), compiled: a filter's final trajectory asks it at each record."""
+"""One backward step of the Rauch-Tung-Striebel smoother (1965), compiled."""
 
 import numba
 import numpy as np
@@ -8,10 +8,8 @@ from factors.se2 import Array
 
 @numba.njit(cache=True)
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
-    """The covariance (S, S) after a prediction, from that before.
-
-    ``transition`` (3, S): its first rows, the others are those of the identity; ``noise`` (3, 3): what it adds.
-    """
+    """The predicted covariance (S, S). ``transition`` (3, S): its first rows, the others are those of the identity; ``noise`` (3,
+    3): added to the first three components."""
     moved = transition @ covariance
     after = covariance.copy()
     after[:3] = moved
@@ -22,11 +20,11 @@ def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
 
 @numba.njit(cache=True)
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """The correction (S,) of a state, and its covariance (S, S), from what came later.
+    """The correction (S,) of a state, and its smoothed covariance (S, S).
 
-    ``covariance`` (S, S): of the filtered state; ``transition`` and ``noise``: of the step that follows, as in :func:`predicted`.
-    The smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
-    LinAlgError where the predicted covariance is singular.
+    ``covariance`` (S, S): of the filtered state; ``transition`` and ``noise``: of the following step, as in :func:`predicted`. The
+    smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
+    LinAlgError if the predicted covariance is singular.
     """
     after = predicted(covariance, transition, noise)
     carried = covariance.copy()  # transition times covariance
@@ -37,7 +35,7 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
 
 @numba.njit(cache=True)
 def is_skew(covariance: Array, share: float) -> bool:
-    """Whether a covariance (S, S) is farther from symmetry than this share of two standard deviations."""
+    """Whether a covariance (S, S) is asymmetric by more than this share of two standard deviations."""
     for i in range(len(covariance)):
         for j in range(i):
             skew = covariance[i, j] - covariance[j, i]

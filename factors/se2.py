@@ -21,12 +21,12 @@ _SMALL_ANGLE = 1e-4
 
 
 def wrap(angle: Array) -> Array:
-    """Angles in radians, brought into (-pi, pi]."""
+    """Angles in radians, wrapped to (-pi, pi]."""
     return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
 
 
 def wrap_scalar(angle: float) -> float:
-    """One angle in radians, brought into (-pi, pi]."""
+    """One angle in radians, wrapped to (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
@@ -158,13 +158,13 @@ def transform_from(pose: Array, points: Array) -> Array:
 
 
 def body_to_world(pose: Array, covariance: Array) -> Array:
-    """A covariance ``(..., 3, 3)`` of the body-frame perturbation, as that of ``(x, y, heading)`` in the world."""
+    """Convert a covariance ``(..., 3, 3)`` of the body-frame perturbation to one of ``(x, y, heading)`` in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation @ covariance @ rotation.mT
 
 
 def world_to_body(pose: Array, covariance: Array) -> Array:
-    """A covariance ``(..., 3, 3)`` of ``(x, y, heading)`` in the world, as that of the body-frame perturbation."""
+    """Convert a covariance ``(..., 3, 3)`` of ``(x, y, heading)`` in the world to one of the body-frame perturbation."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation.mT @ covariance @ rotation
 
@@ -177,17 +177,17 @@ def arc_coefficients(phi: float) -> tuple[float, float]:
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
-    """The same of arrays."""
+    """:func:`arc_coefficients` of arrays."""
     small = np.abs(phi) < _SMALL_ANGLE
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
-    # 1 - cos(phi) by the half angle: the difference would lose its digits
+    # 1 - cos(phi) by the half angle, against cancellation
     b = np.where(small, phi / 2.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     return a, b
 
 
 def _compose_one(ax: float, ay: float, ah: float, bx: float, by: float, bh: float) -> tuple[float, float, float]:
-    # single poses are composed hundreds of thousands of times a run: numpy would take ten times as long
+    # single poses are composed hundreds of thousands of times per run, for which numpy is ten times slower
     c, s = math.cos(ah), math.sin(ah)
     return ax + c * bx - s * by, ay + s * bx + c * by, wrap_scalar(ah + bh)
 

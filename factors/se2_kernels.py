@@ -1,10 +1,10 @@
-"""What compiled code needs of :mod:`factors.se2`: single poses, by their components."""
+"""Compiled :mod:`factors.se2` for single poses, by components."""
 
 import math
 
 import numba
 
-SMALL = 1e-4  # rad: below it series stand for what would lose its digits
+SMALL = 1e-4  # rad; smaller angles use series, against cancellation
 
 
 @numba.njit(cache=True)

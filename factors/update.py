@@ -1,8 +1,7 @@
-"""The Kalman update of all estimators by what is seen of landmarks and points: robust and iterated, in information form.
+"""The robust, iterated Kalman update in information form.
 
-A factor of sightings tells of K of them two coordinates each; one that is wrong must neither pull far nor be dropped by a
-prediction that is wrong itself. Of pixels of known points, which come often and in numbers, the same is done by compiled code
-(:mod:`factors.camera.update_kernels`).
+Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Pixels of known points, which are many and
+frequent, have a compiled version (:mod:`factors.camera.update_kernels`).
 """
 
 from __future__ import annotations
@@ -18,14 +17,13 @@ from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
 from factors.se2 import Array
 
-CONVERGED = 1e-6  # of an iterated update, m and rad
+CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
-GATES = {1: 6.63, 2: GATE, 3: 11.34}  # with others
+GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
 
 
 class Sightings(Protocol):
-    """A factor of sightings: :class:`~factors.landmarks.factor.BearingRangeFactor` and
-    :class:`~factors.camera.factor.ReprojectionFactor`."""
+    """A factor of K sightings with g coordinates each, such as :class:`~factors.landmarks.factor.BearingRangeFactor`."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
@@ -34,16 +32,16 @@ class Sightings(Protocol):
         """The robust weight of squared whitened residuals."""
 
     def dof(self) -> int:
-        """How many coordinates are measured."""
+        """Number of measured coordinates."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What an observation makes of a Gaussian: ``delta`` (S,) of the error state, and its ``covariance`` (S, S) afterwards.
+    """The correction of a Gaussian by an observation: ``delta`` (S,) of the error state, and its ``covariance`` (S, S) afterwards.
 
-    At the prediction: the whitened ``residual`` (K, g), predicted less measured, and its normalised square (``nis``) with degrees
-    of freedom. Of a likelihood that is no residual: how much larger its negative logarithm was than expected (``excess_nll``), the
-    ``variance`` of that, and the ``evidence``, the log of its probability by Laplace's method.
+    At the prediction: the whitened ``residual`` (K, g), predicted minus measured, and its normalised square (``nis``) with degrees
+    of freedom. For a likelihood without residuals: the excess of its negative logarithm over the expected value (``excess_nll``),
+    the ``variance`` of that, and the ``evidence``, its log-probability by Laplace's method.
     """
 
     delta: Array
@@ -59,7 +57,7 @@ class Correction:
 def robust_update(
     factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
 ) -> Correction:
-    """Kalman update of ``pose`` (3,) and further states by a factor on the pose alone; see :func:`update_state`.
+    """Kalman update of ``pose`` (3,) and correlated states by a factor on the pose only; see :func:`update_state`.
 
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
     """
@@ -96,14 +94,14 @@ def update_state(
     dof: int,
     converged: float = CONVERGED,
 ) -> Correction:
-    """Kalman update, robust and iterated, in information form; by square roots where that has not the digits for it.
+    """Robust, iterated Kalman update in information form, or in square-root form if that is numerically insufficient.
 
-    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, g) and Jacobian (K, g, D) by the
-    first D components of the error state, with the state moved by ``delta`` (S,). ``weight``: the weight (K,) of squared
-    residuals (K,), robust and tempered: that of zero is the tempering, which the innovation is free of. At first a sighting
-    whose normalised innovation squared lies beyond the gate has its noise widened by the square of the excess, so that it
-    pulls the less the farther off it is, but never locks the filter out. Further iterations widen it by the inverse of its
-    weight at the updated state (iteratively reweighted least squares), until a step is below ``converged``.
+    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, g) and Jacobian (K, g, D) by the first D
+    components of the error state, at the correction ``delta`` (S,). ``weight``: the weight (K,) of squared residuals (K,), robust
+    and tempered; at zero it is the tempering, which the innovation excludes. In the first iteration a sighting whose normalised
+    innovation squared is outside the gate has its noise multiplied by the squared excess, which reduces its influence without
+    locking the filter out. Further iterations divide the noise by the weight at the updated state (iteratively reweighted least
+    squares), until a step is below ``converged``.
     """
     iterated = iterations, dof, converged
     try:
@@ -114,8 +112,8 @@ def update_state(
     return found
 
 
-# Correction (S,) and covariance (S, S) from a Jacobian (K, g, D) and residuals (K, g), their weights (K,), and the correction (D,)
-# at which they are linearised.
+# Correction (S,) and covariance (S, S) from a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at
+# which they are linearised.
 _Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 
@@ -151,7 +149,7 @@ def _iterated(
 
 
 def _informed(prior: Array) -> _Solver:
-    """By the information ``prior`` (S, S) before."""
+    """A solver with the ``prior`` information (S, S)."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size = len(at)
@@ -166,7 +164,7 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """By the lower ``root`` (S, S) of the covariance before: what comes out is positive however far the numbers are apart."""
+    """A solver with the lower ``root`` (S, S) of the prior covariance, whose result is always positive definite."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))
@@ -182,19 +180,19 @@ def _rooted(root: Array) -> _Solver:
 
 
 def _require_sound(delta: Array, covariance: Array) -> None:
-    """LinAlgError if that is no update: rounding has taken more than there was."""
+    """LinAlgError if the update is invalid because of rounding."""
     np.linalg.cholesky(covariance)
     if not np.all(np.isfinite(delta)):
         raise np.linalg.LinAlgError("an update is not finite")
 
 
 def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of each sighting by itself."""
+    """Normalised innovation squared (K,) of each sighting."""
     s = blocks @ covariance @ blocks.transpose(0, 2, 1)
     if s.shape[1] != 2:
         return np.asarray(positive.squared(residual, np.eye(s.shape[1]) + s))
     a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
     x, y = residual[:, 0], residual[:, 1]
-    # rounding may take all of the difference, which is never less than that
+    # rounding may cancel the difference completely, which is never less than that
     determinant = np.maximum(a * c - b * b, 0.5 * (a + c))
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)

@@ -65,7 +65,7 @@ def test_compare_takes_names_and_settings_by_estimator(office, tmp_path):
     assert config["settings"]["iterations"] == 2
     assert not found.failures
     assert (tmp_path / "out/results.parquet").is_file()
-    with pytest.raises(fgloc.InputError, match="settings are given of smoother"):
+    with pytest.raises(fgloc.InputError, match="settings are given for smoother"):
         fgloc.compare(office, ["ekf"], tmp_path / "other", settings={"smoother": {}})
 
 
@@ -73,7 +73,7 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
     fgloc.simulate("office", 3, changes=SHORT, out=tmp_path / "log")
     (read,) = fgloc.load(str(tmp_path / "log"))
     assert np.array_equal(read.streams["odometry"].dx, office.streams["odometry"].dx)
-    with pytest.raises(fgloc.InputError, match="images are files"):
+    with pytest.raises(fgloc.InputError, match="images need out"):
         fgloc.simulate("office", images=True)
     changes = {"drive": {"duration": 2.0}, "images": {"rate": 2.0}}
     seen = fgloc.simulate("office", changes=changes, images=True, out=tmp_path / "seen")

@@ -93,17 +93,19 @@ def test_what_cannot_be_loaded_is_one_line(install, place, why):
 def test_what_is_no_sensor_is_refused(install):
     install(("sensors", "sonar", "sonar:Guess"))
     with pytest.raises(
-        InputError, match=r"^sensors: sonar of sonar-package has no channels, expected one that the docs describe$"
+        InputError, match=r"^sensors: sonar of sonar-package has no channels, which the interface requires$"
     ):
         registry.sensors()
 
 
 def test_a_name_stands_for_one_thing(install, sonar):
     install(("estimators", "ekf", "sonar:Guess"))
-    with pytest.raises(InputError, match=r"^estimators: sonar-package brings ekf, which this project has already$"):
+    with pytest.raises(
+        InputError, match=r"^estimators: sonar-package registers ekf, which this project already registers$"
+    ):
         list(ESTIMATORS)
     install(("readers", "sonar_log", "sonar"), ("readers", "sonar_log", "sonar", "echo"))
-    with pytest.raises(InputError, match=r"^readers: echo brings sonar_log, which sonar-package has already$"):
+    with pytest.raises(InputError, match=r"^readers: echo registers sonar_log, which sonar-package already registers$"):
         list(READERS)
     sonar.SENSOR = SensorType("sonar", (Channel("sightings"),))
     install(("sensors", "sonar", "sonar:SENSOR"))

@@ -93,7 +93,7 @@ def test_a_script_keeps_rig_map_and_grid(tmp_path):
 def test_several_logs_are_not_one():
     both = {"run": "1,2"}
     assert [log.name for log in fgloc.load("plaza2", options=both)] == ["plaza2-run1", "plaza2-run2"]
-    with pytest.raises(fgloc.InputError, match="plaza2 stands for 2 logs, expected one: plaza2-run1, plaza2-run2"):
+    with pytest.raises(fgloc.InputError, match="plaza2 refers to 2 logs, expected one: plaza2-run1, plaza2-run2"):
         fgloc.read_log("plaza2", options=both)
 
 
@@ -114,7 +114,7 @@ def test_places_of_0_1_0_still_work_with_a_warning():
         exec("from factorgraph_loc.rig import Nothing", {})
     with pytest.raises(ImportError):
         exec("import factorgraph_loc.readers.nothing", {})
-    with pytest.raises(ImportError, match=r"is not installed any more: it is scripts/benchmarking/trials.py of the"):
+    with pytest.raises(ImportError, match=r"is no longer installed: it is scripts/benchmarking/trials.py in the"):
         exec("from factorgraph_loc.experiments.trials import run_trials", {})
 
 

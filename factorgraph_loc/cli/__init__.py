@@ -1,3 +1,3 @@
-"""The command ``fgloc``: options, what is printed, exit codes."""
+"""The command line ``fgloc``."""
 
 __all__ = ["main"]

@@ -1,4 +1,4 @@
-"""``fgloc active``: simulated robots that choose where to drive until they know where they are."""
+"""``fgloc active``: simulated robots that plan their paths to localize themselves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def active(
         str,
         typer.Option(
             metavar="A,B",
-            help="information, paper_literal, random, patrol, nearest_tags; the first is compared with the others.",
+            help="information, paper_literal, random, patrol, nearest_tags; the others are compared with the first.",
         ),
     ] = "information",
     estimator: Annotated[
@@ -34,21 +34,21 @@ def active(
     ] = "active_mcl",
     seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
     max_metres: Annotated[
-        float | None, typer.Option(metavar="M", help="After which a robot gives up [m]; by default 100.")
+        float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
     ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; may be repeated.",
+            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; may be repeated.",
         ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Let robots drive from an unknown start until they know where they are; compare policies on the same seeds."""
+    """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
     from factorgraph_loc.evaluation.active import difference_cells, differences, summaries, summary_cells
     from factorgraph_loc.experiments.active import seek
 
@@ -84,7 +84,7 @@ def active(
 
 
 def _settings(world: str, changes: dict[str, Any]) -> tuple[SimulationSettings, ActiveSettings]:
-    """The world and the run: no key is of both."""
+    """Split the changes into settings of the world and of the run; no key belongs to both."""
     from factorgraph_loc.files.models import nearest, parse_model
     from factorgraph_loc.planning.settings import ActiveSettings
     from factorgraph_loc.simulation import SimulationSettings

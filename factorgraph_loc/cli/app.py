@@ -1,4 +1,4 @@
-"""The commands of ``fgloc``. The command line only parses and prints; numerical libraries are imported inside the commands."""
+"""The Typer application. Commands only parse and print; numerical libraries are imported inside the commands."""
 
 import sys
 import traceback
@@ -33,16 +33,15 @@ from factorgraph_loc.version import __version__
 DEBUG = "--debug"
 COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
 SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
-_UsageError: Any = typer.BadParameter.__mro__[1]  # of click, or of the copy of it that Typer has
-UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: a fault of the program, which no input should cause
+_UsageError: Any = typer.BadParameter.__mro__[1]  # click's, or that of Typer's own copy of click
+UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: an internal error
 
 
 class Commands(TyperGroup):
-    """The one place where an error that a user can cause becomes a line on stderr and an exit code."""
+    """Turns errors into a line on stderr and an exit code."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """``--debug`` is taken wherever it stands on the line. A shell named after an option of completion is the one meant;
-        Typer alone would take the one that it runs in."""
+        """Accept ``--debug`` anywhere on the line, and a shell's name after a completion option."""
         if len(args) == 2 and args[0] in COMPLETION and args[1] in SHELLS:
             COMPLETION[args[0]](ctx, self.params[0], args[1])
         if DEBUG in args:
@@ -74,9 +73,9 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    epilog="Exit codes: 0 all is well, 1 a run failed (the others are reported), 2 bad input, or a file or standard output "
-    "that cannot be written, 70 a fault of the program, 129, 130 and 143 hung up, interrupted and terminated, 141 who reads the "
-    "output has ended.",
+    epilog="Exit codes: 0 success; 1 a run failed (the others are reported); 2 invalid input, or a file or standard output "
+    "cannot be written; 70 internal error; 129, 130 and 143 hung up, interrupted and terminated; 141 the reader of the "
+    "output closed the pipe.",
 )
 app.command()(inspecting.datasets)
 app.command()(inspecting.info)
@@ -107,19 +106,19 @@ def fgloc(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
     debug: Annotated[
-        bool, typer.Option(DEBUG, help="Show the traceback of an error. May stand anywhere on the line.")
+        bool, typer.Option(DEBUG, help="Show the traceback of an error. May be given anywhere on the line.")
     ] = False,
 ) -> None:
-    """Localize a robot from logged runs: look at a log, run an estimator on it, compare estimators."""
+    """Localize robots from logs: inspect a log, run estimators on it, compare them."""
 
 
 def run() -> None:
-    """The command by the arguments of this process, which it ends."""
+    """Run the command with the arguments of this process, then exit."""
     use_one_thread()
     try:
         with standard_streams():
             app()
-    except OutputError as error:  # of --help and --version too
+    except OutputError as error:  # also for --help and --version
         show.note(f"error: {error}")
         sys.exit(error.exit_code)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""``fgloc calibrate``: a rig from logs with reference poses."""
+"""``fgloc calibrate``: estimates a rig from logs with reference poses."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ from factorgraph_loc.cli.options import (
 )
 
 OutRig = Annotated[
-    Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report goes beside it.")
+    Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it.")
 ]
 
 
@@ -34,7 +34,7 @@ def calibrate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Learn a rig from logs with reference poses; write it, and a report."""
+    """Calibrate a rig from logs with reference poses; write the rig and a report."""
     from factorgraph_loc import api
     from factorgraph_loc.calibration import report
 

@@ -1,4 +1,4 @@
-"""``fgloc experiment``: many runs of a file, with results that are kept and one page to read."""
+"""``fgloc experiment``: many runs described in a file, with stored results and a report."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from factorgraph_loc.errors import InputError
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Prepared
 
-MANY = 2000  # runs that are not planned by mistake
-SHOWN = 10  # failures, which are all in the table, and damaged runs
+MANY = 2000  # runs above which confirmation is required
+SHOWN = 10  # failures and damaged runs that are printed
 
-app = typer.Typer(no_args_is_help=True, help="Many runs of a file: make them, see how far they are, report on them.")
+app = typer.Typer(no_args_is_help=True, help="Experiments: run them, show their status, report their results.")
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="The experiment: a TOML file.")]
 Changes = Annotated[
@@ -26,11 +26,12 @@ Changes = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Another value of a key of FILE; LABEL.KEY of an estimator, simulation.KEY of simulated logs; may be repeated.",
+        help="Value for a key of FILE; LABEL.KEY for an estimator, simulation.KEY for simulated logs; may be repeated.",
     ),
 ]
 OutFolder = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; else what FILE says.")
+    Path | None,
+    typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; by default the one that FILE states."),
 ]
 
 
@@ -39,34 +40,34 @@ def run(
     file: File,
     set_: Changes = None,
     out: OutFolder = None,
-    jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that makes the runs instead."),
+        typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs."),
     ] = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run again what failed.")] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Compare stored results with their checksums; make damaged ones again.")
+        bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and how long they may take.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help=f"Yes, these are to be more than {MANY:,} runs.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY:,} runs.")] = False,
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """Make the runs of an experiment whose results are not there yet; can be stopped and started again at any time."""
+    """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
     from factorgraph_loc.experiments.cluster import on_cluster
     from factorgraph_loc.experiments.experiment import run_experiment
     from factorgraph_loc.experiments.plan import TooManyRunsError
 
     if scheduler is not None and jobs is not None:
-        raise InputError("--jobs is of this machine, but --scheduler names a cluster: expected one of them")
+        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
     if yes or dry_run:
         prepared = _prepared(file, set_, out, data_root, verify=verify)
     else:
         try:
             prepared = _prepared(file, set_, out, data_root, verify=verify, most=MANY)
         except TooManyRunsError as error:
-            raise InputError(f"{error}: give --yes if that is meant, --dry-run to see them") from error
+            raise InputError(f"{error}: confirm with --yes, or list them with --dry-run") from error
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return
@@ -80,7 +81,7 @@ def run(
                 progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
             )
     except KeyboardInterrupt as stop:
-        stop.add_note(f"what is done is in {prepared.folder}, the same command goes on")
+        stop.add_note(f"finished runs are kept in {prepared.folder}; the same command resumes")
         raise
     show.warnings(done.warnings)
     for failure in done.failures[:SHOWN]:
@@ -108,7 +109,7 @@ def status(
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """How many runs of an experiment are done, have failed, are missing, or are damaged."""
+    """Show how many runs of an experiment are done, failed, missing or damaged."""
     prepared = _prepared(file, set_, out, data_root, verify=verify)
     labels = list(dict.fromkeys(run.label for run in prepared.runs))
     states = ("ok", "failed", "missing", "damaged")
@@ -140,12 +141,12 @@ def report(
     set_: Changes = None,
     out: OutFolder = None,
     page: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The page to write; else report.html in OUT.")
+        Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")
     ] = None,
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """Write the results of an experiment as one HTML page, of those runs that are there and not damaged."""
+    """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
     from factorgraph_loc.experiments.reporting import report_experiment
 
     written = report_experiment(_prepared(file, set_, out, data_root), page)
@@ -202,7 +203,7 @@ def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -
         ],
     )
     show.line()
-    show.line(f"{len(prepared.runs)} runs, {len(todo)} to be made: about {_span(seconds)} with {processes} processes")
+    show.line(f"{len(prepared.runs)} runs, {len(todo)} to do: about {_span(seconds)} with {processes} processes")
 
 
 def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
@@ -211,7 +212,7 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
     if len(runs) > SHOWN:
         show.line(f"damaged: {len(runs) - SHOWN} more")
     if runs:
-        show.line(f"`fgloc experiment run {file} --verify` makes them again")
+        show.line(f"`fgloc experiment run {file} --verify` runs them again")
 
 
 def _span(seconds: float) -> str:
@@ -222,7 +223,7 @@ def _span(seconds: float) -> str:
 
 
 def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """A line for each label, set of sensors and point of the sweep: of each metric the median, the least and the greatest."""
+    """One line per label, set of sensors and point of the sweep: median, minimum and maximum of each metric."""
     from statistics import median
 
     from factorgraph_loc.evaluation.tables import SCORED, counted
@@ -242,4 +243,4 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
             cells.append(f"{median(values):.3f} ({min(values):.3f} to {max(values):.3f})" if values else "-")
         cells.append(counted(good) or "-")
         lines.append([name, f"{len(good)} of {len(members)}", *cells])
-    return ["median (least to greatest)", "runs", *metrics, SCORED], lines
+    return ["median (min to max)", "runs", *metrics, SCORED], lines

@@ -29,7 +29,7 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="What is written, by its suffix: .mcap (Foxglove), .tum, .kitti or .g2o.",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti or .g2o.",
         ),
     ],
     reader: Reader = None,
@@ -39,7 +39,7 @@ def export(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Write runs for Foxglove, or one run's final trajectory, or the reference of a log, for other programs."""
+    """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs."""
     if out.suffix not in FORMATS:
         raise InputError(f"{out}: has the suffix {quoted(out.suffix)}, expected one of {', '.join(FORMATS)}")
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
@@ -72,16 +72,16 @@ def export(
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:
     if len(runs) != 1:
         found = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
-        raise InputError(f"{out}: is of one run, and {found}, expected the folder of one")
+        raise InputError(f"{out}: holds one run, and {found}, expected the folder of one run")
     return runs[0]
 
 
 def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
-    """The final trajectory of the run, or the reference where a log alone is given."""
+    """The final trajectory of the run, or the reference of a log without runs."""
     if runs:
         return _only(runs, out).final
     if log.reference is None:
         if log.reference3 is not None:
-            raise InputError(f"{log.name}: has its reference in space, which goes into .kitti only")
+            raise InputError(f"{log.name}: has a three-dimensional reference, which only .kitti supports")
         raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
     return log.reference

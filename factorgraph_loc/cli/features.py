@@ -1,4 +1,4 @@
-"""``fgloc features``: how well point features of images repeat and match."""
+"""``fgloc features``: repeatability and matching of point features."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
 from factorgraph_loc.text import quoted
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images, and how good they are.")
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images and their quality.")
 ALL = "colour,sift,orb,fast_hessian,harris_laplace,hessian_laplace"
 
 
@@ -19,16 +19,16 @@ def evaluate(
         list[Path],
         typer.Argument(
             metavar="IMAGES...",
-            help="Folders with img1, img2, ... and H1to2p, ... (or with such folders); photographs, which are warped.",
+            help="Folders with img1, img2, ... and H1to2p, ... (or folders of these), or photographs, which are warped.",
         ),
     ],
     out: Out,
     features: Annotated[str, typer.Option(metavar="A,B", help="Features and detectors to compare.")] = ALL,
-    count: Annotated[int, typer.Option(min=1, help="Points an image, the strongest of each feature.")] = 1000,
+    count: Annotated[int, typer.Option(min=1, help="Points per image, the strongest of each feature.")] = 1000,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Compare features on images of flat scenes: repeatability, matching, the homography found, time."""
+    """Compare features on images of planar scenes: repeatability, matching, estimated homography, time."""
     from factorgraph_loc.errors import InputError
     from factorgraph_loc.evaluation.features import scores as evaluation
     from factorgraph_loc.evaluation.features.feature_evaluation import feature
@@ -38,7 +38,7 @@ def evaluate(
     if not names:
         raise InputError(f"--features is {quoted(features)}, expected names such as {ALL}")
     chosen = [feature(name, count) for name in names]
-    evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
+    evaluation.check_free(out, overwrite=overwrite)  # before the computation
     sequences = find_sequences(images)
     with show.progress("evaluating", counted=True) as progress:
         scores = evaluation.evaluate_all(sequences, chosen, progress)

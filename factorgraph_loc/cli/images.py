@@ -1,4 +1,4 @@
-"""``fgloc images``: how well images are located in a map that was made from others."""
+"""``fgloc images``: accuracy of image localization in a map made from other images."""
 
 from dataclasses import asdict
 from typing import Annotated
@@ -27,12 +27,12 @@ RANGE = "FIRST:END or FIRST:END:STEP"
 def images(
     log: LogName,
     out: Out,
-    map_: Annotated[str, typer.Option("--map", metavar="RANGE", help=f"Images for the map, from 0: {RANGE}.")],
+    map_: Annotated[str, typer.Option("--map", metavar="RANGE", help=f"Images for the map, numbered from 0: {RANGE}.")],
     query: Annotated[
-        list[str], typer.Option(metavar="NAME=RANGE", help="Images to be located, a sequence; may be repeated.")
+        list[str], typer.Option(metavar="NAME=RANGE", help="A sequence of images to localize; may be repeated.")
     ],
     feature: Annotated[str, typer.Option(metavar="A,B", help="Features to compare.")] = "colour,sift,orb",
-    count: Annotated[int, typer.Option(min=10, max=20_000, help="Features an image.")] = 1500,
+    count: Annotated[int, typer.Option(min=10, max=20_000, help="Features per image.")] = 1500,
     reader: Reader = None,
     reader_option: ReaderOption = None,
     data_root: DataRoot = None,
@@ -40,7 +40,7 @@ def images(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Map some images of a log with their reference, locate others, and tell the errors."""
+    """Map some images of a log with their reference poses, localize others, and report the errors."""
     from factorgraph_loc.experiments import image_localization as evaluation
     from factorgraph_loc.vision.features import extractor
 
@@ -51,7 +51,7 @@ def images(
         raise InputError(f"--feature is {quoted(feature)}, expected names such as colour,sift,orb")
     for name in names:
         extractor(name, count)
-    evaluation.check_free(out, overwrite=overwrite)  # now, not when all is computed
+    evaluation.check_free(out, overwrite=overwrite)  # before the computation
     loaded = LogOptions(reader, reader_option, data_root, rig, None).load_one(log)
     with show.progress("images", counted=False) as report:
         results = evaluation.evaluate_images(loaded, names, count, mapped, queries, lambda share: report(share, 1.0))
@@ -78,7 +78,7 @@ def images(
 
 
 def parse_range(text: str, option: str) -> range:
-    """``0:200:2`` as the numbers 0, 2, ... 198; InputError if it is not such a range."""
+    """``0:200:2`` as the numbers 0, 2, ... 198; InputError if the text is invalid."""
     try:
         found = range(*(int(part) for part in text.split(":")))
     except (TypeError, ValueError):

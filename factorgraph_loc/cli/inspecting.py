@@ -1,4 +1,4 @@
-"""``fgloc datasets``, ``fgloc info`` and ``fgloc convert``: what there is, before anything is run."""
+"""``fgloc datasets``, ``fgloc info`` and ``fgloc convert``: commands that run no estimator."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 class Format(StrEnum):
-    """Of the tables of a native log."""
+    """Format of the tables of a native log."""
 
     csv = "csv"
     parquet = "parquet"
 
 
 def datasets(data_root: DataRoot = None, json: Json = False) -> None:
-    """List the logs that are known by name, and whether their files are there."""
+    """List the logs that are known by name, and whether their files exist."""
     from factorgraph_loc.io.readers import describe
 
     known = [asdict(dataset) for dataset in describe(data_root)]
@@ -55,7 +55,7 @@ def info(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Show what a log holds, and what looks wrong with it; of a ROS bag, its topics."""
+    """Summarize a log, with warnings about its content; for a ROS bag, its topics."""
     from factorgraph_loc.evaluation.inspect import inspect
     from factorgraph_loc.files.shipped import manifests
     from factorgraph_loc.io.bags.file import is_bag
@@ -85,7 +85,7 @@ def convert(
     out: Annotated[
         Path, typer.Argument(metavar="OUT", help="Folder to write, or a ROS bag: a name with .bag, .mcap or .db3.")
     ],
-    format: Annotated[Format, typer.Option(help="Of the tables.")] = Format.csv,
+    format: Annotated[Format, typer.Option(help="Format of the tables.")] = Format.csv,
     reader: Reader = None,
     reader_option: ReaderOption = None,
     data_root: DataRoot = None,
@@ -93,7 +93,7 @@ def convert(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Write a log in the native format, a folder of tables that any program can read, or as a ROS bag."""
+    """Write a log as a folder in the native format, or as a ROS bag."""
     from factorgraph_loc.io.write import write_log
 
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
@@ -114,10 +114,10 @@ def _print(log: Log, found: Inspection) -> None:
         "span": f"{last - first:.1f} s",
         "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors)}",
         "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in found.in_map.items())]),
-        "start": "stated by the log" if log.start is not None else "not stated",
+        "start": "given by the log" if log.start is not None else "not given",
     }
     if log.reference is None and log.reference3 is not None:
-        about["reference"] = f"in space, {len(log.reference3)} poses"
+        about["reference"] = f"three-dimensional, {len(log.reference3)} poses"
     elif log.reference is None:
         about["reference"] = "none: runs cannot be scored"
     elif not log.reference.has_heading:
@@ -136,7 +136,7 @@ def _print(log: Log, found: Inspection) -> None:
             show.table(paragraph.header, paragraph.rows)
         show.line()
     if not found.problems:
-        show.line("nothing looks wrong")
+        show.line("no warnings")
     for problem in found.problems:
         show.line(f"! {problem}")
 

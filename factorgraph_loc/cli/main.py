@@ -1,10 +1,10 @@
-"""The entry point of ``fgloc``. What the command needs is imported inside, so that a signal may come meanwhile as at any time."""
+"""The entry point of ``fgloc``. Imports are inside the function, so that signals are handled while they run."""
 
 import sys
 
 
 def main() -> None:
-    """The command ``fgloc``, which ends this process."""
+    """Run the command ``fgloc``, then exit."""
     try:
         from factorgraph_loc.cli.stopping import stoppable
 

@@ -1,4 +1,4 @@
-"""``fgloc manifest``, and what ``fgloc info`` says of a ROS bag: its topics, and what they could be."""
+"""``fgloc manifest``, and the topics of a ROS bag for ``fgloc info``."""
 
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .
 
 
 def manifest(bag: BagPath, json: Json = False) -> None:
-    """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file, and look through it."""
+    """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
     from factorgraph_loc.io.bags.file import open_bag
     from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose, remarks
 
@@ -31,7 +31,7 @@ def manifest(bag: BagPath, json: Json = False) -> None:
         content = manifest_of(proposal, path.relative_to(root).as_posix(), beside)
         told = remarks(opened, proposal, beside)
     if not below:
-        show.note(f"the manifest names {path.name} alone: put it into {path.parent}, or give --data-root {path.parent}")
+        show.note(f"the manifest names {path.name} only: save it in {path.parent}, or give --data-root {path.parent}")
     if json:
         show.document({"manifest": content, "remarks": told})
     else:
@@ -39,7 +39,7 @@ def manifest(bag: BagPath, json: Json = False) -> None:
 
 
 def info_of_bag(bag: Path, json: Json) -> None:
-    """The topics of a bag."""
+    """Print the topics of a bag."""
     from factorgraph_loc.io.bags.file import open_bag
     from factorgraph_loc.io.bags.manifest import propose
 
@@ -60,9 +60,7 @@ def info_of_bag(bag: Path, json: Json) -> None:
     header = ("topic", "type", "messages", "rate [Hz]", "looks like")
     show.table(header, [_row(t.name, t.type, t.count, rates[t.name], uses.get(t.name, "")) for t in topics])
     show.line()
-    show.line(
-        f"`fgloc manifest {bag} > run.toml` proposes how to read it; then `fgloc info run.toml` shows what it holds"
-    )
+    show.line(f"`fgloc manifest {bag} > run.toml` proposes a manifest; then `fgloc info run.toml` shows the content")
 
 
 def _row(name: str, kind: str, count: int, rate: float | None, use: str) -> tuple[str, ...]:

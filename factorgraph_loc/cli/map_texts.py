@@ -1,4 +1,4 @@
-"""What ``fgloc map`` tells of a map that it made: a table and some lines, or one document."""
+"""The output of ``fgloc map``: tables, lines and the JSON document."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = ("given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distan
 
 
 def tell(found: Made) -> tuple[str, ...]:
-    """Print the table of what was found, where there is one, and return what there is to say of it."""
+    """Print the table of map elements, if any, and return further lines."""
     from factorgraph_loc.experiments.maps import DroppedTags
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
@@ -46,7 +46,7 @@ def tell(found: Made) -> tuple[str, ...]:
 
 
 def document(found: Made) -> dict[str, Any]:
-    """The same and all figures, as plain values."""
+    """All figures as plain values."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
@@ -86,7 +86,7 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
 
 
 def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """What is told of each landmark or tag; ``verdicts``: in place of some of the map's."""
+    """The entry of each landmark or tag; ``verdicts`` replace some of the map's."""
     return {
         entry.landmark: {
             "given": None if entry.given is None else entry.given.tolist(),
@@ -102,21 +102,21 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 
 def _notes(made: MadeTags) -> list[str]:
-    """What the table does not tell: the tags that are in no map, and how far the others are off."""
+    """Lines on what the table does not show: unmapped tags, and the RMS distance from the given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     others = {name: why for name, why in made.open.items() if name not in listed}
     told = [note for note in made.made.notes if not note.startswith("kept as they are")]
     kept = [name for name in made.open if name in made.world.tags]
     if kept:
-        told.append(f"kept as they are in the given map, as they could not be located: {', '.join(kept)}")
+        told.append(f"kept unchanged from the given map, as they could not be located: {', '.join(kept)}")
     silent = [name for name, why in made.open.items() if why == "never read"]
     if silent:
         told.append(f"never read: {', '.join(silent)}")
     if made.rms is not None:
-        told.append(f"root mean square distance from the given places: {made.rms:.3f} m")
+        told.append(f"root mean square distance from the given positions: {made.rms:.3f} m")
     chance = [name for name, why in others.items() if "than chance" in why]
     if chance:
         told.append(
-            f"{len(chance)} tags that the map lacks were read so seldom that no place explains it better than chance"
+            f"{len(chance)} tags that the map lacks were read so rarely that no position explains the reads better than chance"
         )
     return told + [f"not in the map: {name}, {why}" for name, why in others.items() if name not in chance]

@@ -1,4 +1,4 @@
-"""``fgloc map``: a map of landmarks, of RFID tags or of points from a log."""
+"""``fgloc map``: a map of landmarks, RFID tags or points from a log."""
 
 from functools import partial
 from pathlib import Path
@@ -22,9 +22,10 @@ from factorgraph_loc.cli.options import (
     parse_settings,
 )
 
-MAPPERS = ("batch", "smoother", "ekf")  # as factorgraph_loc.experiments.maps has them
+MAPPERS = ("batch", "smoother", "ekf")  # as in factorgraph_loc.experiments.maps
 OutWorld = Annotated[
-    Path, typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture goes beside it.")
+    Path,
+    typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture is written next to it."),
 ]
 
 
@@ -46,23 +47,23 @@ def map_(
         str | None,
         typer.Option(
             metavar="WHAT",
-            help="landmarks, tags or points; else points where the log has images, landmarks where it has sightings of them.",
+            help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
         ),
     ] = None,
     poses: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="For tags and points: reference or odometry, which estimates the poses too; else the reference if there is one.",
+            help="For tags and points: reference, or odometry to estimate the poses too; by default the reference if there is one.",
         ),
     ] = None,
     tag_height: Annotated[
         float | None,
-        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; else that of the antennas."),
+        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
     ] = None,
     drop_dead: Annotated[
         bool,
-        typer.Option("--drop-dead", help="Map nothing: write the log's map without the tags that are believed dead."),
+        typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead."),
     ] = False,
     prior: Prior = None,
     set_: Settings = None,
@@ -74,10 +75,10 @@ def map_(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Make a map of the landmarks, RFID tags or points in a log; where the log has a map of landmarks or tags, check that."""
+    """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any."""
     from factorgraph_loc.experiments import maps
 
-    picture = maps.picture_beside(out, overwrite=overwrite)  # before anything is read
+    picture = maps.picture_beside(out, overwrite=overwrite)  # before the log is read
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     settings = parse_settings(set_ or (), [estimator])[estimator]
     options = maps.MapOptions(of, estimator, settings, extend, poses, tag_height, prior, drop_dead)

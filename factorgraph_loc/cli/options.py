@@ -1,4 +1,4 @@
-"""The options that commands share, and what their texts mean."""
+"""Options shared by several commands, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ LogNames = Annotated[
     ),
 ]
 DataRoot = Annotated[
-    Path | None, typer.Option(help="Folder that the manifests' paths start from; else the environment's FGLOC_DATA.")
+    Path | None,
+    typer.Option(help="Folder that paths in manifests are relative to; by default the environment's FGLOC_DATA."),
 ]
-Reader = Annotated[str | None, typer.Option(help="Reader of LOG, where LOG is neither a manifest nor a native folder.")]
+Reader = Annotated[str | None, typer.Option(help="Reader of LOG, if LOG is neither a manifest nor a native folder.")]
 ReaderOption = Annotated[
     list[str] | None, typer.Option(metavar="KEY=VALUE", help="Option of the reader; may be repeated.")
 ]
-RigFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml in place of the log's own rig.")]
-WorldFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .world.toml in place of the log's own map.")]
+RigFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml to use instead of the log's rig.")]
+WorldFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .world.toml to use instead of the log's map.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results.")]
 Estimator = Annotated[
@@ -51,25 +52,25 @@ Estimators = Annotated[
     str,
     typer.Option("--estimators", "-e", metavar="A,B", help="The estimators.", autocompletion=completion.estimators),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results that are there already.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
 Sensors = Annotated[
-    str | None, typer.Option(metavar="A,B", help="Sensors that the estimators may use; else those of the rig.")
+    str | None, typer.Option(metavar="A,B", help="Sensors that the estimators may use; by default those of the rig.")
 ]
 Prior = Annotated[
     str | None,
     typer.Option(
         metavar="PRIOR",
-        help="Where a run starts: reference, log, unknown, X,Y [m] or X,Y,HEADING [rad]; else the log's start, else the reference.",
+        help="Start: reference, log, unknown, X,Y [m] or X,Y,HEADING [rad]; by default the log's start, else the reference.",
         autocompletion=completion.prior,
     ),
 ]
 MaxGap = Annotated[
     float,
-    typer.Option(metavar="SECONDS", help="How far apart estimates may lie between which the score interpolates."),
+    typer.Option(metavar="SECONDS", help="Longest time between estimates across which scoring interpolates."),
 ]
 TickGap = Annotated[
     float,
-    typer.Option(metavar="SECONDS", help="Gaps between measurements that are longer than this hold no estimates."),
+    typer.Option(metavar="SECONDS", help="Gaps between measurements longer than this contain no estimates."),
 ]
 Settings = Annotated[
     list[str] | None,
@@ -84,7 +85,7 @@ Settings = Annotated[
 
 @dataclass(frozen=True)
 class LogOptions:
-    """How logs are to be read."""
+    """The options for reading logs."""
 
     reader: str | None
     reader_option: Sequence[str] | None
@@ -93,7 +94,7 @@ class LogOptions:
     world: Path | None
 
     def load(self, names: Sequence[str]) -> list[Log]:
-        """The logs of several names; a name may stand for several logs."""
+        """The logs of several names; a name may refer to several logs."""
         from factorgraph_loc.io.readers import load
 
         options = dict(key_and_value(text, "--reader-option") for text in self.reader_option or ())
@@ -106,10 +107,10 @@ class LogOptions:
         ]
 
     def load_one(self, name: str) -> Log:
-        """The log of a name that must stand for one log."""
+        """The log of a name that must refer to one log."""
         logs = self.load([name])
         if len(logs) > 1:
-            raise InputError(f"{name} stands for {len(logs)} logs, expected one: {listed(log.name for log in logs)}")
+            raise InputError(f"{name} refers to {len(logs)} logs, expected one: {listed(log.name for log in logs)}")
         return logs[0]
 
 
@@ -153,7 +154,7 @@ def key_and_value(text: str, option: str) -> tuple[str, Any]:
 
 
 def _scalar(text: str) -> Any:
-    """A value as TOML files of ours have it; a word that is none, such as a date, is itself."""
+    """A value as in TOML; text that is not TOML, and dates, stay text."""
     from factorgraph_loc.files.models import parse_toml
 
     try:

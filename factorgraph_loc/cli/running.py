@@ -38,9 +38,9 @@ from factorgraph_loc.model.ticks import TICK_GAP
 if TYPE_CHECKING:
     from factorgraph_loc.model.result import RunResult
 
-SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the rest is in the files
+SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the others are in the files
 
-# of the table of one run; column: figure of the scores, digits
+# table of a planar run; column: key of the scores, digits
 COLUMNS = {
     "position RMSE [m]": ("position_rmse", 3),
     "95 % [m]": ("position_p95", 3),
@@ -49,7 +49,7 @@ COLUMNS = {
     "ANEES": ("anees", 2),
     "poses scored": ("scored", 0),
 }
-# and of one of a robot in space
+# table of a three-dimensional run
 SPACE_COLUMNS = {
     "position RMSE [m]": ("position_rmse", 3),
     "max [m]": ("position_max", 3),
@@ -65,7 +65,7 @@ def run(
     out: Out,
     sensors: Sensors = None,
     prior: Prior = None,
-    seed: Annotated[int, typer.Option(help="Of the random generator.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random generator.", min=0)] = 0,
     set_: Settings = None,
     reader: Reader = None,
     reader_option: ReaderOption = None,
@@ -83,7 +83,7 @@ def run(
     from factorgraph_loc.fusion.registry import check_names
 
     check_names([estimator])
-    check_free(out, overwrite=overwrite)  # now, not when all is computed
+    check_free(out, overwrite=overwrite)  # before the computation
     settings = parse_settings(set_ or (), [estimator])[estimator]
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     config = experiment.RunConfig(
@@ -111,7 +111,7 @@ def compare(
     estimators: Estimators,
     out: Out,
     seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
-    jobs: Annotated[int | None, typer.Option(help="Processes; else one per core.", min=1)] = None,
+    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
     sensors: Sensors = None,
     prior: Prior = None,
     set_: Settings = None,
@@ -133,7 +133,7 @@ def compare(
 
     names = parse_list(estimators)
     check_names(names)
-    experiment.check_free(out, overwrite=overwrite)  # now, not when all logs are read
+    experiment.check_free(out, overwrite=overwrite)  # before the logs are read
     settings = parse_settings(set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
@@ -161,7 +161,7 @@ def compare(
 
 
 def _print_space(scores: Mapping[str, Any]) -> bool:
-    """Print the accuracy of a robot in space; whether there is any."""
+    """Print the accuracy of three-dimensional estimates; False if there are none."""
     kinds = [kind for kind in ("causal", "final") if scores[f"{kind}.space_position_rmse"] is not None]
     if kinds:
         rows = [
@@ -183,16 +183,16 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         ]
         show.table(("", *COLUMNS), rows)
     elif not _print_space(scores):
-        hardly = f", or hardly any: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
+        hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
         show.line(f"there is no reference to score against{hardly}")
     if scores["aligned.position_rmse"] is not None:
         position, heading = (
             show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))
         )
-        show.line(f"final, aligned as the map was free: position RMSE {position} m, heading RMSE {heading} rad")
+        show.line(f"final, aligned because the map was free: position RMSE {position} m, heading RMSE {heading} rad")
     if scores["landmarks.count"]:
         error, anees = (show.number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
-        show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideally 2")
+        show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideal 2")
     if scores["time_to_localized"]:
         show.line(f"localized after {scores['time_to_localized']:.1f} s")
 
@@ -201,11 +201,11 @@ def _print_consistency(scores: Mapping[str, Any]) -> None:
     for name, value in scores.items():
         if name.startswith("nis.") and name.endswith(".mean_per_dof") and value is not None:
             sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
-            # a few gross outliers make a mean of anything
+            # the median, because a few gross outliers dominate the mean
             share = 100.0 * scores[f"nis.{sensor}.beyond_95"]
             show.line(
-                f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideally 1; "
-                f"{share:.1f} % beyond the 95 % bound, ideally 5"
+                f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideal 1; "
+                f"{share:.1f} % beyond the 95 % bound, ideal 5"
             )
 
 
@@ -220,7 +220,7 @@ def _print_learnt(result: RunResult) -> None:
 def _print_events(result: RunResult) -> None:
     events = result.diagnostics.events
     if events:
-        more = f", of which the first {SHOWN_EVENTS}; all are in events.csv" if len(events) > SHOWN_EVENTS else ""
+        more = f", the first {SHOWN_EVENTS}; all are in events.csv" if len(events) > SHOWN_EVENTS else ""
         show.line(f"events: {len(events)}{more}")
     for t, text in events[:SHOWN_EVENTS]:
         show.line(f"  at {t:.1f} s: {text}")
@@ -232,10 +232,10 @@ def _print_effort(scores: Mapping[str, Any]) -> None:
     if images := scores["timing.images"]:
         seconds = scores["timing.frontend_seconds"]
         show.line(
-            f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} a second, the cache included"
+            f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} per second, including the cache"
         )
     final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
-    if scores["time_to_localized"] is None:  # it only collected what came
+    if scores["time_to_localized"] is None:  # a batch estimator has no causal updates
         show.line(f"time: {final}")
         return
     median, factor = (

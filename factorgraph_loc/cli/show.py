@@ -1,4 +1,4 @@
-"""How results look on the terminal: plain tables that nothing cuts off, also in a pipe."""
+"""Terminal output: plain tables that are never truncated, also in a pipe."""
 
 from __future__ import annotations
 
@@ -16,42 +16,42 @@ from factorgraph_loc.text import MESSAGE, one_line, plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-WARNINGS = 20  # that are printed
+WARNINGS = 20  # number of warnings printed
 
 
 def line(text: str = "") -> None:
-    """A line on stdout, the only way there but for tables and documents. What no terminal shows as a character is escaped."""
+    """Print a line on stdout, with non-printable characters escaped."""
     print(plain(text, None), flush=True)
 
 
 def lines(text: str) -> None:
-    """Text of several lines on stdout, such as a file."""
+    """Print text of several lines on stdout, such as a file."""
     for one in text.split("\n"):
         line(one)
 
 
 def note(text: str) -> None:
-    """A line for people, on stderr: where results are, what is doubtful."""
+    """Print a line for people on stderr, such as a warning."""
     print(plain(text, None), file=sys.stderr, flush=True)
 
 
 def warnings(texts: Sequence[str]) -> None:
-    """What is doubtful, a line each on stderr; of very many the first, for all stand with the results."""
+    """Print warnings on stderr, one per line; only the first :data:`WARNINGS` of them."""
     for one in texts[:WARNINGS]:
         note(f"warning: {one_line(one)}")
     if len(texts) > WARNINGS:
-        note(f"warning: {len(texts) - WARNINGS} more stand with the results")
+        note(f"warning: {len(texts) - WARNINGS} more are listed with the results")
 
 
 def document(content: Any) -> None:
-    """One JSON document on stdout; what JSON cannot say (NaN, infinity) is null, what a terminal does not show is escaped."""
+    """Print a JSON document on stdout; NaN and infinity become null, non-printable characters are escaped."""
     unicode = sys.stdout.encoding.lower().startswith("utf")
     text = json.dumps(_plain(content), indent=2, ensure_ascii=not unicode)
     print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table on stdout: the first column to the left, numbers to the right."""
+    """Print a table on stdout: the first column left-aligned, numbers right-aligned."""
     from rich.table import Table
 
     out = Table(box=None, pad_edge=False, header_style="bold")
@@ -64,7 +64,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def rich_table(content: Table) -> None:
-    """A table of rich's on stdout. In a narrow terminal its lines are broken, but nothing is cut off."""
+    """Print a rich table on stdout. A narrow terminal wraps its lines but truncates nothing."""
     from rich.console import Console
 
     console = Console(markup=False, emoji=False, highlight=False, width=1000)
@@ -75,10 +75,9 @@ def rich_table(content: Table) -> None:
 
 @contextmanager
 def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
-    """A bar on stderr while the block lasts, to be told how much is done of how much, and a remark if there is one; silent where
-    stderr is no terminal.
+    """A progress bar on stderr, as a function of done, total and an optional remark; silent if stderr is no terminal.
 
-    ``counted``: these are numbers of things, shown as such; else a percentage is shown.
+    ``counted``: show done and total as counts, else a percentage.
     """
     from rich.console import Console
     from rich.progress import (
@@ -100,14 +99,14 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
 
 
 def fields(content: Mapping[str, str]) -> None:
-    """Names and values, one pair a line."""
+    """Print names and values, one pair per line."""
     width = max(map(len, content))
     for name, value in content.items():
         line(f"{name:<{width}}  {value}")
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number for a table, a dash where there is none."""
+    """A number for a table, or a dash if it is None."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 

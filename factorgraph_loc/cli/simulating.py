@@ -1,4 +1,4 @@
-"""``fgloc simulate``: logs that are made, not recorded."""
+"""``fgloc simulate``: simulated logs."""
 
 from __future__ import annotations
 
@@ -27,16 +27,14 @@ def simulate(
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FOLDER", help="To write; with --seeds, a folder of them.")
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
     ],
-    seed: Annotated[
-        int, typer.Option(min=0, help="Of everything that is drawn; the same seed gives the same bytes.")
-    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws; the same seed gives the same bytes.")] = 0,
     seeds: Annotated[
-        str | None, typer.Option(metavar="A:B", help="A log of each seed from A to B-1, in FOLDER/NAME-SEED.")
+        str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Of the drive [s]; that of the presets is 600.")
+        float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
     ] = None,
     tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None,
     set_: Annotated[
@@ -47,24 +45,22 @@ def simulate(
         str | None,
         typer.Option(
             metavar="LOG",
-            help="Draw each read from those of this recording, with its antennas (semi-real).",
+            help="Resample the reads from this recording, with its antennas (semi-real).",
             autocompletion=completion.logs,
         ),
     ] = None,
-    images: Annotated[
-        bool, typer.Option("--images", help="With what a camera sees: the building is rendered.")
-    ] = False,
-    image_rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Images per second; that of the presets is 5.")
-    ] = None,
+    images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
+    image_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")] = None,
     world_seed: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", help="Of the world alone, for several drives through one; else --seed."),
+        typer.Option(
+            min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
+        ),
     ] = None,
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """Make logs with known truth: a world, a drive, and what odometry, RFID antennas and a camera report on it."""
+    """Simulate logs with known ground truth: a world, a drive, and the measurements of odometry, RFID antennas and camera."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc import api
     from factorgraph_loc.files.models import file_name
@@ -73,7 +69,7 @@ def simulate(
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
     changes = nested_changes(named, set_ or [])
     if "images" in changes and not images:
-        raise InputError("--image-rate or --set images.KEY tells how images are made, expected --images with it")
+        raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
     settings = settings_of(what, changes)
     looks = None
     if recorded is not None:
@@ -94,14 +90,14 @@ def simulate(
 
 
 def settings_of(what: str, changes: dict[str, Any]) -> SimulationSettings:
-    """Those of a preset, or of a file where the name looks like one."""
+    """The settings of a preset, or of a file if the name looks like one."""
     from factorgraph_loc.simulation import named_settings
 
     return named_settings(what, changes)
 
 
 def nested_changes(named: dict[str, float | None], texts: list[str]) -> dict[str, Any]:
-    """The options as nested tables; the named ones go before ``--set``."""
+    """The options as nested tables; named options come before ``--set``."""
     changes: dict[str, Any] = {}
     pairs = [key_and_value(text, "--set") for text in texts]
     pairs += [(key, value) for key, value in named.items() if value is not None]

@@ -1,4 +1,4 @@
-"""Signals that end the command, as an interrupt from the keyboard does: what was begun is cleared away first."""
+"""Handling of signals that end the command: temporary files are removed first."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGH
 
 
 class Stop(KeyboardInterrupt):
-    """A signal came that ends the command."""
+    """A signal that ends the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -24,8 +24,8 @@ class Stop(KeyboardInterrupt):
 
 
 def end(stop: KeyboardInterrupt) -> int:
-    """Remove what is temporary and say in one line on stderr what ended the command, with the notes of the exception; the exit code
-    that is due, 128 and the number of the signal."""
+    """Remove temporary files and print one line on stderr with the cause and the notes of the exception. Returns the exit code,
+    128 plus the number of the signal."""
     from factorgraph_loc.files.temporary import remove_own
 
     remove_own()
@@ -36,10 +36,10 @@ def end(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """The signals of :data:`WORDS` are raised as a :class:`Stop` here, but for those that were ignored before.
+    """Raise the signals of :data:`WORDS` as :class:`Stop` in this block, except those that were ignored before.
 
-    A second one ends the process as it would have without this. Where the exception is lost, as Python cannot let it pass through
-    a destructor or a callback, the signal comes again.
+    A second signal ends the process as usual. If Python cannot propagate the exception, in a destructor or callback, the signal
+    is sent again.
     """
     before: dict[signal.Signals, Any] = {}
     hook = sys.unraisablehook

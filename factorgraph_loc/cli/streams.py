@@ -1,5 +1,4 @@
-"""Standard output and standard error as the command uses them: what they cannot take, being closed, full or of few characters,
-ends in a line and an exit code, never in a traceback, nor in a message of the interpreter as it ends."""
+"""Standard output and standard error that fail with one line and an exit code when they are closed, full or cannot encode text."""
 
 import io
 import os
@@ -11,19 +10,19 @@ from typing import NoReturn, TextIO
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import told
 
-PIPE_CLOSED = 141  # as shells count it: 128 and the number of SIGPIPE
+PIPE_CLOSED = 141  # 128 and the number of SIGPIPE, as in shells
 
 
 class OutputError(InputError):
-    """Standard output takes nothing: it is closed, or what it goes to is full."""
+    """Standard output is closed, or its file system is full."""
 
 
 class _Output(io.TextIOWrapper):
-    """Standard output. Who reads no further from a pipe is no error: the command ends, without a word."""
+    """Standard output. If the reader of a pipe closes it, the command ends silently."""
 
     def write(self, text: str, /) -> int:
         try:
-            return super().write(text) if text != "" else 0  # that is how others try what kind of stream this is
+            return super().write(text) if text != "" else 0  # libraries write "" to probe the stream
         except OSError as error:
             _give_up(error)
 
@@ -35,7 +34,7 @@ class _Output(io.TextIOWrapper):
 
 
 class _Messages(io.TextIOWrapper):
-    """Standard error: there is nowhere to say that it takes nothing."""
+    """Standard error; failures to write are ignored, because they cannot be reported."""
 
     def write(self, text: str, /) -> int:
         try:
@@ -53,17 +52,16 @@ class _Messages(io.TextIOWrapper):
 
 @contextmanager
 def standard_streams() -> Iterator[None]:
-    """Put these in the place of the interpreter's, and write out what they hold at the end of the block.
+    """Replace the standard streams of the interpreter in this block, and flush them at its end.
 
-    A descriptor that is closed is taken by the null device, lest a file that is opened gets its number, and what libraries print
-    in native code gets into that file.
+    A closed descriptor is opened on the null device, so that no other file gets its number.
     """
-    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):  # 1 goes on refusing what is written
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):  # read-only 1 keeps refusing writes
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, mode), True)  # it gets the lowest number that is free, which is this
-    if sys.stdout is sys.__stdout__:  # else it is another's, as in a test
+            os.set_inheritable(os.open(os.devnull, mode), True)  # gets the lowest free number, which is this one
+    if sys.stdout is sys.__stdout__:  # otherwise it was replaced, as in a test
         sys.stdout = _replaced(sys.stdout, 1, _Output, "replace")
     if sys.stderr is sys.__stderr__:
         sys.stderr = _replaced(sys.stderr, 2, _Messages, "backslashreplace")
@@ -75,7 +73,7 @@ def standard_streams() -> Iterator[None]:
 
 
 def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], errors: str) -> io.TextIOWrapper:
-    """A stream of ``kind`` for what ``stream`` goes to, None where the descriptor was closed."""
+    """A stream of ``kind`` on the target of ``stream``; None if the descriptor was closed."""
     if not isinstance(stream, io.TextIOWrapper):
         return kind(os.fdopen(number, "wb", closefd=False), "utf-8", errors)
     encoding, unbuffered, by_line = stream.encoding, stream.write_through, stream.line_buffering
@@ -90,7 +88,7 @@ def _give_up(error: OSError) -> NoReturn:
 
 
 def _discard(number: int) -> None:
-    """What goes to the descriptor, and what is held back for it, goes nowhere from now on."""
+    """Redirect the descriptor and its buffered data to the null device."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, number)
     os.close(null)

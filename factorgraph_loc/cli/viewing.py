@@ -1,4 +1,4 @@
-"""``fgloc view``: results and their log in a viewer."""
+"""``fgloc view``: shows results and their log in a viewer."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import StoredRun
     from factorgraph_loc.model.log import Log
 
-SAME = 1e-6  # m between the positions of a run and of the same run made again
+SAME = 1e-6  # m between the positions of a run and of its repetition
 
 What = Annotated[
     list[str],
     typer.Argument(
         metavar="RUN...|LOG",
-        help="Folders of `fgloc run` or `fgloc compare`, and their log if `fgloc datasets` does not list it; or a log alone.",
+        help="Folders of `fgloc run` or `fgloc compare`, and their log if `fgloc datasets` does not list it; or a log only.",
     ),
 ]
 
@@ -33,10 +33,10 @@ What = Annotated[
 def view(
     what: What,
     rrd: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer in place of opening it.")
+        Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer instead of opening it.")
     ] = None,
     particles: Annotated[
-        bool, typer.Option("--particles", help="Make runs of particles again, to show these too.")
+        bool, typer.Option("--particles", help="Repeat runs of particle filters to show their particles.")
     ] = False,
     reader: Reader = None,
     reader_option: ReaderOption = None,
@@ -45,7 +45,7 @@ def view(
     world: WorldFile = None,
     json: Json = False,
 ) -> None:
-    """Look at a log and at runs of it along time, in Rerun."""
+    """Show a log and its runs over time, in Rerun."""
     from factorgraph_loc.exports import rerun_scene
 
     log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
@@ -57,11 +57,11 @@ def view(
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
-        show.line(f"wrote {rrd}: rerun {rrd} shows it")
+        show.line(f"wrote {rrd}: open it with rerun {rrd}")
 
 
 def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
-    """The particles of those runs that have some, by name."""
+    """The particles of the runs that use particles, by name."""
     from factorgraph_loc.experiments.particles import particles_of
 
     found = {}
@@ -72,21 +72,21 @@ def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
             found[run.name] = cloud
             if cloud.difference > SAME:
                 show.note(
-                    f"warning: {run.folder.path}: made again, it differs by up to {cloud.difference:.2g} m, so its particles are "
-                    "others: was it made with another rig, map or version?"
+                    f"warning: {run.folder.path}: repeated, it differs by up to {cloud.difference:.2g} m, so its particles "
+                    "differ too: did the rig, the map or the version change?"
                 )
     if not found:
-        show.note("warning: no run has particles, as only a particle_filter and switching do")
+        show.note("warning: no run has particles; only particle_filter and switching use them")
     return found
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
-    """What is shown or written, for ``--json``."""
+    """The content of what is shown or written, for ``--json``."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 
 def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[StoredRun]]:
-    """The log that is named among ``what``, or else the one that all runs there are of, and its runs.
+    """The log named in ``what``, or else the common log of all runs there, and the runs.
 
     InputError if there are several logs, or if the log of the runs is not known by its name.
     """
@@ -99,10 +99,10 @@ def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[Stored
     folders = [run for name in places for run in find_runs(Path(name))]
     named = sorted({folder.log for folder in folders})
     if not logs and len(named) > 1:
-        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of them to be named too")
+        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of these logs to be given too")
     if not logs and named[0] not in manifests():
         raise InputError(
-            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be named too"
+            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be given too"
         )
     log = options.load_one(logs[0] if logs else named[0])
     of_log = [folder for folder in folders if folder.log == log.name]

@@ -1,4 +1,4 @@
-"""Bounded text, numbers, tables and models of settings in files; what is wrong with them is one line."""
+"""Validated reading and atomic writing of files: text, tables, arrays, images, and models of settings."""
 
 __all__ = [
     "bounded",

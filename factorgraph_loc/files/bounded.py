@@ -1,7 +1,7 @@
-"""What files hold, read so that no file can hold the reader up or take its memory.
+"""Reading of files within limits of size and time.
 
-All that comes from a file comes through here: only regular files are opened, as a FIFO would wait for ever and a device never
-ends, and a size, be it the file's own or one that it declares, is compared with a limit before memory is taken for it.
+All files are opened here: only regular files, because a FIFO blocks and a device never ends. Sizes, including declared ones, are
+checked before memory is allocated.
 """
 
 import errno
@@ -19,16 +19,16 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.text import plain, quoted, told
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
-YAML = 2**16  # bytes of a YAML file, which takes a hundred times as long to read
-DEFINITION = 2**20  # letters of the definition of a ROS message, which becomes compiled functions
-DATA = 2**30  # bytes of a table, a text or a MATLAB file, as it is and unpacked
+YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read
+DEFINITION = 2**20  # characters of the definition of a ROS message, which is compiled to functions
+DATA = 2**30  # bytes of a table, a text or a MATLAB file, packed and unpacked
 IMAGE = 2**28  # bytes of an image's file
 GRID = 2**26  # bytes of a grid, unpacked
-PIXELS = 2**26  # of an image; OpenCV itself would take 2^30 of them
+PIXELS = 2**26  # of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns of a Parquet file
-RATIO = 1000  # cells that a byte of a Parquet file may stand for
+RATIO = 1000  # maximum cells per byte of a Parquet file
 
-_FICLONE = 0x40049409  # ioctl of Linux: share the content of another file until either is written
+_FICLONE = 0x40049409  # Linux ioctl: share the content of another file until either is written
 _KINDS = {
     stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
@@ -40,13 +40,14 @@ _KINDS = {
 
 
 class NoFileNameError(InputError):
-    """No file can have this name."""
+    """A name that no file can have."""
 
 
 def kind(path: Path, source: object = None) -> str:
-    """ "a file", "a folder", "a named pipe", "a socket" or "a device"; empty where nothing is.
+    """The kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists.
 
-    NoFileNameError if no file can have that name, InputError if it may not be looked at; they name ``source``, by default the path.
+    NoFileNameError if no file can have that name, InputError if access is denied; ``source`` is named in messages, by default the
+    path.
     """
     try:
         return _kind(path.stat())
@@ -63,18 +64,18 @@ def kind(path: Path, source: object = None) -> str:
 
 
 def require_size(source: object, what: str, size: int, limit: int) -> None:
-    """InputError if ``size``, in bytes or as ``what`` says, is above ``limit``: to be called before memory is taken."""
+    """InputError if ``size``, in bytes or as ``what`` says, exceeds ``limit``; call this before allocating memory."""
     if not 0 <= size <= limit:
         raise InputError(f"{plain(source)}: {what} is {size:,}, expected at most {limit:,}")
 
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
-    """A regular file of at most ``limit`` bytes for reading; InputError if it is none, is larger or cannot be opened."""
+    """Open a regular file of at most ``limit`` bytes for reading; InputError if that is impossible."""
     if found := kind(path):
         _require_file(path, found)
     try:
-        # without waiting, should a FIFO have taken the file's place since
+        # non-blocking, in case a FIFO has replaced the file since
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb")
     except OSError as error:
         raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
@@ -86,14 +87,14 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes; InputError as of :func:`opened`."""
+    """The content of a regular file of at most ``limit`` bytes; InputError as in :func:`opened`."""
     with opened(path, limit) as file:
-        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # what is asked for is taken at once
+        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # read the expected size at once
         try:
             while count <= limit and (part := file.read(step)):
                 parts.append(part)
                 count += len(part)
-                step = 2**16  # the file has grown, or is one of /proc that says it is empty
+                step = 2**16  # the file has grown, or its size is unknown, as in /proc
         except OSError as error:
             raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
     require_size(path, "its size in bytes", count, limit)
@@ -101,30 +102,30 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Make the new file ``target`` with the content of the regular file ``source``; the two share it until either is written, where
-    the file system can do that. InputError if ``source`` cannot be read, OSError if ``target`` cannot be written."""
+    """Copy the regular file ``source`` to the new file ``target``; they share storage until either is written, if the file system
+    supports that. InputError if ``source`` cannot be read, OSError if ``target`` cannot be written."""
     with opened(source, sys.maxsize) as file, target.open("xb") as copy:
         try:
             fcntl.ioctl(copy.fileno(), _FICLONE, file.fileno())
-        except OSError:  # another file system, or one whose files share nothing
+        except OSError:  # another file system, or one without shared storage
             shutil.copyfileobj(file, copy, 2**20)
 
 
 @contextmanager
 def foreign(source: object, what: str) -> Iterator[None]:
-    """Whatever another library raises at the content of a file becomes an InputError that says ``what`` the file is not.
+    """Convert any exception of another library on invalid content to an InputError that says ``what`` the file is not.
 
-    It is for calls of parsers alone. They raise nearly anything at damaged files: numpy tokenize.TokenError, zlib an error of its
-    own, polars PanicException, which is no Exception.
+    Use it for calls of parsers only. They raise nearly anything on damaged files: numpy tokenize.TokenError, zlib its own error,
+    polars PanicException, which is not an Exception.
     """
     try:
         yield
     except FglocError:
         raise
     except MemoryError as error:
-        raise InputError(f"{plain(source)}: {what}: it takes more memory than there is") from error
+        raise InputError(f"{plain(source)}: {what}: it needs more memory than is available") from error
     except RecursionError as error:
-        raise InputError(f"{plain(source)}: {what}: it is nested too deep") from error
+        raise InputError(f"{plain(source)}: {what}: it is nested too deeply") from error
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
             raise  # a signal

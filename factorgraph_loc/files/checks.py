@@ -1,4 +1,4 @@
-"""What every reader checks of its rows. What cannot be mended is an InputError with its row, the rest a line of warning."""
+"""Checks that all readers apply to their rows: an InputError with the row, or a warning if the data can be corrected."""
 
 from collections.abc import Sequence
 
@@ -9,62 +9,64 @@ from factorgraph_loc.files.columns import SECONDS
 from factors.odometry.model import composed
 from factors.se2 import Array, Integers
 
-MAX_LATE_NS = 500_000_000  # what estimators still put in at its time
-ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
+MAX_LATE_NS = 500_000_000  # the delay that estimators can handle
+ROUNDING = 1e-6  # s; tolerance of differences of timestamps
 
 
 def require_finite(source: object, rows: Integers, field: str, values: Array) -> None:
-    """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): their rows in ``source``."""
+    """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): row numbers in ``source``."""
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise bad_field(source, field, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]))
 
 
 def require_above_zero(source: object, rows: Integers, field: str, values: Array) -> None:
-    """InputError at the first of ``values`` (N,) that is not above zero; NaN, not measured, passes."""
+    """InputError at the first of ``values`` (N,) that is not positive; NaN (not measured) is valid."""
     bad = np.flatnonzero(values <= 0.0)
     if len(bad):
         raise bad_field(source, field, float(values[bad[0]]), "more than 0", row=int(rows[bad[0]]))
 
 
 def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
-    """Indices (M,) of the rows to keep of a stream that must not go back in time: of equal stamps (N,) the last."""
+    """Indices (M,) of the rows to keep of a stream with non-decreasing timestamps (N,): the last one of equal timestamps."""
     _require_order(source, rows, t_ns)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
     if dropped := len(t_ns) - len(keep):
-        warnings.append(f"{source}: {dropped} rows have the stamp of the row after them and are left out")
+        warnings.append(f"{source}: {dropped} rows have the timestamp of the row after them and are skipped")
     return keep
 
 
 def increments_in_order(
     source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[str]
 ) -> tuple[Integers, Array]:
-    """Stamps (M,) and motions (M, 3) since the one before: ``moves`` (N, 3) of equal stamps (N,) are composed."""
+    """Timestamps (M,) and motions (M, 3) since the one before: ``moves`` (N, 3) with equal timestamps (N,) are composed."""
     _require_order(source, rows, t_ns)
     last, out = composed(t_ns, moves)
     if joined := len(t_ns) - len(last):
-        warnings.append(f"{source}: {joined} increments have the stamp of the row before them and go on from it")
+        warnings.append(
+            f"{source}: {joined} increments have the timestamp of the row before them and are composed with it"
+        )
     return t_ns[last], out
 
 
 def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
-    """InputError at the first row whose stamp is older than the one before it."""
+    """InputError at the first row whose timestamp is older than the one before it."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
-        expected = f"a stamp not before that of the row before, {int(t_ns[i - 1])} ns"
+        expected = f"a timestamp not before that of the row before, {int(t_ns[i - 1])} ns"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
 def arrivals(
     source: object, rows: Integers, t_ns: Integers, warnings: list[str], *, max_late_ns: int | None = MAX_LATE_NS
 ) -> None:
-    """Stamps (N,) in order of arrival: one older than the newest before it is late, by more than ``max_late_ns`` an InputError."""
+    """Check timestamps (N,) in order of arrival: one older than an earlier one is late, and an InputError above ``max_late_ns``."""
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
     if max_late_ns is not None and np.any(late > max_late_ns):
         i = int(np.argmax(late > max_late_ns))
-        expected = f"a stamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
+        expected = f"a timestamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):
         warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
@@ -73,25 +75,25 @@ def arrivals(
 def sightings_in_order(
     source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
 ) -> Integers:
-    """Indices (M,) of the sightings to keep, in order of arrival: of one landmark at one stamp the last."""
+    """Indices (M,) of the sightings to keep, in order of arrival: the last one of a landmark at a timestamp."""
     arrivals(source, rows, t_ns, warnings)
     last = {key: i for i, key in enumerate(zip(t_ns.tolist(), landmarks, strict=True))}
     if dropped := len(t_ns) - len(last):
-        warnings.append(f"{source}: {dropped} rows see a landmark that a later row sees at the same stamp: left out")
+        warnings.append(f"{source}: {dropped} rows see a landmark that a later row sees at the same timestamp: skipped")
     return np.array(sorted(last.values()), dtype=np.int64)
 
 
 def stamps(source: object, rows: Integers, t: Array, *, per_second: float = 1e9) -> Integers:
-    """Stamps (N,) [s] in nanoseconds, in whole steps of which a second has ``per_second``; InputError beyond 64 bits."""
+    """Timestamps (N,) [s] in nanoseconds, rounded to steps of 1 / ``per_second``; InputError beyond 64 bits."""
     SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * per_second).astype(np.int64) * round(1e9 / per_second))
 
 
 def absolute(t: Array, t0_ns: int) -> Integers:
-    """Seconds (N,) after ``t0_ns`` as stamps in nanoseconds."""
+    """Times (N,) in seconds after ``t0_ns`` as timestamps in nanoseconds."""
     return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
 
 
 def seconds(t_ns: Integers, t0_ns: int) -> Array:
-    """Stamps (N,) in nanoseconds as seconds after ``t0_ns``."""
+    """Timestamps (N,) in nanoseconds as seconds after ``t0_ns``."""
     return np.asarray((t_ns - t0_ns) / 1e9, dtype=float)

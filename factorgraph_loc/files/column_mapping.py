@@ -1,6 +1,6 @@
-"""Tables as other programs write them, by a mapping: which of their columns is what, and in which unit.
+"""Reading of foreign tables by a mapping from their columns and units to fields.
 
-CSV with any separator, with a header or without, or JSON lines. Only text is read here; what it means is the caller's business.
+CSV with any separator, with or without header, or JSON lines. The cells are read as text.
 """
 
 import csv
@@ -27,16 +27,15 @@ JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
 ISO = "iso"
-MOST_DIGITS = 20  # of a stamp before its decimal point
-LEAST_UNIT = 1e-12  # of ours, and the largest is its reciprocal
+MOST_DIGITS = 20  # of a timestamp before its decimal point
+LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 
 EpcCase = Literal["as written", "upper", "lower"]
 
 
 class ColumnMapping(FileModel):
-    """``columns``: the column of the file for each of our fields; in JSON lines the keys that lead to it, ``event.epc``; without a
-    ``header`` its number from 1. ``units`` by field: the name of a unit, or what to multiply with. ``decimal``: the mark that
-    spreadsheets of some countries write."""
+    """``columns``: the column of the file for each field; in JSON lines a path of keys, ``event.epc``; without ``header`` the
+    column number from 1. ``units`` by field: the name of a unit, or a factor. ``decimal``: the decimal mark."""
 
     file: str
     columns: dict[str, str]
@@ -48,7 +47,7 @@ class ColumnMapping(FileModel):
 
 @dataclass(frozen=True)
 class Mapped:
-    """N rows of a file, by our ``fields``; ``passed``: objects of JSON lines that have nothing of them and are left out."""
+    """N rows of a file by ``fields``; ``passed``: number of skipped JSON objects, which have none of the fields."""
 
     cells: Cells
     mapping: ColumnMapping
@@ -61,22 +60,22 @@ class Mapped:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Where the rows (N,) stand in the file, as an editor counts lines."""
+        """Line numbers (N,) of the rows in the file."""
         return np.array(self.cells.rows, dtype=np.int64)
 
     def texts(self, field: str) -> Sequence[str]:
-        """The cells (N) of a field as they stand there."""
+        """The cells (N) of a field as text."""
         return self.cells.columns[self.mapping.columns[field]]
 
     def names(self, column: Column) -> list[str]:
-        """The names (N) in the field that ``column`` describes; InputError where one is missing."""
+        """The names (N) in the field that ``column`` describes; InputError if one is missing."""
         for row, text in zip(self.cells.rows, self.texts(column.name), strict=True):
             if not text:
                 raise bad_field(self.path, self.mapping.columns[column.name], text, column.doc, row=row)
         return list(self.texts(column.name))
 
     def numbers(self, field: str, column: Column) -> Array:
-        """A field (N,), what ``column`` describes, in its unit; NaN where it is empty."""
+        """The numbers (N,) in the field that ``column`` describes, in its unit; NaN if empty."""
         name = self.mapping.columns[field]
         cells = self.cells
         if self.mapping.decimal == ",":
@@ -85,7 +84,7 @@ class Mapped:
         return cells.numbers(name, column, self._unit(field, column.units))
 
     def stamps(self, field: str, offset: float = 0.0) -> NDArray[np.int64]:
-        """A field (N,) as nanoseconds; ``offset`` [s] is added. Times of the day without a zone are UTC."""
+        """The timestamps (N,) of a field in nanoseconds, plus ``offset`` [s]. Times without a zone are UTC."""
         unit = self.mapping.units.get(field)
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
@@ -108,9 +107,9 @@ class Mapped:
         return out
 
     def _decimal(self, text: str, power: int) -> int:
-        """A decimal number times ten to ``power``, rounded, without the errors of floating point."""
+        """A decimal number times ten to the ``power``, rounded, without floating-point errors."""
         number = Decimal(text.replace(self.mapping.decimal, "."))
-        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # before all of its digits are written out
+        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
             raise OverflowError
         return round(number.scaleb(power))
 
@@ -125,9 +124,9 @@ class Mapped:
 def read_mapped(
     path: Path, mapping: ColumnMapping, shapes: Sequence[Collection[str]], optional: Collection[str] = ()
 ) -> Mapped:
-    """The rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some that are ``optional``.
+    """Read the rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some of ``optional``.
 
-    A column of an optional field may be missing in the file. InputError names file, row and column of what is wrong.
+    The column of an optional field may be missing. InputError names file, row and column of invalid values.
     """
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
@@ -144,20 +143,20 @@ def read_mapped(
     else:
         cells, passed = _read_csv(path, mapping, needed), 0
     if not cells.rows:
-        raise InputError(f"{path}: holds no rows")
+        raise InputError(f"{path}: contains no rows")
     return Mapped(cells, mapping, tuple(f for f, column in mapping.columns.items() if column in cells.columns), passed)
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """EPCs in the letters in which log and map are compared."""
+    """EPCs in the letter case in which log and map are compared."""
     if case == "as written":
         return list(epcs)
     return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]
 
 
 def iso_nanoseconds(text: str) -> int:
-    """A date and time of ISO 8601 as nanoseconds since 1970; without a zone it is UTC. ValueError for anything else."""
-    # datetime itself keeps microseconds only
+    """An ISO 8601 date and time as nanoseconds since 1970; without a zone it is UTC. ValueError if the text is invalid."""
+    # datetime has microseconds only
     fraction = re.search(r"[.,](\d+)", text)
     whole = text.replace(fraction.group(0), "", 1) if fraction else text
     moment = datetime.fromisoformat(whole.strip())
@@ -171,14 +170,14 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cell
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
     if not content:
-        raise InputError(f"{path}: holds no rows")
+        raise InputError(f"{path}: contains no rows")
     parsed = _cells_of(path, content, mapping.separator)
     first_row, first = next(parsed)
     if not mapping.header:
         header = [str(i) for i in range(1, len(first) + 1)]
     else:
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
-        # a comment of as many names as there are columns is the header, unless the first row has the names
+        # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = set(needed) <= set(named) or (len(named) == len(first) and not set(needed) <= set(first))
         header = named if in_comment else first
     _require_columns(path, needed, header, first_row)
@@ -194,7 +193,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cell
 
 
 def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
-    """The comments before the first row, without their marks, for the last may be the header; and the rows."""
+    """Split off the comments before the first row, without their marks; the last one may be the header."""
     content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
     until = content[0][0] if content else 0
     comments = [(row, line.lstrip().lstrip("#/").strip()) for row, line in lines if row < until]
@@ -202,7 +201,7 @@ def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, s
 
 
 def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
-    if separator == " ":  # columns between any number of blanks
+    if separator == " ":  # any number of blanks
         yield from ((row, line.split()) for row, line in lines)
         return
     reader = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True, strict=True)
@@ -227,7 +226,7 @@ def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], r
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, int]:
-    """The objects of JSON lines, one or a list of them in a line, that have all the columns ``needed``."""
+    """The objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns."""
     rows: list[int] = []
     columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
     passed, seen = 0, dict.fromkeys(columns, False)
@@ -262,7 +261,7 @@ def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:
 
 
 def _at(entry: Mapping[str, Any], keys: str) -> Any:
-    """What stands below keys that are joined by dots; None if nothing does."""
+    """The value at a path of keys joined by dots, or None."""
     value: Any = entry
     for key in keys.split("."):
         if not isinstance(value, Mapping) or key not in value:

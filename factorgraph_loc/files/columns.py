@@ -1,7 +1,7 @@
-"""What the tables of sensors hold: each column's unit, bounds, and what it is. Whatever takes measurements in goes by this.
+"""Descriptions of the tables of sensors: columns with unit, bounds and meaning, used for all input of measurements.
 
-Bounds are wide enough for any real recording and narrow enough that nothing within them overflows: what lies outside has another
-unit, or is garbage. Readers and :class:`~factorgraph_loc.live.localizer.Localizer` refuse it in one line.
+Bounds are wide enough for any real recording and narrow enough to avoid overflow; values outside have a wrong unit or are garbage.
+Readers and :class:`~factorgraph_loc.live.localizer.Localizer` reject them.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ STAMPS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
 PIXELS = {"px": 1.0}
 PURE = {"1": 1.0}
 
-LATEST = 4_600_000_000_000_000_000  # ns, 145 years: a difference of two stamps has room in 64 bits
-MAX_SPAN = 30 * 86_400.0  # s between two stamps of one log
-FASTEST = 100.0  # m/s: a speed in mm/s is mostly above it
+LATEST = 4_600_000_000_000_000_000  # ns, 145 years: differences of two timestamps fit into 64 bits
+MAX_SPAN = 30 * 86_400.0  # s between two timestamps of one log
+FASTEST = 100.0  # m/s; most speeds in mm/s exceed it
 FASTEST_TURN = 100.0  # rad/s: gyros measure up to 70
 LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row to the next, a pause included
 NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m
@@ -45,9 +45,9 @@ LARGEST_PIXEL = 1e5  # px
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table. ``units``: by name, what to multiply with; the first is ours, in which ``low`` and ``high`` are, both
-    included. ``may_lack``: whether a cell may be empty. ``doc``: what it is. ``field``: of the stream, where it is not ``name``.
-    ``left_out_below``: a cell with less is read as an empty one, with a warning; no stream and no measurement has such a value."""
+    """A column of a table. ``units``: factors by name; the first unit is ours, in which the inclusive bounds ``low`` and ``high``
+    are. ``may_lack``: whether a cell may be empty. ``doc``: its meaning. ``field``: name in the stream, if it is not ``name``.
+    ``left_out_below``: smaller values are treated as empty cells, with a warning; streams and measurements have none."""
 
     name: str
     kind: Literal["stamp", "number", "name", "whole", "file"]
@@ -61,12 +61,12 @@ class Column:
 
     @property
     def measured(self) -> Column:
-        """What it is in a stream or a measurement."""
+        """The column as in a stream or a measurement."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
     def expected(self) -> str:
-        """What a value must be, as an error says it."""
+        """A description of valid values, for errors."""
         if self.kind in ("name", "file"):
             return self.doc
         what = "a whole number" if self.kind in ("whole", "stamp") else "a finite number"
@@ -77,15 +77,14 @@ class Column:
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
     def in_unit(self, unit: str | float) -> tuple[Column, float]:
-        """The same column in one of its units, or in one that is so many of ours; and what to multiply with. KeyError if it has
-        no such unit."""
+        """The column in one of its units, or in one with a given factor; and the factor. KeyError if there is no such unit."""
         factor = self.units[unit] if isinstance(unit, str) else unit
         name = unit if isinstance(unit, str) else f"{factor:g} {next(iter(self.units))}"
         low, high = sorted((self.low / factor, self.high / factor))
         return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor
 
     def outside(self, values: Array | Integers) -> NDArray[np.bool_]:
-        """Which of ``values``, in our unit, cannot be; NaN cannot where no value may lack."""
+        """Which of ``values``, in our unit, are invalid, including NaN if no value may be missing."""
         bad = ~((values >= self.low) & (values <= self.high))
         if self.kind == "whole":
             bad |= values != np.floor(values)
@@ -94,8 +93,8 @@ class Column:
     def require(
         self, source: object, rows: Sequence[int] | Integers, values: Array | Integers, name: str | None = None
     ) -> None:
-        """InputError at the first of ``values`` (N,), in our unit, that cannot be; ``rows`` (N,): where they stand in ``source``;
-        ``name``: the column's there."""
+        """InputError at the first invalid one of ``values`` (N,), in our unit; ``rows`` (N,): row numbers in ``source``; ``name``:
+        the column's name there."""
         bad = self.outside(values)
         if bad.any():
             i = int(np.argmax(bad))
@@ -105,10 +104,10 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a sensor. ``rows_of_one_stamp``: whether they are one measurement together, or one each.
+    """A table of a sensor. ``rows_of_one_stamp``: whether these form one measurement, or one each.
 
-    ``stream``: the class of the stream that its rows make, whose fields are the columns; "" where a function makes it of them.
-    ``optional``: columns that may be missing all together, of several the first that is there; ``("rssi",), ()``: that or none.
+    ``stream``: class of the stream, whose fields are the columns; "" if a function creates it. ``optional``: groups of optional
+    columns, of which the first available one is used; ``("rssi",), ()``: rssi or none.
     """
 
     name: str
@@ -122,15 +121,15 @@ class Table:
 
     @property
     def shapes(self) -> tuple[tuple[str, ...], ...]:
-        """The names of the columns that a file may have, the fullest first."""
+        """The possible sets of column names of a file, largest first."""
         left_out = {name for choices in self.optional for choice in choices for name in choice}
         always = tuple(column.name for column in self.columns if column.name not in left_out)
         return tuple((*always, *(n for c in choices for n in c)) for choices in itertools.product(*self.optional))
 
 
 def require_span(tables: Iterable[tuple[object, Sequence[int] | Integers | None, Integers]]) -> None:
-    """InputError if stamps of tables, (source, rows (N,) or None, stamps (N,) [ns]), lie more than :data:`MAX_SPAN` apart: it names
-    that which is farthest from the middle one of all."""
+    """InputError if timestamps of tables, (source, rows (N,) or None, timestamps (N,) [ns]), are more than :data:`MAX_SPAN` apart;
+    it names the one that is farthest from the median."""
     filled = [(source, rows, t_ns) for source, rows, t_ns in tables if len(t_ns)]
     first, last = min(int(t.min()) for _, _, t in filled), max(int(t.max()) for _, _, t in filled)
     if last - first <= MAX_SPAN * 1e9:
@@ -168,7 +167,7 @@ def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field:
     return Column(name, kind, {}, 0.0, math.inf, False, doc, field)
 
 
-STAMP = Column("t_ns", "stamp", STAMPS, -LATEST, LATEST, False, "when it was, by the sensor's clock")
+STAMP = Column("t_ns", "stamp", STAMPS, -LATEST, LATEST, False, "time of the measurement, by the sensor's clock")
 SECONDS = replace(STAMP.in_unit("s")[0], name="t", kind="number")
 POSES = Table(
     "poses",
@@ -176,7 +175,7 @@ POSES = Table(
         STAMP,
         *(within(name, LENGTH, FARTHEST, "position; of odometry in a frame of its own") for name in "xyz"),
         *(within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
-        within("heading", ANGLE, 1e5, "direction of the robot's x axis, or the sum of its turns"),
+        within("heading", ANGLE, 1e5, "direction of the robot's x axis, or accumulated rotation"),
     ),
     "one each",
 )
@@ -186,7 +185,7 @@ POINTS = Table(
         named("point", "the name of a point"),
         *(within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
         *(within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
-        *(within(f"from_{name}", LENGTH, FARTHEST, "where the camera of a view was") for name in "xyz"),
+        *(within(f"from_{name}", LENGTH, FARTHEST, "position of the camera of a view") for name in "xyz"),
         number("size", PIXELS, 1e-3, LARGEST_PIXEL, "of the feature in that view"),
     ),
     "one each",

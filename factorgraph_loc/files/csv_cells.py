@@ -1,4 +1,4 @@
-"""The cells of a CSV with a header, and what is checked of any of them."""
+"""Cells of a CSV with a header."""
 
 import csv
 import io
@@ -19,17 +19,16 @@ Shape = tuple[str, ...]  # the names of columns
 
 @dataclass(frozen=True)
 class Cells:
-    """N rows of a CSV: ``rows`` N, where each stands in ``path`` as an editor counts lines; ``columns``: N cells by name."""
+    """N rows of a CSV: ``rows``: N line numbers in ``path``; ``columns``: N cells by name."""
 
     path: Path
     rows: Sequence[int]
     columns: Mapping[str, Sequence[str]]
 
     def numbers(self, name: str, column: Column, unit: str | float = 1.0) -> Array:
-        """The numbers (N,) below ``name``, what ``column`` describes, in its own unit; in the file they are in ``unit``. An
-        empty cell is NaN.
+        """The numbers (N,) of a column, converted from ``unit`` to that of ``column``. An empty cell is NaN.
 
-        InputError at the first that is no number, is written as NaN or infinite, or lies outside the column's bounds.
+        InputError at the first cell that is no number, not finite, or outside of the column's bounds.
         """
         cells = self.columns[name]
         try:
@@ -55,10 +54,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
-    """The cells of a CSV, and the first of ``shapes`` whose columns it has, in any order.
-
-    Blank lines are passed over. InputError names file and row of what is wrong.
-    """
+    """The cells of a CSV, and the first of ``shapes`` whose columns it has. InputError names file and row of invalid content."""
     rows: list[int] = []
     cells: list[list[str]] = []
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
@@ -82,9 +78,9 @@ def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
 
 
 def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
-    """The one of ``shapes`` that has most columns in ``header``, of several the first that has all of its columns there.
+    """The one of ``shapes`` with most columns in ``header``, the first one if several have all.
 
-    InputError if it lacks one: it is what was meant, even if a poorer one is complete.
+    InputError if a column is missing: the best match is what was intended, even if a smaller shape is complete.
     """
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)

@@ -1,4 +1,4 @@
-"""Reading what people write, and writing so that nothing is half-written."""
+"""Base class of settings models, parsing of TOML and JSON, and atomic writing of files."""
 
 import difflib
 import gc
@@ -24,33 +24,33 @@ from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
 
-LONGEST_FILE = 100  # bytes of a file's name that is made from another
-DEEPEST = 64  # tables or lists within each other, and parts of a key
-MANY = 1000  # names that a misspelt one is compared to: each takes its time
-MOST_ENTRIES = 1_000_000  # of all tables and lists of a file
-MOST_DIGITS = 40  # of a whole number in JSON: an EPC of 96 bits has 29
+LONGEST_FILE = 100  # bytes of a generated file name
+DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
+MANY = 1000  # maximum number of names to search for a similar one
+MOST_ENTRIES = 1_000_000  # values of a file
+MOST_DIGITS = 40  # of an integer in JSON: an EPC of 96 bits has 29
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
 
 
 class FileModel(BaseModel):
-    """Base of everything that people write in TOML: frozen, and no key that we do not know."""
+    """Base class of everything that people write in TOML: frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with other values, numbers beyond the bounds of their field at the bound: what is computed cannot make settings
-        that could not be read again."""
+        """A copy with updated values. Numbers are clipped to the bounds of their fields, so that computed settings remain
+        readable."""
         return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
 
     @classmethod
     def bounded(cls, **values: Any) -> Self:
-        """One of computed values, numbers beyond the bounds of their field at the bound."""
+        """A model of computed values, with numbers clipped to the bounds of their fields."""
         return cls(**{key: _within(cls, key, value) for key, value in values.items()})
 
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
-    """Give a model more fields, each with its type and default, that stand after another one."""
+    """Add fields to a model after another one, each with its type and default."""
     there = dict(model.model_fields)
     behind = list(there)[list(there).index(after) + 1 :]
     added = {name: FieldInfo.from_annotated_attribute(kind, default) for name, (kind, default) in fields.items()}
@@ -61,12 +61,12 @@ def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *,
 
 
 Model = TypeVar("Model", bound=BaseModel)
-FARTHEST = 1e7  # m: northings of UTM go so far
+FARTHEST = 1e7  # m; the maximum of UTM northings
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
 
 
 def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
-    """The least and the largest number that pydantic's ``metadata`` of a field allow; infinite where there is no bound."""
+    """The bounds of a number in pydantic's ``metadata`` of a field; infinite if there are none."""
     low, high = -math.inf, math.inf
     for entry in metadata:
         for part in getattr(entry, "metadata", (entry,)):
@@ -76,7 +76,7 @@ def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
 
 
 def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
-    """``value`` of a field, a number at the nearest bound if it lies beyond; NaN stays."""
+    """``value`` clipped to the bounds of a field; NaN is kept."""
     field = kind.model_fields.get(name)
     if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
@@ -85,7 +85,7 @@ def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
 
 
 def read_text(path: Path, limit: int = bounded.DATA) -> str:
-    """The content of a text file of at most ``limit`` bytes, its line ends as they are; InputError if it is missing, larger, no
+    """The content of a text file of at most ``limit`` bytes, with its line ends; InputError if it is missing, too large, not a
     regular file or not UTF-8."""
     try:
         return bounded.read_bytes(path, limit).decode("utf-8-sig")
@@ -94,15 +94,15 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, has more
-    than :data:`MOST_ENTRIES`, or a date or an integer of more than 64 bits, of which no file of ours has any."""
+    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or has more
+    than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits."""
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
-    """The content of a text in TOML; InputError as of :func:`read_toml`."""
+    """Parse a TOML text; InputError as in :func:`read_toml`."""
     for row, line in enumerate(text.split("\n"), start=1):
-        # the time that tomllib takes grows with the square of the parts
+        # the time that tomllib needs grows with the square of the number of parts
         if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
             raise InputError(f"{plain(source)}:{row}: a key has more than {DEEPEST} parts")
     with bounded.foreign(source, "is not TOML"):
@@ -112,8 +112,8 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
 
 
 def check_content(content: dict[str, Any], source: object) -> None:
-    """InputError for what none of our files has: what is nested deeper than :data:`DEEPEST`, more than :data:`MOST_ENTRIES`, a
-    date, an integer of more than 64 bits, text that is none in UTF-8, or what is no value of TOML at all."""
+    """InputError for content that is nested too deeply, has too many values, or has a date, an integer of more than 64 bits, text
+    that is not UTF-8, or a value that is not from TOML."""
     for key, value in _leaves(content, source):
         if isinstance(value, int) and abs(value) >= 2**63:
             raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
@@ -128,7 +128,7 @@ def check_content(content: dict[str, Any], source: object) -> None:
 
 
 def is_utf8(text: str) -> bool:
-    """Whether a text can be written into a file."""
+    """Whether a text can be encoded as UTF-8."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -137,16 +137,16 @@ def is_utf8(text: str) -> bool:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; InputError as of :func:`read_toml`, and for NaN, infinity and keys that are there twice."""
+    """The content of a JSON file; InputError as in :func:`read_toml`, and for NaN, infinity and duplicate keys."""
     return parse_json(read_text(path, bounded.SETTINGS), path)
 
 
 def parse_json(text: str, source: object) -> Any:
-    """The value of a text in JSON; InputError as of :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
-    try:  # there may be a million lines of it: bounded.foreign takes longer
+    """Parse a JSON text; InputError as in :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
+    try:  # faster than bounded.foreign, as there may be a million lines
         content = _JSON.decode(text)
     except RecursionError as error:
-        raise InputError(f"{source}: is not JSON: it is nested too deep") from error
+        raise InputError(f"{source}: is not JSON: it is nested too deeply") from error
     except ValueError as error:
         raise InputError(f"{source}: is not JSON: {told(error)}") from error
     if text.count("[") + text.count("{") > DEEPEST or len(text) > MOST_ENTRIES:
@@ -155,11 +155,11 @@ def parse_json(text: str, source: object) -> Any:
 
 
 def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
-    """``content`` as a model of ``kind``; InputError names ``source``, the key, the value and what is expected."""
+    """``content`` as a model of ``kind``; InputError names ``source``, the key, the value and the expected value."""
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        # a misspelt key is also a missing one: the spelling is what the user can act on
+        # a misspelt key is also reported as missing; the spelling error is more useful
         with _without_collection():
             first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
         key = plain(".".join(str(part) for part in first["loc"]))
@@ -169,7 +169,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
         if first["type"] == "missing":
             raise InputError(f"{source}: {key} is missing{more}") from error
-        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):  # too much for a line
+        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):  # too long for a line
             table = f"{key}: " if key else ""
             raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]
@@ -178,7 +178,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Without looks for garbage, which take ten times as long as to make a million dictionaries."""
+    """Disable garbage collection, which takes ten times as long as creating a million dictionaries."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -189,15 +189,15 @@ def _without_collection() -> Iterator[None]:
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """The keys that the model below ``path`` takes; empty where that is not a model."""
+    """The keys of the model at ``path``; empty if there is no model."""
     parts = iter(path)
     for part in parts:
-        if isinstance(part, int):  # the place in a list of models
+        if isinstance(part, int):  # index in a list of models
             continue
         field = kind.model_fields.get(str(part))
         nested = field.annotation if field is not None else None
         if get_origin(nested) is dict:
-            next(parts, None)  # the key within the dict
+            next(parts, None)  # key in a dict
         options = [nested, *get_args(nested)]
         models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
         if not models:
@@ -207,7 +207,7 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """A hint for a misspelt word: the nearest known one, else all of them."""
+    """A hint for a misspelt word: the most similar known one, else all of them."""
     short = [name for name in known if len(name) <= NAME][:MANY]
     matches = difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
     if matches:
@@ -216,15 +216,15 @@ def nearest(word: str, known: list[str]) -> str:
 
 
 def inside(root: Path, name: str, source: object) -> Path:
-    """The path ``name`` below ``root``, its links followed, where a file or folder is or could be.
+    """The path ``name`` below ``root``, with links resolved; it need not exist. All paths in files are resolved by this function.
 
-    InputError if it leaves ``root``, by dots, as an absolute path or by a link, or if it is what is neither a regular file nor a
-    folder; NoFileNameError if no file can have that name. Every path that a file names goes through here.
+    InputError if it leaves ``root`` (by dots, as an absolute path or by a link) or is neither a regular file nor a folder;
+    NoFileNameError if no file can have that name.
     """
     try:
         path = Path(os.path.realpath(root / name))
         leaves = not path.is_relative_to(os.path.realpath(root))
-    except (OSError, ValueError) as error:  # NUL, or half of a pair of UTF-16
+    except (OSError, ValueError) as error:  # NUL, or a lone UTF-16 surrogate
         raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
     if leaves:
         raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}")
@@ -235,8 +235,8 @@ def inside(root: Path, name: str, source: object) -> Path:
 
 
 def file_name(name: str) -> str:
-    """A name as a file's name: what is no letter, digit, dot, dash or underscore becomes an underscore. Of more than 100 bytes
-    the first stay, with a digest of the whole name, so that long names that differ go on doing so."""
+    """A name as a file name: characters other than letters, digits, dots, dashes and underscores become underscores. Names above
+    100 bytes are truncated, with a digest of the whole name."""
     safe = re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
     if len(safe.encode()) <= LONGEST_FILE:
         return safe
@@ -246,7 +246,7 @@ def file_name(name: str) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``; what is written to it takes the place of ``path`` when the block ends well."""
+    """A temporary path next to ``path``, which is moved to ``path`` when the block ends without an error."""
     with temporary_file(path) as temporary:
         yield temporary
         umask = os.umask(0)
@@ -256,19 +256,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file at once or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names need not be UTF-8
 
 
 def write_toml(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a TOML file at once or not at all."""
+    """Write a TOML file atomically."""
     write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\{found[0]}", tomli_w.dumps(content)))
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """All values that are neither tables, lists nor floats, each with its key; InputError where they are nested too deep, or where
-    there are too many of all."""
+    """All values with their keys except tables, lists and floats; InputError if there are too many or they are nested too
+    deeply."""
     waiting = [("", content, 0)]
     count = 0
     while waiting:
@@ -276,7 +276,7 @@ def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
         if not isinstance(value, dict | list):
             yield key, value
         elif depth == DEEPEST:
-            raise InputError(f"{source}: {plain(key)} lies more than {DEEPEST} tables or lists deep")
+            raise InputError(f"{source}: {plain(key)} is nested more than {DEEPEST} tables or lists deep")
         else:
             count += len(value)
             bounded.require_size(source, "the number of its values", count, MOST_ENTRIES)
@@ -291,14 +291,14 @@ def _integer(digits: str) -> int:
 
 
 def _constant(name: str) -> float:
-    raise ValueError(f"{name} is no number in JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"the key {quoted(twice)} is there twice")
+        raise ValueError(f"the key {quoted(twice)} is duplicate")
     return found
 
 

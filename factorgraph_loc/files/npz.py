@@ -1,4 +1,4 @@
-"""Arrays of numbers in ``.npz`` files of numpy, without pickles; their declared sizes are checked before memory is taken."""
+"""Arrays of numbers in numpy's ``.npz`` files, without pickles; declared sizes are checked before memory is allocated."""
 
 import io
 import math
@@ -12,22 +12,23 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.files.bounded import foreign, opened, require_size
 
-MEMBERS = 100  # arrays of a file
+MEMBERS = 100  # maximum number of arrays in a file
 SUFFIX = ".npy"
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[Any]]:
-    """The arrays by name, of ``limit`` bytes at most in all; InputError if it is no such file, or holds anything but numbers."""
+    """The arrays by name, of at most ``limit`` bytes in total; InputError if the file is invalid, or contains other than
+    numbers."""
     with opened(path, limit) as file, foreign(path, "is not a file of arrays (.npz)"), zipfile.ZipFile(file) as archive:
         members = archive.infolist()
         require_size(path, "its number of arrays", len(members), MEMBERS)
         require_size(path, "its size in bytes when unpacked", sum(m.file_size for m in members), limit)
-        # no more than file_size is unpacked of a member, whatever it holds
+        # no more than file_size is unpacked of each member
         return {m.filename.removesuffix(SUFFIX): _array(archive.read(m)) for m in members}
 
 
 def _array(content: bytes) -> NDArray[Any]:
-    """The array in an ``.npy`` file; ValueError if it declares more or less than there is."""
+    """The array in an ``.npy`` file; ValueError if its declared size differs from its content."""
     file = io.BytesIO(content)
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):

@@ -1,8 +1,7 @@
-"""What a Parquet file declares of its size, looked through before anything is unpacked (Apache Parquet's ``parquet.thrift``).
+"""Validation of the sizes declared in a Parquet file before it is unpacked (Apache Parquet's ``parquet.thrift``).
 
-A file of a kilobyte may say that it holds 2^40 rows, and each page how much it is when it is unpacked. Who unpacks it believes that
-and takes the memory. So the footer and the heads of all pages are read here, in Thrift's compact protocol, and compared with the
-length of the file, with each other and with limits.
+A file of a kilobyte may declare 2^40 rows or huge pages, for which a reader would allocate memory. So the footer and all page
+headers are read here, in Thrift's compact protocol, and compared with the length of the file, with each other and with limits.
 """
 
 from typing import Any
@@ -10,22 +9,22 @@ from typing import Any
 from factorgraph_loc.files.bounded import CELLS, DATA, RATIO, require_size
 
 MARK = b"PAR1"
-FIXED = 64 * 2**10  # cells that any file may have
-_DEEPEST = 12  # structures within each other
+FIXED = 64 * 2**10  # cells that are always allowed
+_DEEPEST = 12  # nesting levels of structures
 _TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _LIST, _STRUCT = 1, 2, 3, 7, 8, 9, 12
 _WIDTHS = {_TRUE: 0, _FALSE: 0, _BYTE: 1, _DOUBLE: 8}  # bytes
 
-# places of fields in parquet.thrift
+# field numbers in parquet.thrift
 _ROWS, _GROUPS = 3, 4  # FileMetaData
 _COLUMNS, _GROUP_ROWS = 1, 3  # RowGroup
 _COLUMN = 3  # ColumnChunk
 _VALUES, _UNPACKED, _PACKED, _DATA_AT, _DICTIONARY_AT = 5, 6, 7, 9, 11  # ColumnMetaData
 _PAGE_UNPACKED, _PAGE_PACKED, _PAGE, _DICTIONARY, _PAGE_V2 = 2, 3, 5, 7, 8  # PageHeader
-_COUNT = 1  # of a page's head
+_COUNT = 1  # of a page header
 
 
 def check(content: bytes, source: object) -> None:
-    """ValueError if the parts of a Parquet file do not lie in it or contradict each other; InputError if they are too large."""
+    """ValueError if the parts of a Parquet file are outside of it or inconsistent; InputError if they are too large."""
     try:
         _check(content, source)
     except IndexError as error:
@@ -54,8 +53,7 @@ def _check(content: bytes, source: object) -> None:
 
 
 def _pages(content: bytes, last: int, told: dict[int, Any]) -> int:
-    """How many bytes the pages of a column are when unpacked; ValueError where they are not what the column says, or lie behind
-    ``last``."""
+    """Unpacked bytes of the pages of a column; ValueError if they are inconsistent with the column, or extend beyond ``last``."""
     at = [_number(told, place) for place in (_DICTIONARY_AT, _DATA_AT) if place in told]
     start, packed, values = min(at), _number(told, _PACKED), _number(told, _VALUES)
     end = start + packed
@@ -98,7 +96,8 @@ def _list(fields: dict[int, Any], place: int) -> list[dict[int, Any]]:
 
 
 def _structure(content: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
-    """The structure of Thrift's compact protocol at ``at``, by places, and where it ends; texts are None, for none is looked at."""
+    """The structure of Thrift's compact protocol at ``at``, by field number, and its end; texts are None, as they are not
+    needed."""
     if depth > _DEEPEST:
         raise ValueError("its structures are nested too deep")
     found: dict[int, Any] = {}

@@ -1,6 +1,6 @@
-"""Standard error while libraries in C or Rust read a damaged file: they write to it what an error of ours says in one line.
+"""Suppression of messages that C and Rust libraries print to standard error about damaged files.
 
-libpng and libjpeg write there whatever OpenCV's log level is, and threads of polars that stumble over a page before they raise.
+libpng and libjpeg ignore OpenCV's log level; polars prints from its threads before it raises.
 """
 
 import os
@@ -11,19 +11,17 @@ from contextlib import contextmanager
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """What is written to descriptor 2 in this block is lost, if the main thread is in it; in other threads it does nothing.
+    """Discard writes to descriptor 2 in this block; only in the main thread, otherwise it has no effect.
 
-    The descriptor is that of all threads, so what another one writes meanwhile is lost too. Therefore a block holds the call that
-    reads one file and no more: milliseconds for an image, at worst seconds for a table of a gigabyte. What can be missed is a
-    frame of a progress bar, which is drawn again: errors of other threads are exceptions, which are told later. Two threads in such
-    blocks could leave the descriptor lost for good, hence the main thread alone.
+    The descriptor is shared by all threads, so their messages are lost too. Therefore a block should contain only the call that
+    reads one file. In several threads, such blocks could leave the descriptor redirected for good.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     try:
         kept = os.dup(2)
-    except OSError:  # it is closed
+    except OSError:  # the descriptor is closed
         yield
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)

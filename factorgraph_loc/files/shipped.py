@@ -1,13 +1,13 @@
-"""Where the manifests lie that ship with the project. Importable without numerical libraries, for the completion of shells."""
+"""Locations of the shipped manifests. Importable without numerical libraries, for shell completion."""
 
 import sysconfig
 from pathlib import Path
 
-SHIPPED = Path("share", "factorgraph-loc", "datasets")  # below the data path of an installation
+SHIPPED = Path("share", "factorgraph-loc", "datasets")  # relative to the data path of an installation
 
 
 def manifests() -> dict[str, Path]:
-    """The manifests that ship with the project: name -> file, by name."""
+    """The shipped manifests: name -> file, sorted by name."""
     for folder in manifest_folders():
         found = {
             file.stem: file
@@ -20,7 +20,7 @@ def manifests() -> dict[str, Path]:
 
 
 def manifest_folders() -> list[Path]:
-    """Where the shipped manifests may be: in a source checkout beside the package, else where an installer puts data."""
+    """Folders of shipped manifests: next to the package in a source checkout, else in the installation's data path."""
     checkout = Path(__file__).resolve().parents[2]
     folders = [checkout / "datasets"] if (checkout / "pyproject.toml").is_file() else []
     user = sysconfig.get_path("data", sysconfig.get_preferred_scheme("user"))

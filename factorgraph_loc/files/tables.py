@@ -20,9 +20,9 @@ KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.
 
 @dataclass(frozen=True)
 class TableRows:
-    """N rows of a table: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN where empty; ``names`` by column, N texts.
+    """N rows of a table: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN if empty; ``names`` by column, N texts.
 
-    ``rows`` (N,): where each stands in ``path``, as an editor counts lines (Parquet: rows from 1).
+    ``rows`` (N,): line numbers in ``path`` (Parquet: rows from 1).
     """
 
     path: Path
@@ -32,7 +32,7 @@ class TableRows:
     names: dict[str, list[str]]
 
     def rows_at(self, which: Integers) -> Self:
-        """Some of the rows, in the order of their places ``which`` (M,)."""
+        """The rows with indices ``which`` (M,), in that order."""
         return type(self)(
             self.path,
             self.rows[which],
@@ -43,9 +43,9 @@ class TableRows:
 
 
 def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
-    """Read CSV or Parquet with the columns of one of ``tables``, in any order; other columns are not looked at.
+    """Read CSV or Parquet with the columns of one of ``tables``; other columns are ignored.
 
-    InputError names file, row and field of what is missing, is not a number, or lies outside the bounds of its column.
+    InputError names file, row and field of a value that is missing, is not a number, or is out of bounds.
     """
     shapes = [shape for table in tables for shape in table.shapes]
     columns = {column.name: column for table in tables for column in table.columns}
@@ -53,8 +53,8 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
 
 
 def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
-    """Write columns of one of ``tables``, of equal length, to CSV or Parquet, as the suffix says; NaN becomes an empty field.
-    Numbers keep all digits."""
+    """Write columns of equal length of one of ``tables`` to CSV or Parquet, by suffix, with all digits; NaN becomes an empty
+    field."""
     kinds = {column.name: KINDS[column.kind] for table in tables for column in table.columns}
     series = [pl.Series(name, column, dtype=kinds[name]) for name, column in columns.items()]
     frame = pl.DataFrame([s.fill_nan(None) if s.dtype.is_float() else s for s in series])

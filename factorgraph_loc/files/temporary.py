@@ -1,8 +1,7 @@
-"""Temporary files and folders, which lie beside what they become, all in one place.
+"""Temporary files and folders next to their targets.
 
-Their names are that of what they become between a dot and :data:`MARK` with eight digits. Who writes one holds a lock on it, which
-the system lets go of when its process ends, however it ends. What nobody holds is swept away when a command that writes to the same
-folder begins.
+Their names consist of a dot, the target's name, :data:`MARK` and eight digits. The creating process holds a lock, which the system
+releases when the process ends. Unlocked ones are removed when a command that writes to the same folder starts.
 """
 
 import fcntl
@@ -17,41 +16,41 @@ from pathlib import Path
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
-_NAMED, _SUFFIX = 150, 60  # bytes that are taken of a name, and that a suffix may have: file systems have 255 for all
-_swept: set[Path] = set()  # folders that this process has looked through
-_own: set[Path] = set()  # what this process has made and not removed
+_NAMED, _SUFFIX = 150, 60  # bytes used of a name and of a suffix; file systems allow 255 in total
+_swept: set[Path] = set()  # folders that this process has cleaned up
+_own: set[Path] = set()  # paths created by this process and not yet removed
 
 
 @contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """An empty file beside ``path``, with its suffix; it is removed when the block ends, if it has not got another name by then."""
+    """An empty file next to ``path``, with its suffix; removed at the end of the block unless it was renamed."""
     with _held(path, path.stem, path.suffix, folder=False) as made:
         yield made
 
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A new folder beside ``path``, for this user alone; it is removed when the block ends, with what is in it."""
+    """A new private folder next to ``path``; removed with its content at the end of the block."""
     with _held(path, path.name, "", folder=True) as made:
         yield made
 
 
 def of_system(name: str) -> Path:
-    """A path of that name where the system keeps what is temporary."""
+    """A path with this name in the system's temporary folder."""
     return Path(tempfile.gettempdir()) / name
 
 
 def sweep(folder: Path) -> None:
-    """Remove what is temporary in ``folder``, is this user's, and belongs to no process that lives."""
-    with suppress(OSError):  # there is no such folder
+    """Remove this user's temporary files in ``folder`` that belong to no running process."""
+    with suppress(OSError):  # the folder does not exist
         for entry in os.scandir(folder):
             if _NAME.fullmatch(entry.name):
-                with suppress(OSError):  # it is held, or another process was faster
+                with suppress(OSError):  # locked, or removed by another process
                     _remove_unheld(folder / entry.name)
 
 
 def remove_own() -> None:
-    """Remove all that this process has made and not removed, because a signal came between."""
+    """Remove everything that this process has created and not removed, after a signal."""
     for path in list(_own):
         _remove(path)
 
@@ -76,7 +75,7 @@ def _held(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]
 
 
 def _make(path: Path, *, folder: bool) -> int | None:
-    """A handle on what was made under this name; None where there is something, or another process swept it before it was held."""
+    """A handle on a new file or folder; None if the name exists, or another process removed it before it was locked."""
     _own.add(path)
     try:
         if folder:
@@ -98,8 +97,7 @@ def _make(path: Path, *, folder: bool) -> int | None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Wait until no other process is in such a block, by a lock on the file ``path``, which stays there; where the file system has
-    no locks, nobody waits."""
+    """Hold an exclusive lock on the file ``path``, which is not removed; no effect if the file system does not support locks."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         with suppress(OSError):
@@ -110,7 +108,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _lock(handle: int) -> bool | None:
-    """Whether the lock is ours; None where the file system has no locks."""
+    """Whether the lock was acquired; None if the file system does not support locks."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -121,7 +119,7 @@ def _lock(handle: int) -> bool | None:
 
 
 def _is(handle: int, path: Path) -> bool:
-    """Whether the path is still that of what the handle is on."""
+    """Whether the path refers to the handle's file."""
     with suppress(OSError):
         return os.path.samestat(os.fstat(handle), path.lstat())
     return False

@@ -1,4 +1,4 @@
-"""Values that a program hands over: numbers, names and times, checked and copied, so that it may use its arrays again."""
+"""Validation of numbers, names and times passed by a program; arrays are copied, so that the caller may reuse them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NUMBER = (int, float, np.integer, np.floating)
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:
-    """A time [s]; InputError if it is none, or is further away than stamps can be."""
+    """A time [s]; InputError if it is not a number or out of range."""
     found = math.nan
     if isinstance(value, NUMBER) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
@@ -29,14 +29,14 @@ def seconds_of(where: str, value: object, name: str = "t") -> float:
 
 
 def numbers(where: str, field: str, value: object) -> Array:
-    """A new array of ``value``; InputError if it is not of real numbers."""
+    """A new array of ``value``; InputError if it does not consist of real numbers."""
     try:
         found = np.array(value)
         if found.dtype.kind == "O" and all(
             isinstance(item, NUMBER) and not isinstance(item, bool) for item in found.flat
         ):
             found = found.astype(float)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths, whole numbers of hundreds of digits
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, huge integers
         raise bad_field(where, field, value, "numbers") from None
     if found.dtype.kind not in "iuf" and found.size:
         raise bad_field(where, field, value, "numbers")
@@ -44,7 +44,7 @@ def numbers(where: str, field: str, value: object) -> Array:
 
 
 def within(where: str, column: Column, value: object, shape: tuple[int, ...]) -> Any:
-    """Numbers of a shape within the bounds of their column: a float where the shape is ()."""
+    """Numbers of a given shape within the bounds of their column; a float for the shape ()."""
     column, field = column.measured, column.field or column.name
     found = numbers(where, field, value)
     if found.shape != shape:
@@ -63,17 +63,17 @@ def truth(where: str, field: str, value: object) -> bool:
 
 
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
-    """A list of names; InputError if it is none."""
+    """A tuple of names; InputError if ``value`` is not a list of names."""
     if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):
         raise bad_field(where, field, value, "names")
     return tuple(value)
 
 
 def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
-    """What a list holds; InputError if it is none."""
+    """The items of a list; InputError if ``values`` is not a list."""
     found = None
     if isinstance(values, Iterable) and not isinstance(values, str):
-        with contextlib.suppress(TypeError):  # an array without rows
+        with contextlib.suppress(TypeError):  # a zero-dimensional array
             found = tuple(values)
     if found is None:
         raise bad_field(where, field, values, "a list of them")
@@ -81,7 +81,7 @@ def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
-    """Whole numbers (K,) within the bounds of their column; InputError if they are not."""
+    """Integers (K,) within the bounds of their column; InputError if they are invalid."""
     found = numbers(where, column.name, value)
     if found.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")

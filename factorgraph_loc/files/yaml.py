@@ -1,7 +1,7 @@
-"""YAML files of other programs, such as maps and calibrations: keys, texts, numbers, lists and blocks, parsed by PyYAML.
+"""Reading of foreign YAML files, such as maps and calibrations, with PyYAML.
 
-What YAML 1.1 would make of plain texts besides is not wanted: ``on``, ``no`` and dates stay text, and 5e-2 is a number. A tag
-such as ``!!opencv-matrix`` is passed over. Aliases are refused: a small file of them may stand for gigabytes.
+Only a subset of YAML 1.1 is used: ``on``, ``no`` and dates remain text, and 5e-2 is a number. Tags such as ``!!opencv-matrix`` are
+ignored. Aliases are rejected, because they can expand to gigabytes.
 """
 
 import re
@@ -15,32 +15,32 @@ from factorgraph_loc.files.bounded import YAML, foreign
 from factorgraph_loc.files.models import read_text
 from factorgraph_loc.text import quoted
 
-DEEPEST = 20  # blocks within blocks
-_DIRECTIVE = re.compile(r"\A(\s*)%YAML[: ][^\n]*")  # OpenCV writes %YAML:1.0, which is none
+DEEPEST = 20  # nesting levels of blocks
+_DIRECTIVE = re.compile(r"\A(\s*)%YAML[: ][^\n]*")  # OpenCV writes %YAML:1.0, which is invalid
 _INTEGER = re.compile(r"[-+]?\d+")
 _NUMBER = re.compile(r"[-+]?(\.\d+|\d+\.?\d*)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|Nan|NAN)")
 _NOTHING = ("", "~", "null")
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes the nodes of a file; aliases and blocks that are too deep are an InputError."""
+    """Composes the nodes of a file; InputError for aliases and deep nesting."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(_DIRECTIVE.sub(r"\1", read_text(path, YAML)))
         self.path, self.depth = path, 0
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803 - as PyYAML names it
-        if self.flow_level == DEEPEST:  # the time that PyYAML takes grows with the square of the depth
-            raise InputError(f"{self.path}:{self.line + 1}: more than {DEEPEST} blocks are within each other")
+        if self.flow_level == DEEPEST:  # the time that PyYAML needs grows with the square of the depth
+            raise InputError(f"{self.path}:{self.line + 1}: blocks are nested more than {DEEPEST} deep")
         super().fetch_flow_collection_start(TokenClass)
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         where = f"{self.path}:{event.start_mark.line + 1}: "
         if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{where}*{event.anchor} is an alias, expected what it stands for")
+            raise InputError(f"{where}*{event.anchor} is an alias, expected the value itself")
         if self.depth == DEEPEST:
-            raise InputError(f"{where}more than {DEEPEST} blocks are within each other")
+            raise InputError(f"{where}blocks are nested more than {DEEPEST} deep")
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
@@ -48,9 +48,9 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The values of a YAML file by key: texts, numbers, lists, and blocks as dicts; keys without a value are left out.
+    """The values of a YAML file by key: texts, numbers, lists, and blocks as dicts; keys without a value are omitted.
 
-    InputError names file and row of what is not YAML.
+    InputError names file and row of invalid content.
     """
     with foreign(path, "is not YAML that can be read"):
         try:
@@ -72,9 +72,9 @@ def _value(node: yaml.Node, path: Path) -> Any:
         for key, value in node.value:
             where = f"{path}:{key.start_mark.line + 1}"
             if not isinstance(key, yaml.ScalarNode):
-                raise InputError(f"{where}: a key is no text, expected key: value")
+                raise InputError(f"{where}: a key is not text, expected key: value")
             if key.value in found:
-                raise InputError(f"{where}: the key {quoted(key.value)} is there twice")
+                raise InputError(f"{where}: the key {quoted(key.value)} is duplicate")
             found[key.value] = _value(value, path)
         return found
     if isinstance(node, yaml.SequenceNode):
@@ -84,7 +84,7 @@ def _value(node: yaml.Node, path: Path) -> Any:
 
 
 def _scalar(text: str) -> Any:
-    """What is written without quotes: a number where it is one, nothing, else text."""
+    """An unquoted scalar: a number, None, or text."""
     if text in _NOTHING:
         return None
     if _INTEGER.fullmatch(text):

@@ -1,3 +1,3 @@
-"""Logs and results in files: formats of others, the native one, ROS bags."""
+"""Files of logs and results: the native format, foreign formats, ROS bags."""
 
 __all__ = ["bags", "native", "readers", "results", "write"]

@@ -11,7 +11,7 @@ MAX_ODOMETRY_GAP = 5.0  # s
 
 
 def look_over(log: Log) -> list[str]:
-    """Warnings about a whole log; InputError if it has no odometry, which only a camera that is carried by hand may lack."""
+    """Warnings about a whole log; InputError if it has no odometry, which only a hand-held camera may lack."""
     odometry = log.streams.get("odometry")
     if odometry is None and log.reference3 is not None:
         return []

@@ -1,22 +1,21 @@
-"""The motion between poses of odometry, and between counts of encoders: both may begin anew in the middle of a log."""
+"""Motion between odometry poses or encoder counts, both of which may be reset during a log."""
 
 import numpy as np
 
 from factors import se2
 from factors.se2 import Array, Integers
 
-# m/s and rad/s: below these no motion is a jump, and how many times faster than ever before a jump is
+# m/s and rad/s: minimum rate of a jump, and its minimum ratio to the largest rate before
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
-NEAR, ZERO = 0.05, 1e-6  # m: of the origin, where odometry begins anew; and of what is set to 0
-HELD = 1.0  # s for which the motion before goes on where odometry begins anew
-COUNTERS = (2**8, 2**16, 2**32)  # where encoders begin anew at 0
+NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
+HELD = 1.0  # s for which the previous motion is continued across a reset
+COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
-    """The motions (N - 1, 3) between poses (N, 3) of odometry at N stamps [ns].
+    """The motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    Where odometry begins anew, at the origin of its frame and faster than the robot ever moved before, or at nothing but zeros
-    after a pause, the motion before goes on.
+    At a reset (a jump to the origin faster than any motion before, or zeros after a pause) the previous motion is continued.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -34,8 +33,8 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[s
 
 
 def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, warnings: list[str]) -> Array:
-    """The motions (N - 1, 3) of a pair of wheels between the ways (N, 2) [m] that they have gone, ``scales`` (2,) times what
-    encoders counted; N stamps [ns]. An encoder with few bits counts on from 0; one that begins anew is treated as poses are."""
+    """The motions (N - 1, 3) from the distances (N, 2) [m] of a pair of wheels at N timestamps [ns]; ``scales`` (2,): metres per
+    encoder tick. Wrapping of encoders is handled; resets are treated as for poses."""
     steps = np.stack([_unwound(ways[:, i], float(scales[i])) for i in range(2)], axis=-1)
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
@@ -50,13 +49,13 @@ def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, war
 
 
 def _unwound(ways: Array, scale: float) -> Array:
-    """Steps (N - 1,) of one wheel; half the range of a counter is more than a wheel turns between two rows."""
+    """Steps (N - 1,) of one wheel, assuming less than half a counter range between rows."""
     steps: Array = np.diff(ways)
     ticks = ways / scale
     if not np.allclose(ticks, np.rint(ticks), atol=1e-3):
         return steps
     size = next((size for size in COUNTERS if ticks.min() >= -(size // 2) and ticks.max() < size), None)
-    # of a counter that never came to its end the size is not known, and does not matter
+    # the range of a counter that never wraps is unknown and irrelevant
     if size is None or np.abs(steps).max(initial=0.0) <= 0.5 * size * abs(scale):
         return steps
     whole = size * scale
@@ -64,12 +63,12 @@ def _unwound(ways: Array, scale: float) -> Array:
 
 
 def _durations(t_ns: Integers) -> Array:
-    """Between N stamps (N - 1,) [s], at least a millisecond: stamps may repeat, with a motion in between."""
+    """Durations (N - 1,) [s] between N timestamps, at least a millisecond, as timestamps may repeat."""
     return np.asarray(np.maximum(np.diff(t_ns), 1_000_000) / 1e9)
 
 
 def _before(rates: Array, least: float) -> Array:
-    """The largest (N,) of all rates (N,) before each, those of jumps left out, and at least ``least``."""
+    """The largest (N,) of all rates (N,) before each without jumps, at least ``least``."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
         out[i] = most
@@ -83,5 +82,5 @@ def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -
         at = (int(t_ns[anew[0] + 1]) - int(t_ns[0])) / 1e9
         times = "" if len(anew) == 1 else f" {len(anew)} times, first"
         warnings.append(
-            f"{source}: the odometry begins anew at 0{times} {at:.1f} s after its start: the motion before goes on there"
+            f"{source}: the odometry is reset{times} {at:.1f} s after its start: the previous motion is continued there"
         )

@@ -1,4 +1,4 @@
-"""A log into files: the native format, or a ROS bag where the name is one."""
+"""Writing of a log in the native format or as a ROS bag."""
 
 from pathlib import Path
 from typing import Literal
@@ -10,10 +10,10 @@ from factorgraph_loc.model.log import Log
 
 
 def write_log(log: Log, out: str | Path, format: Literal["csv", "parquet"] = "csv") -> list[Path]:
-    """Write a log to ``out``, at once or not at all, and return the files that were written.
+    """Write a log to ``out`` atomically, and return the files.
 
-    A bag (:func:`~factorgraph_loc.io.bags.export.write_bag`) where the name ends as one, else a folder in the native format
-    with tables of ``format`` (:func:`~factorgraph_loc.io.native.native.write_native`). InputError if something is there already.
+    A bag (:func:`~factorgraph_loc.io.bags.export.write_bag`) if the name is that of one, else a folder in the native format with
+    tables of ``format`` (:func:`~factorgraph_loc.io.native.native.write_native`). InputError if ``out`` exists.
     """
     out = Path(out)
     if out.suffix in SUFFIXES:

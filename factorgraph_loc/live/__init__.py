@@ -1,3 +1,3 @@
-"""The library for a robot that drives."""
+"""Online localization of a driving robot."""
 
 __all__ = ["localizer"]

@@ -1,4 +1,4 @@
-"""Where a robot is while it drives: measurements are pushed as they come, estimates are pulled when they are wanted."""
+"""Online localization: measurements are pushed as they arrive, and estimates are pulled when they are needed."""
 
 from __future__ import annotations
 
@@ -37,27 +37,26 @@ from factorgraph_loc.sensors.rfid.pushed import RfidRead, scan_of
 if TYPE_CHECKING:
     from factorgraph_loc.sensors.camera.live import LiveFrontend
 
-LAG = 10.0  # s: the window of the smoother, where the settings do not say another
+LAG = 10.0  # s: default window of the smoother
 HISTORY = 60.0  # s
-TIDY_INTERVAL = 5.0  # s of measurements between two times that the past is forgotten
+TIDY_INTERVAL = 5.0  # s between calls of `forget`, in measured time
 ROWS_KEPT = 1000  # of each list of diagnostics
-AHEAD = 3600.0  # s: a stamp that is so much newer than all others is of another clock
+AHEAD = 3600.0  # s: a timestamp so much newer than all others must come from another clock
 
 
 class Localizer:
-    """An estimator that any number of threads push measurements into and pull estimates from.
+    """An estimator for online use; any number of threads may push measurements and pull estimates.
 
     ``rig`` and ``world``: robot and map. ``estimator``: its name; ``settings``: overrides of its settings. The smoother has a
-    fixed lag of 10 s unless ``settings`` say another; with ``lag = None`` it keeps all, as ``batch`` and ``space_batch`` do.
-    ``sensors``: those that may be used, by default the rig's; what is pushed of others is counted as ignored. ``history`` [s]: how
-    long the past is kept that :meth:`trajectory` tells; with that, memory is bounded. ``seed``: of the random generator.
+    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch`` and ``space_batch``
+    do. ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored. ``history`` [s]:
+    length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
 
-    Its life: :meth:`initialize`, then measurements and estimates in any order. :meth:`initialize` once more begins anew. There is
-    nothing to close. Stamps are seconds by any clock that all sensors share; the offsets that the rig knows are added here. One
-    lock guards the estimator: who pushes waits while another's measurement is taken in, so that nothing piles up.
+    Call :meth:`initialize` first, and again to restart; there is nothing to close. Timestamps are seconds of any clock that all
+    sensors share; the time offsets of the rig are added here. A lock guards the estimator: a push waits while another measurement
+    is processed. The same measurements in the same order give the same results, whatever is queried in between.
 
-    The same measurements in the same order give the same results, whatever is asked in between. InputError if the settings,
-    sensors or ``history`` are wrong.
+    InputError if the settings, sensors or ``history`` are invalid.
     """
 
     def __init__(
@@ -85,14 +84,15 @@ class Localizer:
     def initialize(
         self, pose: ArrayLike | None = None, covariance: ArrayLike | None = None, t: float | None = None
     ) -> None:
-        """Begin, or begin anew, at a ``pose`` (3,), x, y [m] and heading [rad] in the world's frame; None: anywhere in the map. A
-        heading of NaN may be any: nothing is ``localized`` until what is seen has told it.
+        """Start, or restart, at ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None: at an unknown pose in the
+        map. NaN as heading: unknown heading; the status is not ``localized`` until the measurements determine it.
 
-        ``covariance`` (3, 3) of the pose, or (2, 2) of the position where the heading is NaN, by default that of 0.05 m and
-        0.05 rad. ``t`` [s]: when the robot is there, by default at the first measurement. Odometry from before then is taken in,
-        as its velocity holds on; other measurements are ignored.
-        InputError if these are no pose, or if the estimator cannot begin from an unknown one; RunFailedError if it cannot begin
-        there. All goes on as before then.
+        ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN, by default that of 0.05 m and 0.05
+        rad. ``t`` [s]: time of the pose, by default that of the first measurement. Odometry from before ``t`` is used; its
+        velocity is held. Other measurements from before ``t`` are ignored.
+
+        InputError if an argument is invalid or the estimator does not support an unknown pose; RunFailedError if it cannot start
+        there. The previous state is kept in both cases.
         """
         start = None if pose is None else prior_of(pose, covariance, t)
         setup = model_setup.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
@@ -102,9 +102,11 @@ class Localizer:
         if start is None and not getattr(new, "supports_unknown_start", False):
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
         if start is not None and getattr(new, "starts_in_space", False):
-            raise InputError(f"{self._name} begins at a pose in space, expected an estimator that begins on a floor")
+            raise InputError(
+                f"{self._name} starts from a three-dimensional pose, expected an estimator for planar poses"
+            )
         if start is not None and not start.has_heading and not finds_heading(new):
-            raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected one")
+            raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
         if start is not None and not math.isnan(start.t):
             with guard.telling(f"the start at {start.t:.3f} s"):
                 new.initialize(start)
@@ -112,33 +114,32 @@ class Localizer:
             self._begin_anew(new, start, guard)
 
     def push(self, measurement: Measurement) -> None:
-        """Take a measurement, in the order of arrival: one that is late goes in at its time if it is late by at most the
-        estimator's ``max_delay``, else it is counted and dropped.
+        """Process a measurement, in order of arrival. A late one is inserted at its time if it is late by at most the estimator's
+        ``max_delay``; otherwise it is counted and dropped.
 
-        InputError if it has a value that cannot be, such as NaN, or comes before :meth:`initialize`; if a stamp is an hour ahead
-        of all others; if increments of odometry go back in time, whose meaning depends on their order. It is not taken then, and
-        nothing else has changed. RunFailedError if the estimator fails: it is lost. Whatever is pushed or asked from then on
-        raises the same error, until :meth:`initialize` begins anew; only :meth:`diagnostics` still tells what there was.
-        Tags, antennas and landmarks that rig and map lack are no errors: they are counted, see :meth:`diagnostics`.
+        InputError if a value is invalid, such as NaN; before :meth:`initialize`; if a timestamp is an hour ahead of all others;
+        if increments of odometry go back in time. The measurement is then dropped and nothing else changes. RunFailedError if the
+        estimator fails: every call except :meth:`diagnostics` then raises this error until :meth:`initialize` is called. Unknown
+        tags, antennas and landmarks are no errors: they are counted, see :meth:`diagnostics`.
         """
         own = checked(measurement)
         with self._lock:
             self._take(own)
 
     def push_reads(self, t: float, antennas: Iterable[str], reads: Iterable[RfidRead] = ()) -> None:
-        """Take what was read in inventory rounds that ended at ``t``. ``antennas``: those that listened, also if they read nothing:
-        that tags were not read tells as much. InputError as of :meth:`push`."""
+        """Process the reads of inventory rounds that ended at ``t``. ``antennas``: all that were active, including those without
+        reads, as missing reads are informative too. InputError as in :meth:`push`."""
         self.push(scan_of(t, antennas, reads))
 
     def push_image(self, t: float, image: object) -> None:
-        """Take an image, an array (H, W) or (H, W, 3) BGR of the size that the rig's camera has.
+        """Process an image, an array (H, W) or (H, W, 3) BGR with the size of the rig's camera.
 
-        Its features are looked for in the calling thread, while other measurements go on: it arrives late by the time that takes.
-        InputError as of :meth:`push`, or if it is no such image.
+        Features are detected in the calling thread while other measurements are processed, so the image arrives late by that
+        time. InputError as in :meth:`push`, or if ``image`` is no such array.
         """
         t = seconds_of("image", t)
         if self._rig.find(CameraSettings) is None:
-            raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] that tells where it looks")
+            raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] with its mounting")
         modalities = getattr(registry.estimator_type(self._name), "modalities", ())
         if not uses_images(self._sensors, modalities):
             with self._lock:
@@ -146,7 +147,7 @@ class Localizer:
             return
         with self._image_lock:
             if self._frontend is None:
-                # imported here, as without images no OpenCV is needed
+                # imported here because OpenCV is not needed without images
                 from factorgraph_loc.sensors.camera.live import LiveFrontend  # noqa: PLC0415
 
                 self._frontend = LiveFrontend(frontend_of(self._rig, self._world), self._rig.of(CameraSettings).model())
@@ -154,19 +155,17 @@ class Localizer:
         self.push(frame)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the newest stamp of all measurements, or at ``t`` if that is later still, where the odometry leads.
+        """The pose at the newest timestamp of all measurements, or predicted by odometry to ``t`` if that is later.
 
-        It changes nothing: what is measured before ``t`` will not be late.
-
-        Before there is anything to tell it is ``unlocalized``, and not a number. RunFailedError if the estimator has failed, or has
-        no pose of finite numbers with a positive covariance then; that loses nothing.
+        This does not change the state: measurements before ``t`` will not be late. Before the first estimate the status is
+        ``unlocalized`` and the pose is NaN. RunFailedError if the estimator has failed, or if its estimate is not finite or its
+        covariance not positive; the latter loses nothing.
         """
         with self._lock:
             return self._estimate(t)
 
     def belief(self) -> Belief:
-        """All that is believed at the time of :meth:`estimate`: modes, and particles of an estimator that has them. RunFailedError
-        as there."""
+        """The belief at the time of :meth:`estimate`: modes, and particles if the estimator uses them. RunFailedError as there."""
         with self._lock:
             self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
@@ -175,8 +174,7 @@ class Localizer:
                 return copy.deepcopy(sound_belief(self._estimator.belief(self._newest)))
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of the past, with what came later: ten times a second from the start to before the newest stamp, of the
-        last ``history`` seconds, or somewhat more."""
+        """The smoothed past at 10 Hz, at least the last ``history`` seconds before the newest timestamp."""
         with self._lock:
             self._require_whole()
             if self._estimator is None or self._ticks is None or not self._ticks.count:
@@ -185,8 +183,7 @@ class Localizer:
                 return copy.deepcopy(sound_trajectory(self._estimator.trajectory()))
 
     def learnt(self) -> Learnt:
-        """What is estimated beside the pose: constants of the sensors, landmarks, points; with what came later, as
-        :meth:`trajectory` has them, and in the time that this takes."""
+        """Estimates besides the pose: constants of sensors, landmarks, points. Smoothed, like :meth:`trajectory`."""
         with self._lock:
             self._require_whole()
             if self._estimator is None:
@@ -195,19 +192,19 @@ class Localizer:
                 return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
-        """What was ignored, rejected or too late, by reason, since the beginning; the last innovations, residuals and events."""
+        """Counts of ignored, rejected and late measurements since the start, and the latest innovations, residuals and events."""
         with self._lock:
             return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
 
     def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None, guard: Guard) -> None:
         self._estimator = estimator
         self._guard = guard
-        self._failure: RunFailedError | None = None  # what the estimator was lost by
-        self._prior = prior  # its time is NaN until the first measurement tells it
-        # from the first measurement on, or from the prior's time
+        self._failure: RunFailedError | None = None  # by which the estimator was lost
+        self._prior = prior  # its time is NaN until the first measurement
+        # ticks start at the prior's time, or at the first measurement
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
         self._newest = self._tidied = -math.inf
-        self._last: PoseEstimate | None = None  # nothing has changed since
+        self._last: PoseEstimate | None = None  # latest estimate, None after a change
         known = channels()
         self._sequences: dict[str, Any] = {
             name: load(known[name].sequence)(self._rig, self._world) for name in self._sensors if known[name].sequence
@@ -220,7 +217,7 @@ class Localizer:
     def _begun(self, what: str) -> Estimator:
         self._require_whole()
         if self._estimator is None:
-            raise InputError(f"{what} came before initialize(), expected that first")
+            raise InputError(f"{what} came before initialize(), expected initialize() first")
         return self._estimator
 
     def _take(self, m: Measurement) -> None:
@@ -233,11 +230,11 @@ class Localizer:
         self._newest, self._last = max(self._newest, m.t), None
         try:
             self._feed(estimator, m)
-        except BaseException as error:  # an interrupt, too, leaves it half changed
+        except BaseException as error:  # an interrupt also leaves the estimator in an undefined state
             if isinstance(error, RunFailedError):
                 self._failure = error
             else:
-                self._failure = RunFailedError(f"{self._name}: lost by {type(error).__name__}; initialize() it anew")
+                self._failure = RunFailedError(f"{self._name}: lost by {type(error).__name__}; call initialize() again")
             raise
         self._tidy(estimator)
 
@@ -248,7 +245,7 @@ class Localizer:
                 self._prior = replace(self._prior, t=m.t)
                 with self._guard.telling(f"the start at {m.t:.3f} s"):
                     estimator.initialize(self._prior)
-        # as in a run of a log: a tick comes after all that was measured by then
+        # as in a run of a log: a tick follows all measurements up to its time
         for t in self._ticks.before(m.t):
             self._guard.process(estimator, Tick(t))
         if not m.is_motion and not self._is_under_way(m.t):
@@ -267,7 +264,7 @@ class Localizer:
             self._sequences[m.sensor].require(m, where)
 
     def _is_under_way(self, t: float) -> bool:
-        """Whether there is something to tell of ``t``: it is not before the start, nor before the first measurement."""
+        """Whether ``t`` is not before the start or the first measurement."""
         return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:
@@ -279,16 +276,16 @@ class Localizer:
             return PoseEstimate(math.nan, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         if at > self._newest + AHEAD:
             raise InputError(
-                f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected their clock"
+                f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected the same clock"
             )
         with self._guard.telling(f"the estimate at {at:.3f} s"):
             found = sound(self._estimator.estimate(at))
-        # the estimator may use its arrays again
+        # copied, because the estimator may reuse its arrays
         self._last = copy.deepcopy(replace(found, t=at))
         return copy.deepcopy(self._last)
 
     def _tidy(self, estimator: Estimator) -> None:
-        """Forget what lies too far back, every few seconds."""
+        """Forget the old past, every few seconds."""
         if self._newest < self._tidied + TIDY_INTERVAL:
             return
         self._tidied = self._newest
@@ -298,6 +295,6 @@ class Localizer:
 
 
 def _moved(m: Measurement, offset: float) -> Measurement:
-    """The same measurement by the clock that all sensors share."""
+    """The measurement with its time offset applied."""
     moved: Measurement = replace(m, t=m.t + offset)  # type: ignore[type-var]
     return moved

@@ -1,4 +1,4 @@
-"""What a :class:`~factorgraph_loc.live.localizer.Localizer` is made with and begins from, checked."""
+"""Validation of the arguments of :class:`~factorgraph_loc.live.localizer.Localizer`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,13 +18,13 @@ from factorgraph_loc.sensors.registry import sensor_of
 from factorgraph_loc.sensors.usage import lacking_section
 from factorgraph_loc.text import quoted
 
-# m and rad, as a covariance has them; wider than either no place is known, and narrower none is measured
+# bounds of standard deviations in m and rad: a wider one means an unknown pose, a narrower one is implausible
 NARROWEST, WIDEST, WIDEST_TURN = 1e-6, 1e4, 100.0
-RATIO = 1e14  # of the largest variance to the least, along any axes: a double has 16 digits
+RATIO = 1e14  # largest ratio of eigenvalues of a covariance; a double has 16 digits
 
 
 def require_options(rig: object, world: object, settings: object, history: object, seed: object) -> None:
-    """InputError if one of them is no such thing."""
+    """InputError if an argument is invalid."""
     for name, value, kind in (
         ("rig", rig, Rig),
         ("world", world, World | None),
@@ -41,7 +41,7 @@ def require_options(rig: object, world: object, settings: object, history: objec
 
 
 def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The sensors that may be used: without those that need a section that the rig lacks. InputError if one is unknown."""
+    """The usable sensors: without those whose section the rig lacks. InputError if one is unknown."""
     if asked is None:
         asked = rig.sensors
     if isinstance(asked, str) or not isinstance(asked, Sequence):
@@ -52,19 +52,21 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
-    """The Gaussian to begin from; its time is NaN where none is given. InputError if these are none."""
+    """The Gaussian prior of the start; its time is NaN if ``t`` is None. InputError if an argument is invalid."""
     mean = numbers("initialize()", "pose", pose)
     known = mean[: 2 if mean.shape == (3,) and np.isnan(mean[2]) else 3] if mean.shape == (3,) else mean
     if mean.shape != (3,) or any(POSES[n].outside(v) for n, v in zip(("x", "y", "heading"), known, strict=False)):
-        expected = f"finite x, y [m] and heading [rad], which may be NaN, none beyond {FARTHEST:g}"
+        expected = f"finite x, y [m] and heading [rad] (may be NaN), at most {FARTHEST:g} in size"
         raise InputError(f"pose is {quoted(mean.tolist())}, expected {expected}")
     size = len(known)
     if covariance is None:
         covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA))[:size])
     spread = numbers("initialize()", "covariance", covariance)
     if not _is_covariance(spread, size):
-        expected = f"({size}, {size}), symmetric and positive definite, deviations of {NARROWEST:g} to {WIDEST:g} m"
-        turn = f" and to {WIDEST_TURN:g} rad" if size == 3 else ""
+        expected = (
+            f"({size}, {size}), symmetric and positive definite, standard deviations of {NARROWEST:g} to {WIDEST:g} m"
+        )
+        turn = f" and up to {WIDEST_TURN:g} rad" if size == 3 else ""
         raise InputError(f"covariance is {quoted(spread.tolist())}, expected {expected}{turn}")
     at = math.nan if t is None else seconds_of("initialize()", t)
     return PosePrior(at, mean, spread) if size == 3 else PosePrior.at_position(at, mean[:2], spread)

@@ -1,4 +1,4 @@
-"""Values that all packages share: logs, rigs, worlds, trajectories, beliefs, diagnostics."""
+"""Types shared by all packages: logs, rigs, worlds, trajectories, beliefs, diagnostics."""
 
 __all__ = [
     "belief",

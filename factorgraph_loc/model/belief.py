@@ -1,4 +1,4 @@
-"""What an estimator is told of the start, and what it believes of the pose."""
+"""Priors of the start pose, pose estimates and beliefs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,12 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What is known of the start: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame;
-    ``space``: of a robot that is not on a floor. ``has_heading``: False where the heading may be any; that of the pose is 0 then,
-    and its variance that of a uniform distribution."""
+    """Gaussian prior of the start pose.
+
+    ``pose`` (3,) is (x, y, heading) at ``t`` with ``covariance`` (3, 3), in the world frame. ``space``: the pose of a robot that
+    moves in three dimensions. ``has_heading`` is False if the heading is unknown: it is 0 then, with the variance of a uniform
+    distribution.
+    """
 
     t: float
     pose: Array
@@ -31,7 +34,7 @@ class PosePrior:
 
     @staticmethod
     def at_position(t: float, position: Array, covariance: Array) -> PosePrior:
-        """At a ``position`` (2,) with ``covariance`` (2, 2), and any heading."""
+        """Prior of a ``position`` (2,) with ``covariance`` (2, 2) and unknown heading."""
         whole = np.diag((0.0, 0.0, math.pi**2 / 3.0))
         whole[:2, :2] = covariance
         return PosePrior(t, np.append(position, 0.0), whole, has_heading=False)
@@ -39,8 +42,8 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class SpacePose:
-    """A robot in space: ``position`` (3,) [m] and ``rotation`` (3, 3) in the world's frame, with the ``covariance`` (6, 6) of its
-    perturbation in its own frame, turn first, then shift, as ``gtsam.Pose3`` has them."""
+    """A pose in three dimensions: ``position`` (3,) [m] and ``rotation`` (3, 3) in the world frame, and the ``covariance`` (6, 6)
+    of a perturbation in the robot frame, rotation before translation as in ``gtsam.Pose3``."""
 
     position: Array
     rotation: Array
@@ -49,8 +52,8 @@ class SpacePose:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world's frame; ``space``: of
-    an estimator that knows the robot's pose in space."""
+    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame; ``space``: the
+    three-dimensional pose, if the estimator has one."""
 
     t: float
     pose: Array
@@ -61,7 +64,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class Mode:
-    """One Gaussian mode of a belief, in the world's frame."""
+    """One Gaussian mode of a belief, in the world frame."""
 
     weight: float
     pose: Array
@@ -70,7 +73,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Belief:
-    """What an estimator believes now: weighted Gaussian modes, and particles (N, 3) with weights (N,) where it has them."""
+    """The current belief: weighted Gaussian modes, and particles (N, 3) with weights (N,) if the estimator uses particles."""
 
     modes: tuple[Mode, ...]
     particles: Array | None = None
@@ -78,7 +81,7 @@ class Belief:
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
-    """The belief of an estimator that has one Gaussian; nothing is believed where the estimate is not a number."""
+    """The belief of a Gaussian estimator; it has no modes if the estimate is not finite."""
     if not np.isfinite(estimate.pose).all():
         return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 @dataclass(frozen=True)
 class Mark:
-    """How much :class:`Diagnostics` held at a time: numbers of rows, and counts."""
+    """The sizes of the lists and the counts of :class:`Diagnostics` at some time."""
 
     nis: Mapping[str, int]
     residuals: Mapping[str, int]
@@ -19,7 +19,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Written:
-    """What was added to :class:`Diagnostics`: its rows, and by how much its counts rose."""
+    """What was added to :class:`Diagnostics` since a mark: new rows, and the increases of counts."""
 
     nis: Mapping[str, Sequence[tuple[float, float, int]]]
     residuals: Mapping[str, Sequence[float]]
@@ -34,10 +34,10 @@ NOTHING_WRITTEN = Written({}, {}, {}, {})
 class Diagnostics:
     """Counts and consistency figures of a run.
 
-    ``residuals``: by sensor and value (``bearing_range.range`` in m), measurement less prediction, before the update. ``nis``: by
-    sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by reason.
-    ``events``: (t, what happened), for example a rebuilt graph. ``dead_tags``: tags of the map that are believed dead now, with the
-    probability of it.
+    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update. ``nis``:
+    by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by
+    reason. ``events``: (t, description), for example a rebuilt graph. ``dead_tags``: tags of the map believed to be dead, with
+    that probability.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class Diagnostics:
     late: dict[str, int] = field(default_factory=dict)
     events: list[tuple[float, str]] = field(default_factory=list)
     dead_tags: dict[str, float] = field(default_factory=dict)
-    # the last mark, while nothing is written after it: most of what is taken writes nothing
+    # the latest mark, valid while nothing is added
     _mark: Mark | None = field(default=None, init=False, repr=False, compare=False)
 
     def ignore(self, reason: str, count: int = 1) -> None:
@@ -70,12 +70,12 @@ class Diagnostics:
         self.residuals.setdefault(name, []).extend(values)
 
     def event(self, t: float, what: str) -> None:
-        """Something happened; it counts once, however often an estimator goes back in time."""
+        """Record an event; an event that is repeated after going back in time is recorded once."""
         if (t, what) not in self.events:
             self.events.append((t, what))
 
     def keep_last(self, rows: int) -> None:
-        """Forget all but the last ``rows`` of each list."""
+        """Keep the last ``rows`` rows of each list only."""
         self._mark = None
         for innovations in self.nis.values():
             del innovations[:-rows]
@@ -84,7 +84,7 @@ class Diagnostics:
         del self.events[:-rows]
 
     def copy(self) -> Diagnostics:
-        """One of its own with the same content."""
+        """A deep copy."""
         return Diagnostics(
             {name: list(rows) for name, rows in self.nis.items()},
             {name: list(values) for name, values in self.residuals.items()},
@@ -96,7 +96,7 @@ class Diagnostics:
         )
 
     def mark(self) -> Mark:
-        """What there is now, for :meth:`since`."""
+        """The current sizes, for :meth:`since`."""
         if self._mark is None:
             self._mark = self._counted()
         return self._mark
@@ -106,7 +106,7 @@ class Diagnostics:
         return Mark(rows, values, dict(self.ignored), dict(self.rejected))
 
     def since(self, mark: Mark) -> Written:
-        """What was added since then."""
+        """What was added since ``mark``."""
         if mark is self._mark:
             return NOTHING_WRITTEN
         return Written(
@@ -117,9 +117,8 @@ class Diagnostics:
         )
 
     def take_back(self, written: Written) -> None:
-        """Take out what was added, as what it tells of will be taken once more: a measurement counts once, however often an
-        estimator goes back in time. Rows may be gone by now: a robot that runs for long keeps the last ones. What was ``late``
-        stays, and so do ``events``, which did happen."""
+        """Remove what was added, before the same measurements are processed again. Rows that :meth:`keep_last` removed are
+        skipped; ``late`` and ``events`` are kept."""
         self._mark = None
         _remove(self.nis, written.nis)
         _remove(self.residuals, written.residuals)
@@ -131,7 +130,7 @@ class Diagnostics:
 
 
 def _risen(counts: Mapping[str, int], before: Mapping[str, int]) -> dict[str, int]:
-    """By how much each of those counts rose that did."""
+    """The counts that increased, and by how much."""
     rises = {name: count - before.get(name, 0) for name, count in counts.items()}
     return {name: rise for name, rise in rises.items() if rise}
 
@@ -140,7 +139,7 @@ _Row = TypeVar("_Row")
 
 
 def _remove(lists: dict[str, list[_Row]], taken: Mapping[str, Sequence[_Row]]) -> None:
-    """Take rows out of lists, each where it is found last; a list without rows goes too."""
+    """Remove the last occurrence of each row, and lists that become empty."""
     for name in taken.keys() & lists.keys():
         rows = lists[name]
         for row in reversed(taken[name]):

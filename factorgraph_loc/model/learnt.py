@@ -1,4 +1,4 @@
-"""What an estimator has estimated beside the poses."""
+"""Estimates besides the poses: constants of sensors, landmarks, points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class LearntPoint:
-    """A landmark's estimated ``position`` (2,) [m] with ``covariance`` (2, 2) of (x, y), in the world's frame."""
+    """Estimated ``position`` (2,) [m] of a landmark with ``covariance`` (2, 2) of (x, y), in the world frame."""
 
     position: Array
     covariance: Array
@@ -17,11 +17,11 @@ class LearntPoint:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What an estimator has estimated on the way, beside the poses.
+    """Estimates besides the poses.
 
-    ``values``: constants, name to (value, standard deviation), SI units. Those of the odometry have plain names
-    (``scale_distance``), those of another sensor its name before them (``bearing_range.x``). ``landmarks``: by the map's or the
-    measurements' name. ``points``: those in space that the map lacks, None without any.
+    ``values``: constants by name, each (value, standard deviation) in SI units. Constants of odometry have plain names
+    (``scale_distance``), those of other sensors a prefix (``bearing_range.x``). ``landmarks``: by name. ``points``: points in
+    space that are not in the map, or None.
     """
 
     values: Mapping[str, tuple[float, float]] = field(default_factory=dict)

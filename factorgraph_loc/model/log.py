@@ -1,4 +1,4 @@
-"""A logged run: rig, world, measurements by sensor, and the reference trajectory if there is one."""
+"""A recorded or simulated run: rig, world, measurements by sensor, and the reference trajectory if there is one."""
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class StartPose:
-    """A known start: ``t`` [s], ``pose`` (3,) and standard deviations (3,) of x, y, heading."""
+    """A known start pose: ``t`` [s], ``pose`` (3,) and standard deviations (3,) of x, y, heading."""
 
     t: float
     pose: Array
@@ -29,10 +29,10 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Log:
-    """A run. ``streams`` by the names of their sensors' channels; ``t0_ns``: absolute time of t = 0 in nanoseconds.
+    """A log. ``streams`` by channel; ``t0_ns``: absolute time of t = 0 in nanoseconds.
 
-    ``reference3``: the true robot in space, of a log that was not recorded on a floor. ``warnings``: what the reader mended or
-    left out, one line each. ``metadata``: licence, origin and the like.
+    ``reference3``: the reference trajectory in three dimensions, if the robot does not move on a floor. ``warnings``: one line
+    for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on.
     """
 
     name: str
@@ -47,19 +47,19 @@ class Log:
     reference3: Trajectory3 | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", well_formed(self.name))  # it may be that of a file
+        object.__setattr__(self, "name", well_formed(self.name))  # it may come from a file name
 
     def span(self) -> tuple[float, float]:
-        """First and last stamp of all streams [s]."""
+        """First and last timestamp of all streams [s]."""
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
         if not stamps:
             return 0.0, 0.0
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
 
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """The measurements of ``sensors`` in the order in which they arrived, stamps corrected by the rig's offsets.
+        """The measurements of ``sensors`` in order of arrival, with the time offsets of the rig applied.
 
-        A late one keeps its stamp and follows those that arrived before it. At equal times the rank of the streams decides.
+        A late measurement keeps its timestamp and follows those that arrived before it. Equal times are ordered by stream rank.
         """
 
         def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
@@ -74,10 +74,10 @@ class Log:
 
 
 def cut(log: Log, start: float, end: float) -> Log:
-    """The part of a log with stamps in [start, end) seconds, each sensor's by its own clock; the reference's likewise.
+    """The part of a log with timestamps in [start, end) seconds by each sensor's own clock, including the reference.
 
-    Stamps and name stay as they are; a known start is dropped. A velocity from before ``start`` is not held into the part, and the
-    first increment of odometry still is the motion since the row before it. InputError if no measurement is left.
+    Timestamps and name do not change; a known start is dropped. A velocity from before ``start`` does not apply in the part, and
+    the first increment of odometry remains the motion since the row before it. InputError if no measurement is left.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:
@@ -108,12 +108,11 @@ def cut(log: Log, start: float, end: float) -> Log:
 
 
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
-    """A kidnapped robot: ``second`` begins ``gap`` seconds after the end of ``first``, wherever the robot is then.
+    """A kidnapped robot: ``second`` starts ``gap`` seconds after the end of ``first``, wherever the robot is then.
 
-    All stamps of ``second`` are shifted alike, those of the reference too; in a gap between its poses nothing is scored. The last
-    velocity of ``first`` is held until the first row of ``second``. The first increment of ``second`` becomes zero: wheels do not
-    feel how they are carried. Start, metadata and absolute time are those of ``first``. InputError if rig, map or kind of
-    odometry differ, or if ``gap`` is not above zero.
+    The timestamps of ``second`` are shifted. A gap between the references is not scored. The last velocity of ``first`` is held
+    until the first row of ``second``, whose first increment becomes zero. Start, metadata and absolute time are those of
+    ``first``. InputError if rig, map or kind of odometry differ, or if ``gap`` is not positive.
     """
     if gap <= 0.0:
         raise InputError(f"the gap between {first.name} and {second.name} is {gap:g} s, expected more than 0")
@@ -135,7 +134,7 @@ def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
 
 
 def _joined_references(first: Trajectory | None, second: Trajectory | None, shift: float) -> Trajectory | None:
-    """Covariances are kept only if both parts have them, the heading only counts if it does in both."""
+    """Joined references; covariances and heading are kept only if both parts have them."""
     later = None if second is None else replace(second, t=second.t + shift)
     if first is None or later is None:
         return first or later
@@ -151,7 +150,7 @@ def _joined_references(first: Trajectory | None, second: Trajectory | None, shif
 
 
 def _extent(log: Log) -> tuple[float, float]:
-    """First and last stamp of streams and reference [s]."""
+    """First and last timestamp of streams and reference [s]."""
     first, last = log.span()
     if log.reference is None or not len(log.reference):
         return first, last

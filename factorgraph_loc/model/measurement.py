@@ -1,14 +1,14 @@
-"""What the sensors of a robot report: frozen values, stamped in seconds from the log's start, in SI units."""
+"""The interface of measurements: frozen values with timestamps in seconds from the start of the log, in SI units."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 
 class Measurement(Protocol):
-    """What a sensor reported at ``t`` [s], the time of the event, with the known offset between clocks already applied.
+    """A measurement at ``t`` [s], the time of the event with the clock offset applied.
 
-    ``sensor``: the channel that it is of, as a log and ``--sensors`` name it; ``modality``: the kind of sensor, by which estimators
-    say what they use; ``count``: how many things were seen; ``is_motion``: whether it tells how the robot moves.
+    ``sensor``: its channel, as in a log and in ``--sensors``. ``modality``: the kind of sensor, by which estimators declare what
+    they use. ``count``: number of detections. ``is_motion``: whether it measures the robot's motion.
     """
 
     @property
@@ -25,7 +25,7 @@ class Measurement(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No measurement: time has passed, and the trajectory is wanted at this stamp."""
+    """A time at which the causal trajectory is evaluated."""
 
     sensor: ClassVar[str] = "tick"
     modality: ClassVar[str] = "tick"

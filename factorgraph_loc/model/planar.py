@@ -1,4 +1,4 @@
-"""Poses in space laid onto the floor, and how the axes of a file or a sensor stand: what is lost that way is told."""
+"""Projection of three-dimensional poses onto the floor, and conventions for the axes of files and sensors."""
 
 import math
 from pathlib import Path
@@ -14,17 +14,17 @@ from factorgraph_loc.files.models import FileModel
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
-RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: told of from here on, refused from there on
-TILT = math.radians(10.0)  # of the robot's z axis against the world's: told of from here on
+RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a warning and for an error
+TILT = math.radians(10.0)  # of the robot's z axis against the world's: limit for a warning
 NEGLIGIBLE = 1e-9  # of an axis
-UNIT = 0.01  # what the length of a quaternion may be off
+UNIT = 0.01  # tolerance of the norm of a quaternion
 NAMED = {"body": "x y z", "optical": "z -x -y"}
 
 Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
 
 
 def _matrix(text: str) -> Array:
-    """The axes that ``text`` names (3, 3), a row each."""
+    """The matrix (3, 3) of the axes that ``text`` names, one per row."""
     signs = NAMED.get(text, text).split()
     return np.array(
         [[(1.0 - 2.0 * s.startswith("-")) * (s.removeprefix("-") == axis) for axis in "xyz"] for s in signs]
@@ -35,7 +35,7 @@ def _axes(text: str) -> str:
     rows = _matrix(text)
     if rows.shape != (3, 3) or round(float(np.linalg.det(rows))) != 1:
         raise ValueError(
-            f"expected {', '.join(NAMED)}, or the three axes that point ahead, left and up, right-handed, such as 'z -x -y'"
+            f"expected {', '.join(NAMED)}, or the three axes that point forward, left and up, right-handed, such as 'z -x -y'"
         )
     return text
 
@@ -44,35 +44,34 @@ Axes = Annotated[str, AfterValidator(_axes)]
 
 
 class Mounting(FileModel):
-    """How a sensor is turned on the robot: about the robot's x axis by ``roll``, then about y by ``pitch`` (down where positive),
-    then about z by ``yaw`` (to the left)."""
+    """Orientation of a sensor on the robot: rotations about x by ``roll``, y by ``pitch`` (down is positive), z by ``yaw``."""
 
     roll: Angle = 0.0
     pitch: Angle = 0.0
     yaw: Angle = 0.0
 
     def rotation(self) -> Array:
-        """The sensor's axes (3, 3) in the robot's frame."""
+        """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
         return np.asarray(Rotation.from_euler("xyz", (self.roll, self.pitch, self.yaw)).as_matrix())
 
 
 class Turned(FileModel):
-    """``axes``: which axes of the source point ahead, left and up: ``body`` (x, y, z), ``optical`` (z, -x, -y), or such a list.
-    ``mounting``: how what is measured is turned on the robot."""
+    """Axes and mounting of a source. ``axes``: the axes that point forward, left and up: ``body`` (x, y, z), ``optical`` (z, -x,
+    -y), or such a list. ``mounting``: the orientation of the measured frame on the robot."""
 
     axes: Axes | None = None
     mounting: Mounting = Mounting()
 
     def is_given(self) -> bool:
-        """Whether anything is said of it."""
+        """Whether axes or mounting are set."""
         return self.axes is not None or self.mounting != Mounting()
 
     def standing(self) -> Array:
-        """The source's axes (3, 3) as ahead, left and up."""
+        """The rotation (3, 3) from the source's axes to forward, left and up."""
         return _matrix(self.axes or "body")
 
     def turned(self) -> Array:
-        """The rotation (3, 3) from the source's axes to those of the robot."""
+        """The rotation (3, 3) from the source's axes to the robot frame."""
         return self.mounting.rotation() @ self.standing()
 
 
@@ -80,13 +79,13 @@ AS_IT_IS = Turned()
 
 
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
-    """Rotations (N, 3, 3) of quaternions (N, 4) as x, y, z, w; InputError at one that is no unit quaternion."""
+    """Rotations (N, 3, 3) of quaternions (N, 4), (x, y, z, w); InputError if one is not a unit quaternion."""
     require_unit(source, rows, quaternions)
     return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
 
 
 def require_unit(source: object, rows: Integers, quaternions: Array) -> None:
-    """InputError at one of the quaternions (N, 4) that is no unit one."""
+    """InputError if one of the quaternions (N, 4) is not a unit quaternion."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     bad = np.flatnonzero(~(np.abs(length - 1.0) <= UNIT))
@@ -98,11 +97,10 @@ def require_unit(source: object, rows: Integers, quaternions: Array) -> None:
 def on_floor(
     source: object, positions: Array, rotations: Array | None, warnings: list[str], turned: Turned = AS_IT_IS
 ) -> Array:
-    """Poses (N, 3) on the floor of positions (N, 3) and rotations (N, 3, 3), where there are any: x, y, and the direction of the
-    robot's x axis, seen from above.
+    """Planar poses (N, 3) of positions (N, 3) and optional rotations (N, 3, 3): x, y and the direction of the robot's x axis.
 
-    A line goes to ``warnings`` where they rise by more than :data:`RISE` or tilt by more than :data:`TILT`. InputError where they
-    rise by more than :data:`MOST` and no ``axes`` are given: then y and z may be meant otherwise.
+    A line is added to ``warnings`` if heights differ by more than :data:`RISE` or the robot tilts by more than :data:`TILT`.
+    InputError if heights differ by more than :data:`MOST` and no ``axes`` are given, as y and z may be swapped then.
     """
     places = positions @ turned.standing().T
     poses = np.column_stack((places[:, :2], np.zeros(len(places))))
@@ -115,23 +113,21 @@ def on_floor(
     rise = float(np.ptp(places[:, 2])) if len(places) else 0.0
     if rise > MOST and turned.axes is None:
         raise InputError(
-            f"{source}: poses rise by {rise:.1f} m, expected a robot on a floor (at most {MOST:g} m): axes says which axes point "
-            'ahead, left and up, "body" where it is x, y and z'
+            f"{source}: the height of poses varies by {rise:.1f} m, expected a robot on a floor (at most {MOST:g} m); set axes "
+            'to the axes that point forward, left and up, or to "body" if these are x, y and z'
         )
-    told = [f"rise by {rise:.2f} m"] if rise > RISE else []
+    told = [f"vary in height by {rise:.2f} m"] if rise > RISE else []
     told += [f"tilt by up to {math.degrees(tilt):.0f} degrees"] if tilt > TILT else []
     if told:
-        warnings.append(
-            f"{source}: poses {' and '.join(told)}, which is left out: axes and mounting say how they stand"
-        )
+        warnings.append(f"{source}: poses {' and '.join(told)}, which is ignored; check axes and mounting")
     return poses
 
 
 def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Array:
-    """Turn rates (N,) about the robot's z axis of rates (N, 3) about those of a sensor, which stand on the robot as ``turned``
-    (3, 3).
+    """Turn rates (N,) about the robot's z axis from rates (N, 3) about the axes of a sensor with rotation ``turned`` (3, 3).
 
-    InputError at a rate that is needed and no finite number."""
+    InputError if a rate that is needed is not finite.
+    """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():
         if len(bad := np.flatnonzero(~np.isfinite(rates[:, i]))):

@@ -1,4 +1,4 @@
-"""What a run leaves behind: the causal estimates, the final trajectory, and what was counted and timed on the way."""
+"""The result of a run: causal estimates, final trajectory, diagnostics and timings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from factors.se2 import Array
 class Timings:
     """Wall-clock times.
 
-    ``update_t`` (M,) [s from the log's start]: stamps with an exteroceptive measurement; ``update_ms`` (M,): what each took,
-    the ``estimate()`` after it included. ``causal_seconds``: the whole causal loop, odometry and ticks included;
-    ``real_time_factor``: the log's span over that. ``final_seconds``: the making of the final trajectory.
-    ``peak_memory_mb``: the largest resident memory of the process so far, in 10^6 bytes. ``frontend_seconds``: before the loop,
-    how long it took until the features of ``images`` were there, found or from the cache.
+    ``update_t`` (M,) [s from the log's start]: timestamps with an exteroceptive measurement; ``update_ms`` (M,): time of each
+    update, including the following ``estimate()``. ``causal_seconds``: the whole causal loop, including odometry and ticks;
+    ``real_time_factor``: the log's duration divided by that. ``final_seconds``: time to compute the final trajectory.
+    ``peak_memory_mb``: peak resident memory of the process so far, in 10^6 bytes. ``frontend_seconds``: time to detect the
+    features of ``images``, or to load them from the cache, before the loop.
     """
 
     update_t: Array
@@ -38,12 +38,11 @@ class Timings:
 
 @dataclass(frozen=True)
 class RunResult:
-    """One log run by one estimator.
+    """The result of one estimator on one log.
 
-    ``config``: the effective configuration as plain values, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3),
-    ``covariances`` (N, 3, 3) in the world's frame and ``status`` (N) are the causal estimates on the grid of ticks;
-    ``final`` is the best estimate of the whole past. ``causal_space``, ``final_space``: the same in space, of an estimator that
-    knows it.
+    ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
+    the world frame and ``status`` (N) are the causal estimates at the ticks; ``final`` is the estimate from the whole log.
+    ``causal_space``, ``final_space``: the same in three dimensions, if the estimator has them.
     """
 
     log: str
@@ -63,7 +62,7 @@ class RunResult:
 
     @property
     def max_gap(self) -> float:
-        """The time [s] between estimates that are interpolated where they are scored."""
+        """The longest time [s] between estimates across which scoring interpolates."""
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:
@@ -72,7 +71,7 @@ class RunResult:
         return int(found[0]) if len(found) else None
 
     def causal(self) -> Trajectory | None:
-        """The causal estimates from the first localized one on, or None if there is none."""
+        """The causal estimates from the first localized one, or None if there is none."""
         first = self.first_localized()
         if first is None:
             return None

@@ -1,7 +1,7 @@
-"""What the robot carries, and what we believe about it, read from and written to ``NAME.rig.toml``.
+"""The robot's sensors with their mounting and noise, read from and written to ``NAME.rig.toml``.
 
-Each sensor has its own section, whose class its package registers. Every number has its unit in the description; the bounds are
-there to catch wrong units (degrees for radians, mm for m).
+Each sensor has its own section, registered by its package. Descriptions state units; bounds reject wrong units (degrees for
+radians, mm for m).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ S = TypeVar("S", bound=FileModel)
 
 
 class Rig(FileModel):
-    """A robot: the sensors that estimators use by default, and the settings of each, as attributes by the names of the sections:
-    None of a sensor that it has not."""
+    """A robot: the sensors that estimators use by default, and the settings of each as an attribute with the section's name, None
+    if the robot lacks the sensor."""
 
     name: str = "rig"
     sensors: tuple[str, ...] = ("odometry", "bearing_range")
@@ -42,33 +42,33 @@ class Rig(FileModel):
             return partial(MOVED[name], self)
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
-        """The settings of a class, of the ``section`` if a rig may have several of that class; None if it has none."""
+        """The settings of class ``kind``, or None; ``section`` selects one if several have the same class."""
         found: S | None = getattr(self, section or _SECTIONS[kind])
         return found
 
     def of(self, kind: type[S], section: str | None = None) -> S:
-        """Those of :meth:`find`; InputError if it has none."""
+        """As :meth:`find`; InputError if the rig lacks the section."""
         found = self.find(kind, section)
         if found is None:
             raise InputError(f"the rig {self.name} has no [{section or _SECTIONS[kind]}]")
         return found
 
     def estimated(self, section: str) -> Estimated:
-        """Which constants of a sensor are learnt on the way; none of one that it has not."""
+        """The constants of a sensor that are estimated; none if the rig lacks the sensor."""
         found = getattr(self, section)
         return found.estimated() if isinstance(found, SensorSettings) else NOTHING
 
     def time_offset(self, channel: str) -> float:
-        """Seconds to add to the stamps of a channel."""
+        """Seconds to add to the timestamps of a channel."""
         settings = getattr(self, _CLOCKS.get(channel, ""), None)
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """The same, read from a file in ``folder``, where files that it names are."""
+        """A copy whose file references are relative to ``folder``."""
         return self.model_copy(update={name: found.placed(folder) for name, found in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files that it names into the ``folder`` of its own."""
+        """Write the files that the rig refers to into ``folder``."""
         for found in self._of_sensors().values():
             found.write_beside(folder)
 
@@ -77,7 +77,7 @@ class Rig(FileModel):
 
 
 _KINDS: dict[str, type[FileModel]] = {name: load(section.kind) for name, section in sections().items()}
-_SECTIONS = {kind: name for name, kind in reversed(_KINDS.items())}  # the first of those of one class
+_SECTIONS = {kind: name for name, kind in reversed(_KINDS.items())}  # the first one if several have the same class
 _CLOCKS = sections_of_channels()
 add_fields(
     Rig,

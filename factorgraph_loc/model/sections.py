@@ -1,6 +1,6 @@
-"""What registered sensors add to a rig and to a world: sections and layers by name, each with its class.
+"""The rig sections and world layers that sensors register.
 
-Classes and functions are named by their places, ``package.module:name``, and loaded when they are first used.
+Classes and functions are given as places, ``package.module:name``, and loaded when they are first used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from factorgraph_loc.text import plain
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a rig. ``kind``: its class, a :class:`~factorgraph_loc.files.models.FileModel`; ``always``: whether a rig that
-    does not say it has the default one."""
+    """A section of a rig. ``kind``: its class, a :class:`~factorgraph_loc.files.models.FileModel`; ``always``: whether a rig
+    without the section gets the default one."""
 
     kind: Place
     always: bool = False
@@ -24,12 +24,11 @@ class Section:
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of a world, things by name. ``kind``: the class of one, a :class:`~factorgraph_loc.files.models.FileModel`;
-    ``table``: the description of the table that may hold many of them.
+    """A layer of a world: elements by name. ``kind``: the class of an element, a
+    :class:`~factorgraph_loc.files.models.FileModel`; ``table``: the description of a table that may hold many of them.
 
-    ``read``: ``(content, source, folder) -> things``, of what stands in the file of a world in ``folder``, such as the name of a
-    table; ``write``: ``(things, world's file without suffixes) -> what stands there in place of them``, or None; ``suffix``: of the
-    tables that they read and write.
+    ``read``: ``(content, source, folder) -> elements`` converts the content of a world file in ``folder``, such as the name of a
+    table. ``write``: ``(elements, path of the world file without suffixes) -> content``, or None. ``suffix``: of these tables.
     """
 
     kind: Place
@@ -47,7 +46,7 @@ class _Channel(Protocol):
 
 
 class Sensor(Protocol):
-    """What is asked of a registered sensor here."""
+    """The part of a registered sensor that is used here."""
 
     @property
     def channels(self) -> Sequence[_Channel]: ...
@@ -59,7 +58,7 @@ class Sensor(Protocol):
 
 @cache
 def registered() -> Mapping[str, Sensor]:
-    """The sensors by name, ours first. InputError if one of another package cannot be loaded, or if two bring the same name."""
+    """The registered sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
     found: dict[str, Sensor] = dict(SENSORS)
     owners: dict[tuple[str, str], str] = {}
     for name, sensor in found.items():
@@ -72,14 +71,14 @@ def registered() -> Mapping[str, Sensor]:
 
 
 def sections() -> dict[str, Section]:
-    """The sections of a rig by name, in the order in which they are written: what belongs to no channel comes last."""
+    """The sections of a rig by name in the order in which they are written; those without a channel come last."""
     found = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
     return {name: found[name] for name in sorted(found, key=lambda name: name not in used)}
 
 
 def sections_of_channels() -> dict[str, str]:
-    """The section of the rig that tells the clock of a channel, by the channel's name."""
+    """The rig section of each channel."""
     return {channel.name: channel.section for sensor in registered().values() for channel in sensor.channels}
 
 

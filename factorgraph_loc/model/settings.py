@@ -1,4 +1,4 @@
-"""What the settings of all sensors have in common."""
+"""Base class of the rig settings of sensors."""
 
 from pathlib import Path
 from typing import ClassVar, Self
@@ -9,19 +9,19 @@ from factorgraph_loc.model.variable import Estimated
 
 
 class SensorSettings(FileModel):
-    """The section of a sensor in a rig. ``time_offset`` [s] is added to its stamps. ``constants``: the names of those that may be
-    learnt on the way; the section's ``uncertainty`` has a field for each that can be, its standard deviation."""
+    """The section of a sensor in a rig. ``time_offset`` [s] is added to its timestamps. ``constants``: names of the calibration
+    constants that may be estimated; the section's ``uncertainty`` holds their standard deviations."""
 
     constants: ClassVar[tuple[str, ...]] = ()
     time_offset: Seconds = 0.0
 
     def estimated(self) -> Estimated:
-        """Which of its ``constants`` are learnt on the way."""
+        """The constants that are estimated."""
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def placed(self, folder: Path) -> Self:
-        """The same, of a rig whose file is in ``folder``."""
+        """A copy whose file references are relative to ``folder``, which holds the rig's file."""
         return self
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files that it names into the ``folder`` of the rig's file."""
+        """Write the files that the settings refer to into ``folder``, which holds the rig's file."""

@@ -1,4 +1,4 @@
-"""What every estimator is made from."""
+"""The common arguments of all estimators."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from factorgraph_loc.model.world import World
 
 @dataclass(frozen=True)
 class Setup:
-    """What every estimator is made from: robot, map, the sensors it may use, and its own random generator."""
+    """The common arguments of all estimators: robot, map, usable sensors, and a random generator of their own."""
 
     rig: Rig
     world: World
@@ -22,5 +22,5 @@ class Setup:
 
 
 MapUse = Literal["known", "extended", "unknown"]
-# which uncertain constants of sensors an estimator learns: all, those that may differ from particle to particle, or none
+# which uncertain constants an estimator learns: all, those that may differ between particles, or none
 Calibration = Literal["all", "particles", "none"]

@@ -1,4 +1,4 @@
-"""Bounded numbers of what is simulated."""
+"""Bounded numbers for simulation settings."""
 
 from typing import Annotated
 

@@ -12,16 +12,16 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.measurement import Measurement
 from factors.se2 import Array
 
-SEEN = 2  # the rank of streams of what is seen; lower ones tell how the robot moves
+SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
 
 
 @dataclass(frozen=True)
 class Stream:
-    """The rows of one sensor, as columns; ``t`` (N,) in seconds from the log's start, by the sensor's own clock.
+    """The rows of one channel as columns; ``t`` (N,) in seconds from the start of the log, by the sensor's clock.
 
-    Rows stand in the order in which they arrived; a stamp may be a little older than the one before (a late measurement).
-    ``rank``: of rows of one time, those of the stream with the lowest come first: 0 of wheel odometry, 1 of other motion. ``kind``:
-    the class of its measurements, made of a stamp and a value of each column.
+    Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
+    timestamps: 0 for wheel odometry, 1 for other motion. ``kind``: class of the measurements, constructed from a timestamp and
+    the columns.
     """
 
     rank: ClassVar[int] = SEEN
@@ -29,27 +29,27 @@ class Stream:
     t: Array
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """What the rows tell, in their order, each a measurement of its own; ``offset`` [s] is added to their stamps."""
+        """One measurement per row; ``offset`` [s] is added to the timestamps."""
         return map(self.kind, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def _columns(self) -> Iterator[Any]:
         return (getattr(self, field.name) for field in fields(self)[1:])
 
     def begun_anew(self) -> Self:
-        """The same of a robot that was put down at its first row, wherever it was before."""
+        """The stream of a robot that was placed at its first row, without any motion before it."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
-        """The first row of each run of equal stamps, and the one after its last."""
+        """First and end row of each run of equal timestamps."""
         return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
 
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """Rows of which those of one stamp are one measurement, made of names (K,) and arrays (K,)."""
+    """A stream in which the rows of one timestamp form one measurement, made of names (K,) and arrays (K,)."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """What the rows tell, in their order; ``offset`` [s] is added to their stamps."""
+        """One measurement per timestamp; ``offset`` [s] is added to the timestamps."""
         for i, j in self.scans():
             parts = (column[i:j] for column in self._columns())
             values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
@@ -67,7 +67,7 @@ def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
 def joined(first: Stream, second: Stream) -> Stream:
     if type(first) is not type(second):
         kinds = f"{type(first).__name__} and one with {type(second).__name__}"
-        raise InputError(f"a log with {kinds} cannot be joined, expected tables of one kind")
+        raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
     columns = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(first)}
     both: dict[str, Any] = {
         k: np.concatenate((a, b)) if isinstance(a, np.ndarray) else [*a, *b] for k, (a, b) in columns.items()

@@ -1,4 +1,4 @@
-"""How well a surveyed position is known."""
+"""Uncertainty of a surveyed position."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ from factors.se2 import Array
 
 def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, float, float]:
     xx, xy, yy = value
-    # of a singular matrix the determinant may round to a little below zero
+    # rounding may make the determinant of a singular matrix slightly negative
     if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + 1e-9):
         raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
     return value
@@ -21,7 +21,7 @@ Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_posi
 
 
 def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Array:
-    """The covariance (2, 2) [m^2] of a position with ``sigma`` [m] in x and y, or with (xx, xy, yy) in place of it."""
+    """The covariance (2, 2) [m^2] of a position, from (xx, xy, yy) if given, else from the standard deviation ``sigma`` [m]."""
     if covariance is None:
         return sigma**2 * np.eye(2)
     xx, xy, yy = covariance

@@ -1,4 +1,4 @@
-"""When a run tells its estimates: on a grid of 10 Hz from its start on, but not inside long gaps between measurements."""
+"""The ticks of a run: a grid of 10 Hz from its start, except in long gaps between measurements."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -6,42 +6,41 @@ from collections.abc import Iterable, Iterator
 from factorgraph_loc.errors import InputError
 
 RATE = 10  # Hz
-TICK_GAP = 60.0  # s without any measurement, above which there are no ticks
-SHORTEST, LONGEST = 1.0, 86400.0  # s that may be set
-TOLERANCE = 1e-6  # of a tick: one that rounding put behind the last measurement counts
+TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
+SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
+TOLERANCE = 1e-6  # fraction of a tick, for rounding at the last measurement
 
 
 def check_tick_gap(gap: float) -> None:
-    """InputError if that is no length of gaps without ticks."""
+    """InputError if ``gap`` is out of bounds."""
     if not SHORTEST <= gap <= LONGEST:
         raise InputError(f"tick_gap is {gap:g}, expected {SHORTEST:g} to {LONGEST:g} s")
 
 
 class Ticks:
-    """The ticks of a run that begins at ``start``, as measurements arrive.
+    """The ticks of a run that starts at ``start``, generated as measurements arrive.
 
-    A tick comes after all measurements that arrived up to its time. There is none between two measurements, of any sensor, that
-    lie more than ``gap`` [s] apart; the grid goes on behind them. So what a hole costs, of a clock that jumps or of a robot that is
-    switched off, does not grow with its length.
+    A tick follows all measurements that arrived up to its time. Gaps of more than ``gap`` [s] between measurements (of all
+    sensors) have no ticks; the grid continues after them. So the cost of a gap does not grow with its length.
     """
 
     def __init__(self, start: float, gap: float = TICK_GAP) -> None:
         self._start, self._gap = start, gap
         self._newest = start
-        self._next = 0  # number of the next tick on the grid
-        self.count = 0  # ticks that there were
-        self.skipped: list[tuple[float, float]] = []  # begin and end [s] of gaps without ticks
+        self._next = 0  # index of the next tick on the grid
+        self.count = 0  # number of ticks so far
+        self.skipped: list[tuple[float, float]] = []  # start and end [s] of gaps without ticks
 
     @property
     def seconds(self) -> float:
-        """How long it has been since the start, without gaps."""
+        """Time since the start, without gaps."""
         return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
 
     def before(self, t: float) -> Iterable[float]:
-        """The ticks that come before a measurement at ``t``, which is the next to arrive."""
+        """The ticks before the next measurement, which is at ``t``."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
             self._newest = t
-            return ()  # as with most rows of odometry
+            return ()  # the usual case for odometry
         return self._before(t)
 
     def _before(self, t: float) -> Iterator[float]:
@@ -49,7 +48,7 @@ class Ticks:
             yield from self.rest()
             self.skipped.append((self._newest, t))
             self._next = max(self._next, math.floor((t - self._start) * RATE) - 1)
-            for _ in range(3):  # rounding of large numbers: the first that is not before
+            for _ in range(3):  # find the first tick that is not before `t` despite rounding
                 self._next += self._start + self._next / RATE < t
         self._newest = max(self._newest, t)
         while (tick := self._start + self._next / RATE) < t:

@@ -1,4 +1,4 @@
-"""Stamped planar poses with covariances; interpolation; the TUM text format."""
+"""Planar trajectories with covariances, interpolation, and the TUM text format."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +16,8 @@ from factors.se2 import Array, Integers
 
 @dataclass(frozen=True)
 class Trajectory:
-    """``t`` (N,) seconds, strictly increasing; ``poses`` (N, 3) robot in world; ``covariances`` (N, 3, 3) of (x, y, heading) in
-    the world's frame, or None. ``has_heading`` is False where the source's heading means nothing and is not scored."""
+    """A planar trajectory: ``t`` (N,) seconds, strictly increasing; ``poses`` (N, 3) of the robot in the world; ``covariances``
+    (N, 3, 3) of (x, y, heading) in the world frame, or None. ``has_heading`` is False if the headings are meaningless."""
 
     t: Array
     poses: Array
@@ -28,13 +28,13 @@ class Trajectory:
         if self.poses.shape != (len(self.t), 3):
             raise ValueError(f"poses have shape {self.poses.shape}, expected ({len(self.t)}, 3)")
         if len(self.t) > 1 and not np.all(np.diff(self.t) > 0.0):
-            raise ValueError("stamps of a trajectory must increase")
+            raise ValueError("timestamps of a trajectory must increase")
 
     def __len__(self) -> int:
         return len(self.t)
 
     def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
-        """Poses (M, 3) at times ``t`` (M,), along the arc between neighbours; NaN outside and in gaps above ``max_gap``."""
+        """Poses (M, 3) at times ``t`` (M,), interpolated on SE(2); NaN outside and in gaps longer than ``max_gap``."""
         out = np.full((len(t), 3), np.nan)
         if len(self.t) == 0:
             return out
@@ -45,8 +45,8 @@ class Trajectory:
         return out
 
     def covariances_at(self, t: Array, *, max_gap: float = np.inf) -> Array:
-        """Covariances (M, 3, 3) at times ``t`` (M,), averages of those of the neighbours by how near they are; NaN outside and in
-        gaps above ``max_gap``. ValueError for a trajectory without covariances."""
+        """Covariances (M, 3, 3) at times ``t`` (M,), interpolated linearly; NaN outside and in gaps longer than ``max_gap``.
+        ValueError if the trajectory has no covariances."""
         if self.covariances is None:
             raise ValueError("the trajectory has no covariances")
         out = np.full((len(t), 3, 3), np.nan)
@@ -58,8 +58,8 @@ class Trajectory:
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
-    """Of times ``t`` (M,) the ``stamps`` (N,), ascending, N > 0, between which they lie: their indices, twice the same where a time
-    is a stamp; what share of the way there; and whether a time lies inside, and not in a gap above ``max_gap``."""
+    """Bracket times ``t`` (M,) in sorted ``stamps`` (N,), N > 0: the indices before and after, which are equal at a stamp, the
+    fraction between them, and whether a time is inside and not in a gap longer than ``max_gap``."""
     t = np.asarray(t, dtype=float)
     after = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
     before = np.where(stamps[after] == t, after, np.maximum(after - 1, 0))
@@ -70,7 +70,7 @@ def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integ
 
 
 def averaged(covariances: Array, before: Integers, after: Integers, fraction: Array) -> Array:
-    """Covariances (M, D, D) between neighbours among ``covariances`` (N, D, D): see :func:`neighbours`."""
+    """Covariances (M, D, D) interpolated in ``covariances`` (N, D, D): see :func:`neighbours`."""
     weight = fraction[:, None, None]
     return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
 
@@ -78,8 +78,8 @@ def averaged(covariances: Array, before: Integers, after: Integers, fraction: Ar
 def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
     """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
 
-    InputError names file and row of what is not so, and of a stamp that is not after the one before; and where poses rise by more
-    than :data:`factorgraph_loc.model.planar.MOST`.
+    InputError names file and row if a row is invalid or timestamps do not increase; also if heights vary by more than
+    :data:`factorgraph_loc.model.planar.MOST`.
     """
     rows, t_ns, table = read_tum_rows(Path(path))
     poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), [])
@@ -91,8 +91,8 @@ def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> T
 
 
 def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
-    """The rows of a TUM file in any order: their line numbers (N,), stamps (N,) in nanoseconds, and (N, 7) x, y, z [m] and
-    the quaternion x, y, z, w."""
+    """The rows of a TUM file in any order: line numbers (N,), timestamps (N,) in nanoseconds, and (N, 7) x, y, z [m] and the
+    quaternion x, y, z, w."""
     rows: list[int] = []
     stamps: list[int] = []
     values: list[list[float]] = []
@@ -110,7 +110,7 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
             raise bad_field(path, "row", line.strip(), "8 finite numbers", row=row) from None
         rows.append(row)
     if not rows:
-        raise InputError(f"{path}: holds no poses, expected at least one row")
+        raise InputError(f"{path}: contains no poses, expected at least one row")
     table = np.array(values)
     bad = np.flatnonzero(~np.all(np.isfinite(table), axis=1))
     if len(bad):
@@ -122,7 +122,7 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
 
 
 def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a TUM file with absolute stamps in decimal seconds."""
+    """Write a TUM file with absolute timestamps in decimal seconds."""
     rows = []
     for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
         t_ns = t0_ns + round(t * 1e9)
@@ -133,7 +133,7 @@ def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
 
 
 def nanoseconds(stamp: str) -> int:
-    """A stamp in decimal seconds as nanoseconds, without losing those of an absolute time."""
+    """A timestamp in decimal seconds as nanoseconds, exact for absolute times."""
     whole, _, fraction = stamp.partition(".")
     if whole.lstrip("+-").isdigit() and (fraction == "" or fraction.isdigit()):
         ns = int((fraction + "000000000")[:9])

@@ -1,4 +1,4 @@
-"""Stamped poses in space, of cameras and robots that do not stay on a floor."""
+"""Trajectories in three dimensions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from factors.se2 import Array, Integers
 
 @dataclass(frozen=True)
 class Trajectory3:
-    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world's frame;
-    ``covariances`` (N, 6, 6) of an estimate: of the perturbation in the robot's frame, turn first, then shift."""
+    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world frame;
+    ``covariances`` (N, 6, 6) of a perturbation in the robot frame, rotation before translation."""
 
     t: Array
     positions: Array
@@ -25,17 +25,17 @@ class Trajectory3:
     def __post_init__(self) -> None:
         if self.positions.shape != (len(self.t), 3) or self.rotations.shape != (len(self.t), 3, 3):
             raise ValueError(
-                f"positions {self.positions.shape}, rotations {self.rotations.shape}, expected those of {len(self.t)} stamps"
+                f"positions {self.positions.shape}, rotations {self.rotations.shape}, expected those of {len(self.t)} timestamps"
             )
         if len(self.t) > 1 and not np.all(np.diff(self.t) > 0.0):
-            raise ValueError("stamps of a trajectory must increase")
+            raise ValueError("timestamps of a trajectory must increase")
 
     def __len__(self) -> int:
         return len(self.t)
 
     def at(self, t: Array) -> Trajectory3:
-        """The poses at times ``t`` (M,), which must lie between the first and the last stamp: straight between neighbours, turning
-        evenly; covariances, if there are any, averaged by how near they are."""
+        """The poses at times ``t`` (M,), which must lie between the first and the last timestamp. Positions and covariances are
+        interpolated linearly, rotations by slerp."""
         t = np.asarray(t, dtype=float)
         before, after, fraction, _ = neighbours(self.t, t, np.inf)
         covariances = None if self.covariances is None else averaged(self.covariances, before, after, fraction)
@@ -47,15 +47,15 @@ class Trajectory3:
         return Trajectory3(t, positions, rotations.reshape(-1, 3, 3), covariances)
 
     def spans(self, t: Array, *, max_gap: float) -> NDArray[np.bool_]:
-        """Which of the times ``t`` (M,) lie between the first and the last stamp, and not in a gap above ``max_gap``."""
+        """Which of the times ``t`` (M,) lie between the first and the last timestamp and not in a gap longer than ``max_gap``."""
         return neighbours(self.t, t, max_gap)[3]
 
     def rows(self, which: Integers) -> Trajectory3:
-        """Some of the poses."""
+        """The poses with indices ``which``."""
         covariances = None if self.covariances is None else self.covariances[which]
         return Trajectory3(self.t[which], self.positions[which], self.rotations[which], covariances)
 
     def planar(self) -> Trajectory:
-        """The same seen from above: (x, y) and the direction of the first axis."""
+        """The planar trajectory: (x, y) and the direction of the robot's x axis."""
         headings = np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
         return Trajectory(self.t, np.column_stack((self.positions[:, :2], headings)))

@@ -1,4 +1,4 @@
-"""Bounded numbers of settings, with their units; the bounds are there to catch wrong units (degrees for radians, mm for m)."""
+"""Bounded numbers of settings with their units; the bounds reject wrong units (degrees for radians, mm for m)."""
 
 import math
 from typing import Annotated
@@ -6,8 +6,8 @@ from typing import Annotated
 from pydantic import Field
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
-Scale = Annotated[float, Field(ge=0.2, le=5.0, description="true over reported")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
+Scale = Annotated[float, Field(ge=0.2, le=5.0, description="true divided by reported")]
 Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
 Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
 Noise = Annotated[float, Field(ge=0.0, le=5.0)]

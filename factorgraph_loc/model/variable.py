@@ -1,4 +1,4 @@
-"""Constants of a sensor that an estimator learns."""
+"""Sensor constants that are estimated."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Estimated:
-    """Constants of a sensor that an estimator learns, as changes from the rig's values.
+    """The constants of a sensor that are estimated, as corrections to the rig's values.
 
-    ``names`` (P,): of the constants; ``indices`` (P,): their places among all that could be; ``sigmas`` (P,): their priors'.
+    ``names`` (P,): their names; ``indices`` (P,): their indices among all constants; ``sigmas`` (P,): prior standard deviations.
     """
 
     names: tuple[str, ...]
@@ -24,13 +24,13 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Those of ``names`` whose uncertainty is above zero."""
+        """Those of ``names`` whose uncertainty is positive."""
         sigmas = np.array([getattr(uncertainty, name, 0.0) for name in names])
         indices = tuple(np.flatnonzero(sigmas).tolist())
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 
     def full(self, values: Array, count: int) -> Array:
-        """``values`` (..., P) among all ``count`` constants, the others zero."""
+        """``values`` (..., P) inserted among all ``count`` constants; the others are zero."""
         out = np.zeros((*np.shape(values)[:-1], count))
         out[..., list(self.indices)] = values
         return out

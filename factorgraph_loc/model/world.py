@@ -1,7 +1,6 @@
-"""What is around the robot, read from and written to ``NAME.world.toml``: layers of things by name, whose classes the packages of
-sensors register, points that cameras see, and walls.
+"""The map, read from and written to ``NAME.world.toml``: layers of named elements registered by sensors, points, and walls.
 
-Many tags are better kept in a table beside it, ``NAME.tags.csv``; points that a camera sees always are, as ``NAME.points.parquet``.
+A layer may be kept in a table next to the file, such as ``NAME.tags.csv``; points always are, in ``NAME.points.parquet``.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ L = TypeVar("L", bound=FileModel)
 
 
 class World(FileModel):
-    """A map. ``points``: what a camera sees. ``walls``: segments (x1, y1, x2, y2) [m]. Layers, such as ``landmarks`` by name as
-    measurements name them and RFID ``tags`` by EPC, hold what was surveyed, as it was surveyed."""
+    """A map. ``points``: points that cameras see. ``walls``: segments (x1, y1, x2, y2) [m]. Layers hold surveyed elements by
+    name, for example ``landmarks``, and RFID ``tags`` by EPC."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
@@ -36,17 +35,17 @@ class World(FileModel):
         def __getattr__(self, layer: str) -> Any: ...
 
     def of(self, kind: type[L]) -> dict[str, L]:
-        """The layer of things of a class."""
+        """The layer whose elements have class ``kind``."""
         found: dict[str, L] = getattr(self, next(name for name, other in _KINDS.items() if other is kind))
         return found
 
     def position(self, name: str, layer: str | None = None) -> Array | None:
-        """Position (2,) of a thing of a ``layer``, by default the first; None if the map lacks it."""
+        """Position (2,) of an element of ``layer``, by default the first layer; None if it is not in the map."""
         found = getattr(self, layer or next(iter(_KINDS))).get(name)
         return None if found is None else np.array((found.x, found.y))
 
     def positions(self, layer: str | None = None) -> Array:
-        """Positions (K, 2) of all things of a ``layer``, by default the first, in the order of the map."""
+        """Positions (K, 2) of all elements of ``layer``, by default the first layer, in the order of the map."""
         things = getattr(self, layer or next(iter(_KINDS))).values()
         return np.array([(thing.x, thing.y) for thing in things]).reshape(-1, 2)
 

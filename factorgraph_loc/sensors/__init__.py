@@ -1,4 +1,4 @@
-"""A package for each sensor: its measurement, stream, settings, map, simulation, calibration and summary."""
+"""One package per sensor: its measurement, stream, settings, map layer, simulation, calibration and summary."""
 
 __all__ = [
     "base",

@@ -1,9 +1,9 @@
-"""What a sensor and an estimator know of each other.
+"""The interface between sensors and estimators.
 
-A sensor that is bound to one run turns a measurement, and a view of the estimate, into observations. An estimator applies these,
-each before the next is asked for, and lets the sensor judge each correction first. An observation tells of the pose at one time
-and of named blocks (constants of a sensor, positions of landmarks); it can be linearised, which makes it a factor of a graph and a
-correction of a Gaussian, and weighed over poses. Neither side knows the other by name.
+A sensor that is bound to a run turns a measurement and a view of the estimate into observations. The estimator applies each
+before it asks for the next, and lets the sensor judge each correction first. An observation depends on the pose at one time and
+on named blocks (constants of a sensor, positions of landmarks). It can be linearised, as a factor of a graph or a correction of a
+Gaussian, and evaluated as a likelihood over poses. Neither side depends on the other's implementation.
 """
 
 from __future__ import annotations
@@ -30,10 +30,8 @@ from factors.update import CONVERGED, Correction, Sightings, update_state
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of a graph, with the names of the ``blocks`` that it depends on beside the pose, in the order of its values.
-
-    ``rows``: how many residuals it has.
-    """
+    """A factor of a graph and the names of the ``blocks`` that it depends on besides the pose, in the order of its values.
+    ``rows``: number of residuals."""
 
     factor: Factor
     blocks: tuple[str, ...]
@@ -41,11 +39,10 @@ class Term:
 
 
 class Observation(Protocol):
-    """What a measurement, or a part of it, tells of the pose at one time and of named blocks. It never changes.
+    """The information of a measurement, or a part of it, on the pose at one time and on named blocks. Immutable.
 
-    ``t`` [s]: when that was measured; ``found``: how many things were seen, of which 0 is a silence. ``is_judged``: whether the
-    sensor wants to judge its correction. ``iterations``: how often it must be linearised,
-    None where the estimator chooses.
+    ``t`` [s]: time of the measurement; ``found``: number of detections, 0 if there are none. ``is_judged``: whether the sensor
+    judges the correction. ``iterations``: number of linearisations, None if the estimator decides.
     """
 
     @property
@@ -58,11 +55,11 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def things(self) -> frozenset[Hashable]:
-        """Names of what was seen."""
+        """Identifiers of the detected things."""
 
     @property
     def terms(self) -> Sequence[Term]:
-        """The same as factors of a graph."""
+        """The observation as factors of a graph."""
 
     @property
     def blocks(self) -> tuple[str, ...]:
@@ -76,32 +73,32 @@ class Observation(Protocol):
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """What it makes of a Gaussian: ``pose`` (3,) and the ``values`` of the blocks by name.
+        """The correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks by name.
 
-        ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation and whose
-        ``columns`` are those of each block; what else is in it follows by correlation. ``iterations``: how often it is
-        linearised.
+        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose;
+        ``columns``: the components of each block. Other components are corrected by their correlation. ``iterations``: number of
+        linearisations.
         """
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
-        """Its log-likelihood (N,) up to a constant, for ``poses`` (N, 3) and ``values`` (N, P) of blocks; others are as
-        the rig has them."""
+        """Log-likelihood (N,) up to a constant for ``poses`` (N, 3) and block ``values`` (N, P); other blocks have the rig's
+        values."""
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Observation:
-        """The same as an observation of the pose alone, with its blocks at ``values``; their covariances ``spreads`` widen the
-        noise."""
+        """The observation as a function of the pose only, with the blocks fixed at ``values``; their covariances ``spreads`` are
+        added to the noise."""
 
     def at_its_time(self) -> Observation | None:
-        """The same as an observation of the pose at its own time; None where it does not tell of other places."""
+        """The observation on the pose at its own time, independent of poses at other times; None if that is impossible."""
 
 
 @dataclass(frozen=True)
 class NewVariable:
-    """A block that begins now: the position of a landmark that was seen for the first time.
+    """A new block: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``mean`` (d,): where it is seen to be; ``by_pose`` (d, 3) and ``by_block`` (d, P) by name: its Jacobians; ``noise`` (d, d): its
-    covariance from the measurement alone. ``sightings``: the observations that told it, each with the time of the pose that it
-    hangs on; none of a block that begins with a prior, which ``mean`` and ``noise`` are then.
+    ``mean`` (d,): initial estimate; ``by_pose`` (d, 3) and ``by_block`` (d, P) by name: its Jacobians; ``noise`` (d, d):
+    covariance from the measurement alone. ``sightings``: the observations used, each with the time of its pose. A block with a
+    prior has none; ``mean`` and ``noise`` are the prior then.
     """
 
     name: str
@@ -112,8 +109,8 @@ class NewVariable:
     sightings: tuple[tuple[float, Observation], ...]
 
     def joint(self, covariance: Array, columns: Mapping[str, slice]) -> tuple[Array, Array]:
-        """Its covariance (d, S) with an error state of ``covariance`` (S, S), of which the blocks have these ``columns``, and that
-        of itself (d, d). Blocks that are not there are exact."""
+        """Its covariance (d, S) with an error state of ``covariance`` (S, S), and its own covariance (d, d). ``columns``:
+        components of each block in the error state; missing blocks are exact."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
         jacobian[:, :3] = self.by_pose
         for name, block in self.by_block.items():
@@ -125,10 +122,10 @@ class NewVariable:
 
 @dataclass(frozen=True)
 class Binding:
-    """What a sensor is bound to: a run, the ``motion`` of its robot, and where to report.
+    """What a sensor is bound to: a run, the robot's ``motion`` and the diagnostics.
 
-    ``use``: what the map's landmarks are taken for, and ``points`` its points; ``calibration``: which uncertain constants the
-    estimator learns.
+    ``use``: how landmarks of the map are used, ``points``: how its points are used; ``calibration``: which uncertain constants
+    the estimator learns.
     """
 
     setup: Setup
@@ -140,11 +137,11 @@ class Binding:
 
 
 class View(Protocol):
-    """What an estimator shows a sensor while it observes: the estimate as it is after all that was applied.
+    """The current estimate as shown to a sensor, including all observations applied so far.
 
-    ``t`` [s]: the time of the pose that observations hang on; ``offset``: the motion from there to the measurement, None where it
-    is the same time. ``pose`` (3,) with body-frame ``covariance`` (3, 3): as expected at ``t``. ``newest``: whether no later pose
-    was estimated; ``localized``: whether the place is known.
+    ``t`` [s]: time of the pose that observations refer to; ``offset``: the motion from there to the measurement, None if the
+    times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): predicted at ``t``. ``newest``: whether there is no
+    later pose; ``localized``: whether the robot is localized.
     """
 
     @property
@@ -160,22 +157,22 @@ class View(Protocol):
     @property
     def covariance(self) -> Array: ...
     def value(self, name: str) -> Array | None:
-        """The estimate (d,) of a block; None where there is none of that name."""
+        """The estimate (d,) of a block, or None if there is no such block."""
 
     def spread(self, name: str) -> Array:
-        """The covariance (d, d) of a block that there is."""
+        """The covariance (d, d) of an existing block."""
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:
-        """The covariance (S, S) of the error state, and the columns of each block that it holds."""
+        """The covariance (S, S) of the error state, and the columns of its blocks."""
 
     def poses_at(self, times: Array) -> Array:
-        """Where the robot was at these times (R,), in the frame of the pose at ``t``, (R, 3)."""
+        """Poses (R, 3) at times (R,) relative to the pose at ``t``."""
 
 
 class Finder(Protocol):
-    """Finds the pose from what a sensor sees, without a prediction: for an unknown start and for a robot that was carried away.
+    """Finds the pose from the measurements of one sensor without a prediction, for an unknown start or a kidnapped robot.
 
-    ``start``: where the robot began, while only its heading is sought. ``at_once``: one measurement may tell the place.
+    ``start``: the known start position if only the heading is sought. ``at_once``: whether one measurement may be enough.
     """
 
     start: KnownPosition | None
@@ -185,45 +182,47 @@ class Finder(Protocol):
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry at the last measurement that told something."""
+        """The odometry state at the last informative measurement."""
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
-        """Places at that time, the likeliest first."""
+        """Hypotheses of the pose at that time, most likely first."""
 
     @property
     def best(self) -> PosePrior | None:
-        """The one place that is clear, None where there is none."""
+        """The pose if it is unambiguous, else None."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Take a measurement while no place is known; False where it tells nothing."""
+        """Process a measurement while the robot is not localized; False if it is uninformative."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at that time, drawn from what is known of it."""
+        """Poses (N, 3) at that time, sampled from the hypotheses."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Keep what is about to be applied to a track, of which ``view`` shows what was expected."""
+        """Record an observation that is about to be applied to a track; ``view`` shows the prediction."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Since when the track must have been wrong, after a measurement was applied to it; None where nothing tells that.
+        """The time since which the track must have been wrong, checked after a measurement was applied; None if it is not
+        refuted.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the track at the measurement; ``best`` tells where the robot is.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement; ``best`` returns the pose found
+        instead.
         """
 
     def clear(self) -> None:
-        """Forget what was seen of a track: another begins, or it is trusted."""
+        """Discard the history: a new track starts, or the current one is trusted."""
 
 
 class Sensor:
-    """A sensor of the world around the robot, bound to one run. What is here holds for one that has nothing of the kind.
+    """A sensor of the robot's surroundings, bound to one run. The defaults are those of a sensor without the feature in question.
 
-    ``modality``: of the measurements that it takes. ``constants``: those that are estimated, as a block named after the modality;
-    ``follows_constants``: whether their covariance is needed on the way, and not at the end alone. ``finder``: tells the place by
-    itself. ``bounds`` (2, 2) [m]: lower and upper corner of where the robot may be, of a sensor that only tells how likely a place
-    is. ``evidence_every`` [s]: how often its measurements tell something new of a place. ``lost``: why a track is given up.
+    ``modality``: of its measurements. ``constants``: those that are estimated, as a block named after the modality;
+    ``follows_constants``: whether their covariance is needed during the run. ``finder``: localizes without a prediction.
+    ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may be, for a sensor that can only weigh poses.
+    ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
 
-    Of graphs: ``keyframe_every`` [s]: how often a measurement gets a pose of its own; ``gathers``: whether observations wait on the
-    newest pose until the next one, to become few factors then; ``solve_every`` [s]: how long they may wait for the solver.
+    For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
+    when the next pose begins; ``solve_every`` [s]: longest delay of a solver update.
     """
 
     modality: ClassVar[str]
@@ -238,58 +237,58 @@ class Sensor:
     bounds: Array | None = None
 
     def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable]:
-        """What a measurement tells; each is applied before the next is asked for."""
+        """The observations of a measurement; each is applied before the next is requested."""
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Report the innovation, of which ``view`` shows what was expected; False where the observation must not be applied."""
+        """Report the innovation, with the prediction in ``view``; False if the observation must not be applied."""
         return True
 
     def evidence(self, m: Any) -> Observation | None:
-        """What a measurement tells of the pose without any prediction; nothing is counted. None for one that is of no use there."""
+        """The information of a measurement on the pose without a prediction; nothing is counted. None if it has none."""
         return None
 
     @property
     def suspicious_since(self) -> float | None:
-        """Since when [s] the track does not explain what is seen; None if all is well."""
+        """Time [s] since which the track does not explain the measurements; None if it does."""
         return None
 
     @property
     def silent(self) -> bool:
-        """Whether nothing is seen where something should be."""
+        """Whether nothing is detected although something should be."""
         return False
 
     def accept(self) -> None:
-        """The track is right all the same: the model or the map is not."""
+        """Accept the track although it was suspicious: the model or the map is wrong instead."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
-        """Observations on one pose as few factors."""
+        """Merge the observations on one pose into few factors."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """A factor of this sensor for the final solution: with what is known by then, and its robust loss ``width`` times as wide
-        as it is. None where it is left out while that is more than once, as it has many optima."""
+        """A factor of this sensor for the final solution, with its robust loss ``width`` times as wide. None to leave a
+        multimodal factor out while ``width`` is above 1."""
         return factor
 
     def rewind(self, t: float) -> None:
-        """Forget what came after ``t``: it will come once more."""
+        """Forget what came after ``t``; it will be processed again."""
 
     def restart(self, t: float) -> None:
-        """A new track begins at ``t``: what was seen from then on will come once more."""
+        """Start a new track at ``t``; later measurements will be processed again."""
 
 
 @dataclass(frozen=True)
 class ResidualObservation:
-    """An observation by factors that are residuals (:class:`~factors.update.Sightings`), of one sensor.
+    """An observation made of residual factors (:class:`~factors.update.Sightings`) of one sensor.
 
-    Its log-likelihood is that of the factors, pose by pose: a sensor that is to be fast with particles has one of its own.
+    Its log-likelihood is evaluated pose by pose; sensors that need speed with particles override it.
     """
 
     t: float
     terms: tuple[Term, ...]
     is_judged: ClassVar[bool] = True
     iterations: ClassVar[int | None] = None
-    settled: ClassVar[float] = CONVERGED  # m, rad: a step that needs no further one
+    settled: ClassVar[float] = CONVERGED  # m, rad: convergence limit of a step
 
     @property
     def found(self) -> int:
@@ -313,7 +312,7 @@ class ResidualObservation:
 
     @property
     def dof(self) -> int:
-        """How many numbers were measured."""
+        """Number of measured values."""
         return sum(factor.dof() for factor in self.factors)
 
     def correct(

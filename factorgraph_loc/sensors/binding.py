@@ -1,4 +1,4 @@
-"""The sensors of a run, bound to it."""
+"""Binding of the sensors of a run."""
 
 from typing import cast
 
@@ -10,7 +10,7 @@ from factorgraph_loc.sensors.registry import functions
 
 
 def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bool = False) -> Motion:
-    """The sensor of a run that predicts."""
+    """The motion sensor of a run."""
     _, predict = next(functions("predict"))
     return cast(Motion, predict(setup.rig, setup.sensors, diagnostics, self_calibration=self_calibration))
 
@@ -24,8 +24,8 @@ def bound_sensors(
     points: MapUse = "known",
     calibration: Calibration = "all",
 ) -> dict[str, Sensor]:
-    """The sensors of a run that see the world around the robot, by the modality of their measurements. ``use``: what the map's
-    landmarks are taken for, and ``points`` its points."""
+    """The exteroceptive sensors of a run by modality. ``use``: how landmarks of the map are used, ``points``: how its points are
+    used."""
     binding = Binding(setup, motion, diagnostics, use, points, calibration)
     sensors: list[Sensor | None] = [bind(binding) for _, bind in functions("bind")]
     return {sensor.modality: sensor for sensor in sensors if sensor is not None}

@@ -1,4 +1,4 @@
-"""How a sensor is calibrated: what its package brings to the engine in :mod:`factorgraph_loc.calibration`."""
+"""The interface by which sensor packages take part in :mod:`factorgraph_loc.calibration`."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,19 +15,19 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factors.se2 import Array
 
-BLOCK = 20.0  # s; errors in one block may be correlated
-BLOCKS = 5  # stretches of time of a single log, each predicted by the others
+BLOCK = 20.0  # s; errors within a block may be correlated
+BLOCKS = 5  # folds of a single log in cross-validation
 
 
 class Unit(NamedTuple):
-    """Parameters that are judged together: a section of the rig, and its fields."""
+    """Parameters that are accepted or rejected together: fields of one section of the rig."""
 
     section: str
     fields: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The fields with their section."""
+        """The fields, prefixed by their section."""
         return tuple(f"{self.section}.{name}" for name in self.fields)
 
 
@@ -36,8 +36,8 @@ State = frozenset[Unit]
 
 @dataclass(frozen=True)
 class Settled:
-    """What is learnt of a sensor with some of its constants: ``sections`` of the rig, the ``constants``, ``notes`` of one line each
-    on what could not be learnt, and ``details`` for its report."""
+    """The result for a sensor with a given set of constants: ``sections`` of the rig, the ``constants``, ``notes`` (one line
+    each) on what could not be learnt, and ``details`` for its report."""
 
     sections: Mapping[str, Any] = field(default_factory=dict)
     constants: Sequence[Learnt] = ()
@@ -47,8 +47,8 @@ class Settled:
 
 @dataclass(frozen=True)
 class Told:
-    """What a report tells of one sensor: ``found`` and ``details`` of its calibrator, None without; ``learnt``: the rig with all
-    that was learnt, ``rig``: with what is accepted; ``trial``: of its noise, None without."""
+    """The input of a sensor's report: ``found`` and ``details`` of its calibrator, or None; ``learnt``: the rig with all learnt
+    values, ``rig``: with the accepted ones; ``trial``: of its noise, or None."""
 
     logs: tuple[str, ...]
     found: Any
@@ -60,15 +60,14 @@ class Told:
 
 
 class Calibrator:
-    """How one sensor is calibrated.
+    """The calibration of one sensor.
 
-    ``section``: of the rig; ``channel``: whose stream a log must have; ``senses``: whether a robot knows its place by it.
-    ``noise``: what is learnt for the constants that remain; ``models``: the same, judged after what differs between runs;
-    ``uncertain``: the constants that an estimator can learn on each run, with the most that the rig takes; ``together``:
-    constants that are judged together where both are learnt; ``units``: of the constants; ``first``: settings of a sensor of
-    which nothing is known. ``estimator``: which judges, where it cannot be the EKF; ``folds``: into how many parts a single log
-    is cut, and in how many stretches each is judged. ``is_consistent``: whether its noise is made such that the estimator is as
-    sure as it may be, and ``judged_unseen``: by runs with what other logs tell, as its models have many parameters.
+    ``section``: of the rig; ``channel``: the stream that a log must have; ``senses``: whether the robot can be localized by it.
+    ``noise``: parameters learnt after the constants; ``models``: parameters judged after those that differ between runs;
+    ``uncertain``: the constants that an estimator can learn on each run, with the rig's upper bounds; ``together``: constants
+    that are judged together; ``units``: of the constants; ``first``: settings of an unknown sensor. ``estimator``: used for
+    judging if the EKF cannot be; ``folds``: number of parts of a single log, and of segments of each. ``is_consistent``: whether
+    the noise is scaled to a consistent estimator. ``judged_unseen``: whether models are judged on held-out logs only.
     """
 
     section: ClassVar[str]
@@ -86,90 +85,90 @@ class Calibrator:
     judged_unseen: ClassVar[bool] = False
 
     def recordings(self, logs: Sequence[Log]) -> list[int]:
-        """The number of what each log recorded: of logs that hold the same measurements one is no test of the other."""
+        """An identifier of the recording of each log; logs with the same measurements cannot validate each other."""
         return list(range(len(logs)))
 
     def check_alike(self, first: Log, log: Log) -> None:
-        """InputError if two logs cannot be of one robot."""
+        """InputError if two logs cannot be of the same robot."""
 
     def learn(self, logs: Sequence[Log], rig: Rig, grids: Path | None, like: Any) -> Any:
-        """What ``logs`` tell before an estimator runs, None if nothing.
+        """Learn from ``logs`` what needs no estimator; None if there is nothing to learn.
 
-        ``grids``: path and beginning of the names of files that may be written; ``like``: what was found from all logs, where these
-        are some of them. InputError if a log is too short.
+        ``grids``: path and name prefix of files that may be written; ``like``: the result from all logs if these are some of
+        them. InputError if a log is too short.
         """
         raise NotImplementedError
 
     def settle(
         self, found: Any, logs: Sequence[Log], rig: Rig, accepted: Collection[str] | None, *, by_log: bool
     ) -> Settled:
-        """What is learnt with those constants alone that are worth it and ``accepted``, by their names with the section's; None:
-        all that are worth it. Unless ``by_log``, no log is looked at alone."""
+        """The result with only those worthwhile constants that are in ``accepted`` (names with the section); None: all worthwhile
+        ones. Without ``by_log``, individual logs are not examined."""
         raise NotImplementedError
 
     def constant_units(self, _found: Any, kept: Sequence[Learnt], _learnt: Rig, _start: Rig) -> dict[Unit, float]:
-        """What is judged of the constants that were ``kept``, with what the fits gain by it."""
+        """The units of the constants that were ``kept``, with the gain of the fits by each."""
         groups: dict[str, list[Learnt]] = {}
         for c in kept:
             groups.setdefault(next((names[0] for names in self.together if c.name in names), c.name), []).append(c)
         return {Unit(self.section, tuple(c.name for c in some)): sum(c.gain for c in some) for some in groups.values()}
 
     def optional(self, _learnt: Rig) -> tuple[Unit, ...]:
-        """What is tried last, and is not used unless it pays."""
+        """Units that are tried last and used only if they improve the result."""
         return ()
 
     def settings(self, rig: Rig) -> Any:
-        """The section of a rig, or the first one."""
+        """The section of a rig, or the initial one."""
         return getattr(rig, self.section) or self.first
 
     def mixed(self, old: Rig, new: Rig, state: State) -> dict[str, Any]:
-        """Sections with what is ``new`` of the parameters in ``state``, and ``old`` of the others."""
+        """Sections with the ``new`` values of the parameters in ``state`` and the ``old`` values of the others."""
         learnt = getattr(new, self.section)
         update = {name: getattr(learnt, name) for unit in state if unit.section == self.section for name in unit.fields}
         return {self.section: self.settings(old).model_copy(update=update)} if update else {}
 
     def usable(self, rig: Rig, _state: State) -> Rig:
-        """The rig whose sensors are those that it can use."""
+        """The rig with the sensors that this calibrator can use."""
         return rig
 
     def is_complete(self, rig: Rig) -> bool:
-        """Whether a rig has what the sensor needs, learnt or stated."""
+        """Whether a rig has everything that the sensor needs."""
         return self.channel not in rig.sensors or getattr(rig, self.section) is not None
 
     def guess(self, _found: Any) -> float:
-        """Where the search for the factor on the noise begins."""
+        """Initial guess of the noise factor."""
         return 3.0
 
     def least(self, _found: Any) -> float | None:
-        """Where it ends; None: where that of all does."""
+        """Lower bound of the noise factor; None for the common bound."""
         return None
 
     def inflated(self, rig: Rig, _factor: float) -> Rig:
-        """The rig with the sensor's standard deviations multiplied."""
+        """The rig with the sensor's standard deviations multiplied by a factor."""
         return rig
 
     def as_honest_as(self, rig: Rig, _other: Rig) -> Rig:
-        """The rig with what makes up for errors that are alike of another one."""
+        """The rig with the tempering of another one, which accounts for correlated errors."""
         return rig
 
     def honest(self, rig: Rig, factor: float | None, _other: Rig, _learnt: Rig) -> Rig:
-        """The rig with the noise that was found: by the ``factor``, as the rig ``_other`` has it; ``_learnt``: from all logs."""
+        """The rig with the final noise: scaled by ``factor``, as in ``_other``; ``_learnt``: the rig learnt from all logs."""
         return rig if factor is None or getattr(rig, self.section) is None else self.inflated(rig, factor)
 
     def judged(self, found: Any, _judgements: Mapping[str, Any]) -> Any:
-        """What was found, with what an estimator says of it, by the parameters' names."""
+        """The result with the estimator's judgement of each parameter."""
         return found
 
     def doubts(self, _found: Any, _details: Any) -> Sequence[str]:
-        """What the reader of the report should look at."""
+        """Warnings for the reader of the report."""
         return ()
 
     def document(self, _told: Told) -> Mapping[str, Any]:
-        """The sensor's part of the document for programs."""
+        """The sensor's part of the machine-readable document."""
         return {}
 
     def tables(self, _told: Told) -> Sequence[Rows]:
-        """Tables beside those of all sensors."""
+        """Additional tables."""
         return ()
 
     def told_noise(self, _told: Told) -> Sequence[str]:
@@ -177,18 +176,19 @@ class Calibrator:
         return ()
 
     def told_section(self, _told: Told) -> Sequence[str]:
-        """HTML of a section of its own."""
+        """HTML of an additional section."""
         return ()
 
     def told_residuals(self, _told: Told) -> Sequence[str]:
-        """HTML of what is left over."""
+        """HTML of the residuals."""
         return ()
 
 
 @dataclass(frozen=True)
 class ConstantsFound:
-    """``parts``: the data by log; all constants fitted together (``everything``), from ``start``; ``gain`` (P, K): see
-    :func:`~factorgraph_loc.fitting.robust.gains`; ``denied``: names of those that something else denies."""
+    """The fit of a sensor's constants. ``parts``: data per log; ``everything``: all constants fitted together, from ``start``;
+    ``gain`` (P, K): see :func:`~factorgraph_loc.fitting.robust.gains`; ``denied``: names of constants rejected for other
+    reasons."""
 
     parts: tuple[Any, ...]
     everything: Fit
@@ -198,19 +198,19 @@ class ConstantsFound:
 
 
 class ConstantsCalibrator(Calibrator):
-    """Of a sensor whose constants are fitted by least squares. The data of a log have stamps ``t`` (K,), ``residuals(settings)``
-    (K, D) in standard deviations, and can be cut into two ``halves()``."""
+    """Base class for constants fitted by least squares. The data of a log have timestamps ``t`` (K,), ``residuals(settings)`` (K,
+    D) in standard deviations, and can be split into ``halves()``."""
 
     def part(self, log: Log) -> Any:
-        """The data of a log; InputError if they are too few."""
+        """The data of a log; InputError if there are too few."""
         raise NotImplementedError
 
     def constants(self, parts: Sequence[Any], settings: Any) -> Sequence[Constant]:
-        """What may be fitted; neutral are the values of the rig."""
+        """The constants that may be fitted; their neutral values are the rig's."""
         raise NotImplementedError
 
     def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> Any:
-        """The constants of a sensor that the logs have."""
+        """Fit the constants to the logs that have the sensor."""
         if self.channel not in logs[0].streams:
             return None
         parts, settings = tuple(map(self.part, logs)), self.settings(rig)
@@ -220,17 +220,17 @@ class ConstantsCalibrator(Calibrator):
         return ConstantsFound(parts, everything, gain, everything.as_dict())
 
     def base(self, found: Any, rig: Rig, _accepted: Collection[str] | None) -> Any:
-        """What the constants are part of, with neutral ones."""
+        """The object that the constants belong to, with neutral values."""
         return self.changed(self.settings(rig), {c.name: c.neutral for c in found.everything.constants})
 
     def changed(self, base: Any, values: Mapping[str, float]) -> Any:
-        """The same with other constants."""
+        """A copy with changed constants."""
         return base.model_copy(update=dict(values))
 
     def fit(
         self, _found: Any, parts: Sequence[Any], base: Any, constants: Sequence[Constant], start: Mapping[str, float]
     ) -> Fit:
-        """The ``constants`` fitted to some of the data together, with the other constants and the noise of ``base``."""
+        """Fit ``constants`` to some of the data jointly, with the other constants and the noise of ``base``."""
         names = [c.name for c in constants]
 
         def whitened(values: Array) -> Array:
@@ -242,7 +242,7 @@ class ConstantsCalibrator(Calibrator):
     def finished(
         self, _found: Any, _logs: Sequence[Log], _rig: Rig, base: Any, learnt: Sequence[Learnt], *, by_log: bool
     ) -> Settled:
-        """With what depends on the constants; unless ``by_log`` without what is told of each log."""
+        """Complete the result with what depends on the constants; without ``by_log``, omit the results of individual logs."""
         del by_log
         return Settled({self.section: base}, learnt)
 
@@ -259,8 +259,9 @@ class ConstantsCalibrator(Calibrator):
         base = self.base(found, rig, accepted)
         pooled = self.fit(found, parts, base, kept, start) if kept else None
         base = self.changed(base, pooled.as_dict() if pooled else {})
-        # to each log alone what is kept with what an estimator could learn on each run, then what is kept, whose values come from
-        # the second fit: what is not kept may do the same as what is
+        # individual logs: kept constants plus those that an estimator could learn on each run; then the kept ones with the values
+        # of
+        # the second fit, because a rejected constant may have explained the same residuals
         learnable = [c for c in constants if c.name in self.uncertain and c.is_inside(start[c.name]) and c not in kept]
         apart = [some for some in ([*kept, *learnable] if learnable else [], kept) if some]
         alone = [

@@ -1,4 +1,4 @@
-"""What a sensor is expected to tell on a way that a robot may drive."""
+"""The interface for the expected information of a sensor along a planned path."""
 
 from typing import Protocol
 
@@ -12,18 +12,18 @@ Places = NDArray[np.int64]
 
 
 class Forecast(Protocol):
-    """Of one sensor, in a world whose map is taken as exact. ``goals`` (K, 2) [m]: places near which it tells most; none of one
-    that sees far."""
+    """The forecast of one sensor in a world whose map is exact. ``goals`` (K, 2) [m]: positions near which it is most
+    informative; empty for a sensor with long range."""
 
     goals: Array
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Fisher's information (N, 3, 3) that is expected on the body-frame perturbation of poses (N, 3), of ``ways`` (N,) metres
-        that are driven about each, or of turns that take as long."""
+        """Expected Fisher information (N, 3, 3) on the body-frame perturbation of poses (N, 3). ``ways`` (N,) [m]: distance
+        travelled at each pose; turns count by their duration."""
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Add to ``out`` (J, M) what the measurements that the first J particles might make on one path tell of each of M.
+        """Add the log-likelihoods (M,) of measurements that the first J particles might make on a path to ``out`` (J, M).
 
-        ``poses`` (S, M, 3): where they look; ``metres``: of the path, turns counted by the time that they take; ``stops`` (M,): at
-        how many of the places each gets to look. Draws are the same for all paths of one ``seed``.
+        ``poses`` (S, M, 3): where particles measure; ``metres``: length of the path, with turns by their duration; ``stops``
+        (M,): number of measurements of each particle. Random draws are the same for all paths with one ``seed``.
         """

@@ -1,7 +1,7 @@
-"""A start whose position is known and whose heading is not, for the searches of an unknown start.
+"""A start with known position and unknown heading, for the search of the pose.
 
-It is a Gaussian on the position, and uniform in the heading. Along the odometry since then it is one more constraint on the present
-pose, beside what is seen, and the place to look for hypotheses.
+The prior is Gaussian in the position and uniform in the heading. Propagated along the odometry, it is one more constraint on the
+current pose and generates hypotheses.
 """
 
 import math
@@ -15,13 +15,13 @@ from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
-HEADINGS = 72  # at which hypotheses begin
-START_KEPT = 300.0  # s that a robot may take to find its heading, for its trajectory to begin at the start
+HEADINGS = 72  # initial hypotheses
+START_KEPT = 300.0  # s to find the heading for the trajectory to include the start
 
 
 @dataclass
 class KnownPosition:
-    """The start; see the module."""
+    """A start with known position; see the module."""
 
     prior: PosePrior
     motion: Motion
@@ -29,11 +29,11 @@ class KnownPosition:
 
     @property
     def odometry(self) -> ChainState:
-        """That at the time of the prior, by all rows that have come by now, or by the time that it was settled."""
+        """The odometry state at the time of the prior, from all rows so far or until it was settled."""
         return self.motion.state(self.t) if self._odometry is None else self._odometry
 
     def settle(self) -> None:
-        """At the first measurement: the odometry of before has come."""
+        """Fix the odometry at the start; called at the first measurement."""
         self._odometry = self.odometry
 
     @property
@@ -41,26 +41,26 @@ class KnownPosition:
         return self.prior.t
 
     def facing(self, heading: float) -> PosePrior:
-        """The start as a Gaussian, once its heading was found: what was seen is still to tell how well it is known."""
+        """The start as a Gaussian with a given heading."""
         covariance = self.prior.covariance.copy()
         covariance[2, 2] = math.pi**2
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
 
     def mode(self, now: ChainState) -> Mode:
-        """The moments of the present pose, before anything was seen."""
+        """Moments of the current pose before any measurement."""
         x, y, turned = self.motion.relative(self.odometry, now).delta
         covariance = self.prior.covariance.copy()
-        covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # it went that way, in any direction
+        covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # displacement in an unknown direction
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Present poses (N, 3) of a robot that began at the mean, with evenly spread headings."""
+        """Current poses (N, 3) from the mean position with evenly spaced headings."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Present poses (N, 3), drawn; of their headings one in each of ``count`` equal parts."""
+        """Random current poses (N, 3), with stratified headings."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -68,33 +68,33 @@ class KnownPosition:
         return se2.compose(poses, se2.exp(positive.draws(moved.covariance, count, rng)))
 
     def loss(self, poses: Array, now: ChainState, spread: Array | None = None) -> Array:
-        """Half the squared Mahalanobis distance (N,) of present poses (N, 3) from it. ``spread`` (3, 3): body-frame covariance by
-        which these poses may be off themselves."""
+        """Half the squared Mahalanobis distance (N,) of current poses (N, 3) from the start. ``spread`` (3, 3): body-frame
+        covariance of the current poses."""
         error, _, covariance = self._linearized(poses, now, spread)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
     def log_density(self, poses: Array, now: ChainState) -> Array:
-        """Log of the density (N,) of present poses (N, 3)."""
+        """Log density (N,) of current poses (N, 3)."""
         _, _, covariance = self._linearized(poses, now, None)
         normaliser = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1] + math.log(2.0 * math.pi)
         return np.asarray(-self.loss(poses, now) - normaliser)
 
     def normal_equations(self, poses: Array, now: ChainState, spread: Array | None = None) -> tuple[Array, Array]:
-        """Information (N, 3, 3) and gradient (N, 3) of the loss, by the body-frame perturbation of present poses (N, 3)."""
+        """Information (N, 3, 3) and gradient (N, 3) of the loss by the body-frame perturbation of current poses (N, 3)."""
         error, jacobian, covariance = self._linearized(poses, now, spread)
         weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
     def whitened(self, pose: Array, now: ChainState) -> tuple[Array, Array, Array]:
-        """Residual (2,) of a present pose (3,) in standard deviations of the position, its Jacobian (2, 3) by the body-frame
-        perturbation, and the covariance (3, 3) of the odometry since, which is not in them."""
+        """Residual (2,) of a current pose (3,) in standard deviations of the position, its Jacobian (2, 3) by the body-frame
+        perturbation, and the covariance (3, 3) of the odometry since the start, which they do not include."""
         error, jacobian, _ = self._linearized(pose[None], now, None)
         root = positive.root(self.prior.covariance[:2, :2])
         moved = self.motion.relative(self.odometry, now)
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
     def _linearized(self, poses: Array, now: ChainState, spread: Array | None) -> tuple[Array, Array, Array]:
-        """Where poses (N, 3) have begun, less the mean (N, 2); its Jacobian (N, 2, 3); and the covariance (N, 2, 2) of it."""
+        """Start positions of poses (N, 3) minus the mean (N, 2), their Jacobian (N, 2, 3), and covariance (N, 2, 2)."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)
         error = se2.compose(poses, back)[:, :2] - self.prior.pose[:2]

@@ -1,4 +1,4 @@
-"""What is drawn of a sensor: the things of the map that it finds, and when it reads or sees them."""
+"""What is drawn of a sensor: map elements, and the times of their detection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,10 +12,10 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """A ``layer`` of the map: ``names`` (K) of its things and ``positions`` (K, 3) [m], where estimators take them to be.
+    """A ``layer`` of the map: ``names`` (K) of its elements and ``positions`` (K, 3) [m].
 
-    ``t`` (N,) [s of the log], ``seen`` (N) names: what is read or seen when. ``marker``, ``size``, ``order``: how matplotlib draws
-    them, the lowest order first. ``dense``: there are too many to tell one from the other, as of the points of images.
+    ``t`` (N,) [s of the log], ``seen`` (N) names: detections. ``marker``, ``size``, ``order``: matplotlib style, lowest order
+    first. ``dense``: whether there are too many elements to label.
     """
 
     layer: str
@@ -30,5 +30,5 @@ class Marks:
 
 
 def marks(log: Log) -> list[Marks]:
-    """What all sensors draw of a log and its map."""
+    """The marks of all sensors for a log and its map."""
     return [draw(log) for _, draw in functions("draw")]

@@ -1,4 +1,4 @@
-"""The measurements that this project's own sensors report."""
+"""Unions of the measurement types of this project's sensors."""
 
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
@@ -8,4 +8,4 @@ from factorgraph_loc.sensors.twist.measurement import Twist
 from factorgraph_loc.vision.frame import CameraFrame
 
 Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist
-Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # what tells of the world around the robot
+Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # measurements of the robot's surroundings

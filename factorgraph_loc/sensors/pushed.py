@@ -1,4 +1,4 @@
-"""Measurements from a running program: checked and copied, so that whoever made them may use the arrays again."""
+"""Validation of measurements pushed by a program; they are copied, so that the caller may reuse its arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ M = TypeVar("M", bound=Measurement)
 
 @cache
 def kinds() -> Mapping[type[Any], Channel]:
-    """The classes of measurements, and a channel that yields each."""
+    """The measurement classes, each with a channel that has it."""
     found: dict[type[Any], Channel] = {}
     for channel in channels().values():
         for place in channel.measurements:
@@ -29,15 +29,15 @@ def kinds() -> Mapping[type[Any], Channel]:
 
 
 def channel_of(m: object) -> Channel:
-    """The channel that yields measurements of this class; InputError if it is no measurement."""
+    """The channel of a measurement's class; InputError if it is not a measurement."""
     if type(m) not in kinds():
         known = ", ".join(kind.__name__ for kind in kinds())
-        raise InputError(f"{type(m).__name__} is no measurement, expected one of {known}")
+        raise InputError(f"{type(m).__name__} is not a measurement, expected one of {known}")
     return kinds()[type(m)]
 
 
 def checked(m: M) -> M:
-    """The same measurement with arrays of its own; InputError names the first field that cannot be, its value, and what can."""
+    """A validated copy of a measurement; InputError names the first invalid field, its value and the expected values."""
     channel = channel_of(m)
     t = seconds_of(type(m).__name__, m.t)
     where = f"{type(m).__name__} at {t:.3f} s"
@@ -47,8 +47,7 @@ def checked(m: M) -> M:
 
 
 def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
-    """The fields of a measurement that has those of a table: a number each, or, where several rows are one measurement, names, of
-    which each has a row, and arrays (K,)."""
+    """The fields of a measurement that match the columns of a table: numbers, or names and arrays (K,) if it has several rows."""
     table = _table_of(type(m), channel)
     count: int | None = None
     for column in table.columns[1:]:

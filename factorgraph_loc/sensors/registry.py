@@ -1,9 +1,9 @@
-"""The sensors: what each brings, and which of them a name is of.
+"""The registry of sensors and their channels.
 
-A sensor is a package. Its ``__init__`` has a :class:`SensorType` that names the classes and functions of its modules by their
-places, ``package.module:name``, so that asking what there is imports nothing else; :func:`factorgraph_loc.plugins.load` does. Ours
-stand in :mod:`factorgraph_loc.builtin`. Another package registers one by an entry point of the group ``factorgraph_loc.sensors``
-whose value is the place of its :class:`SensorType`.
+A sensor is a package whose ``__init__`` defines a :class:`SensorType`. It refers to classes and functions of its modules by place,
+``package.module:name``, so that they are imported only when needed (:func:`factorgraph_loc.plugins.load`). Built-in sensors are
+listed in :mod:`factorgraph_loc.builtin`; other packages register the place of their :class:`SensorType` as an entry point of the
+group ``factorgraph_loc.sensors``.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,20 +20,18 @@ from factorgraph_loc.text import quoted
 
 @dataclass(frozen=True)
 class Channel:
-    """A name in ``--sensors``, and of a log's streams.
+    """A name in ``--sensors`` and of a log's streams.
 
-    ``streams``, ``measurements``: the classes that a stream of this name may have, and what it yields. Both are empty of a channel
-    that only says how the rows of another one are used, as ``rssi`` and ``phase`` do of those of ``rfid``: they are columns of it
-    (``column_of``). ``rows``: what its rows are called. ``section``: the one of the rig that has the ``time_offset`` of its stamps,
-    without which it tells nothing if it ``needs_section``. ``motion``: whether it tells how the robot moves on a floor or in space,
-    or how it turns.
+    ``streams``, ``measurements``: the classes of its streams and measurements. Both are empty for a channel that selects columns
+    of another one (``column_of``), as ``rssi`` and ``phase`` do for ``rfid``. ``rows``: a plural for its rows. ``section``: the
+    rig's section with the ``time_offset``; ``needs_section``: whether the channel is useless without it. ``motion``: whether it
+    measures motion on a floor or in space, or rotation.
 
-    ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of those in which a log keeps it; ``described``: of
-    further ones, such as what its measurements hold where that is not what the tables do. Where a stream's fields are no columns:
-    ``assemble``: ``(rows by table, reading) -> stream``, ``disassemble``: ``(stream, writing) -> columns by table``, see
-    :mod:`factorgraph_loc.sensors.tables`. Of measurements that a program pushes, where their fields are no columns: ``check``:
-    ``(measurement, where) -> fields``, checked; ``sequence``: a class, made of (rig, world), whose ``require(measurement, where)``
-    raises InputError for one that does not go with those before it.
+    ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further
+    tables, for measurements that differ from those. If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
+    stream`` and ``disassemble``: ``(stream, writing) -> columns by table``, see :mod:`factorgraph_loc.sensors.tables`. For pushed
+    measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``sequence``: a class made
+    of (rig, world) whose ``require(measurement, where)`` raises InputError if a measurement does not fit the previous ones.
     """
 
     name: str
@@ -54,27 +52,25 @@ class Channel:
 
 @dataclass(frozen=True)
 class SensorType:
-    """What a sensor brings: its ``channels``, the sections of the rig that are its ``settings``, its ``layers`` of the world, and
-    the places of its functions, "" where it has none; :func:`functions` gives those of all sensors.
+    """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
+    functions, "" for none. :func:`functions` returns those of all sensors.
 
-    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, what ``fgloc info`` says of a log; ``draw``:
-    ``(log) ->`` :class:`~factorgraph_loc.sensors.marks.Marks`, what plots and viewers draw of it.
+    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
+    :class:`~factorgraph_loc.sensors.marks.Marks`, for plots and viewers.
 
-    Of an estimator: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, None where a run does not use it;
+    For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
     ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.motion.Motion`.
 
-    Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
-    together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
-    diagnostics)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in the map
-    and the words for that nothing of it was found, or None; ``mappable``: ``(log)``, the layer of a world that ``fgloc map`` can
-    make of what it measured, or None.
+    For runs (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, raises InputError if log and settings do not fit;
+    ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use, diagnostics)``,
+    warnings at the end; ``findable``: ``(log, sensors)``, a plural for the map elements that the channels can detect and a message
+    that none was detected, or None; ``mappable``: ``(log)``, the world layer that ``fgloc map`` can make, or None.
 
-    Of simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
+    For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:
-    ``(settings)``, how often per second a drive looks for all things of a kind, by a plural for these; ValueError where the
-    settings do not fit together. Of robots that choose where to drive: ``on_robot``: ``(world, rig, settings, rng) ->``
-    :class:`~factorgraph_loc.sensors.simulated.LiveSensor` or None; ``forecast``: ``(world, rig, speed, settings) ->``
-    :class:`~factorgraph_loc.sensors.forecast.Forecast` or None.
+    ``(settings)``, the measurement rate [Hz] by plural of the detected things; ValueError if the settings are inconsistent. For
+    active robots: ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.simulated.LiveSensor` or None;
+    ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.forecast.Forecast` or None.
 
     ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
     """
@@ -101,20 +97,20 @@ class SensorType:
 
 
 def sensors() -> Mapping[str, SensorType]:
-    """All sensors by name, ours first. InputError if one of another package cannot be loaded, or if two bring the same name."""
+    """All sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
     return cast(Mapping[str, SensorType], registered())
 
 
 @cache
 def channels() -> Mapping[str, Channel]:
-    """All channels by name: what may stand in ``--sensors``."""
+    """All channels by name, as used in ``--sensors``."""
     return {channel.name: channel for sensor in sensors().values() for channel in sensor.channels}
 
 
 @cache
 def sensor_of(channel: str) -> SensorType:
-    """The sensor that a channel is of, which is also the ``sensor`` of a measurement and the name of a log's stream. InputError if
-    there is none of that name."""
+    """The sensor of a channel; ``channel`` may be the ``sensor`` of a measurement or the name of a stream. InputError if it is
+    unknown."""
     for sensor in sensors().values():
         if any(own.name == channel for own in sensor.channels):
             return sensor
@@ -122,25 +118,25 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], *motions: str) -> tuple[str, ...]:
-    """The channels among ``names`` that tell how the robot moves on the ``floor`` or in ``space``, or how it turns (``turn``)."""
+    """The channels among ``names`` that measure motion on the ``floor`` or in ``space``, or rotation (``turn``)."""
     known = channels()
     return tuple(name for name in names if name in known and known[name].motion in motions)
 
 
 def channel(name: str) -> Channel:
-    """A channel by name; InputError as of :func:`sensor_of`."""
+    """A channel by name; InputError if it is unknown."""
     return next(own for own in sensor_of(name).channels if own.name == name)
 
 
 def functions(kind: str) -> Iterator[tuple[str, Any]]:
-    """The functions of one kind, a field of :class:`SensorType`, of the sensors that have one, with their names."""
+    """Names and functions of one kind, a field of :class:`SensorType`, of the sensors that have it."""
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):
             yield name, load(place)
 
 
 def forget() -> None:
-    """Look once more for what is installed."""
+    """Search for installed sensors again at the next access."""
     SENSORS.forget()
     for function in (registered, channels, sensor_of):
         function.cache_clear()

@@ -1,4 +1,4 @@
-"""What the packages of sensors are told of a simulated drive, and what they make of it."""
+"""The interface between simulated drives and sensor packages."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,11 +16,10 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Ride:
-    """A drive through a world: the ``truth`` from t = 0 on, the ``rig`` that estimators are told, and the true ``world``.
+    """A drive through a world: the ``truth`` from t = 0, the ``rig`` given to estimators, and the true ``world``.
 
-    ``settings``: of the simulation, with the sections that sensors register. ``rng``, ``rng_of_world``: generators by the name of
-    what is drawn, of the log's seed and of the world's. ``recorded``: looks of recorded antennas that reads are drawn from, or
-    None.
+    ``settings``: of the simulation, with the sections of the sensors. ``rng``, ``rng_of_world``: random generators by name, from
+    the seeds of the log and of the world. ``recorded``: recorded reads to resample, or None.
     """
 
     settings: Any
@@ -32,14 +31,14 @@ class Ride:
     recorded: Any = None
 
     def times(self, rate: float) -> Array:
-        """Times (N,) of a sensor that measures ``rate`` times per second, the first after one period."""
+        """Times (N,) of a sensor with ``rate`` [Hz], starting after one period."""
         return times(rate, self.truth)
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a sensor's channels would have reported, by their names. ``layers``: of the world as it is surveyed, where that differs
-    from the true one; ``metadata`` and ``warnings`` of the log."""
+    """The streams of a sensor's channels. ``layers``: of the surveyed world, if it differs from the true one; ``metadata`` and
+    ``warnings`` of the log."""
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
     layers: Mapping[str, Any] = field(default_factory=dict)
@@ -48,18 +47,18 @@ class Simulated:
 
 
 class LiveSensor(Protocol):
-    """A simulated sensor of a robot that chooses where to drive: it measures ``rate`` times per second. ``decides``: whether the
-    robot asks itself after each measurement whether it knows its place by now; of one that does not it waits for another's."""
+    """A simulated sensor of an active robot with ``rate`` [Hz]. ``decides``: whether the robot checks after each measurement if it
+    is localized."""
 
     channel: str
     rate: float
     decides: bool
 
     def measure(self, t: float, pose: Array) -> Measurement:
-        """What it reports at ``t`` [s] from a pose (3,)."""
+        """The measurement at ``t`` [s] from pose (3,)."""
 
 
 def times(rate: float, truth: Trajectory) -> Array:
-    """Times (N,) of a sensor on a drive, the first after one period."""
+    """Times (N,) of a sensor on a drive, starting after one period."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))

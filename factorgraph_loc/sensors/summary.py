@@ -1,4 +1,4 @@
-"""What ``fgloc info`` says of a sensor, in the form in which each sensor's package says it."""
+"""The parts of a sensor's summary for ``fgloc info``."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A line, and the table below it where it has a ``header``: cells (R, C) of text."""
+    """A line, and a table below it if it has a ``header``: cells (R, C) of text."""
 
     line: str
     header: tuple[str, ...] = ()
@@ -16,10 +16,10 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a log holds of one sensor.
+    """The summary of one sensor in a log.
 
-    ``found``: what ``fgloc info --json`` lists, by its keys; ``in_map``: how many things of each layer of the map it can find;
-    ``problems``: what looks wrong, as lines for people; ``text``: what is printed.
+    ``found``: entries of ``fgloc info --json``; ``in_map``: number of detectable elements by map layer; ``problems``: warnings, one
+    line each; ``text``: printed paragraphs.
     """
 
     found: Mapping[str, Any] = field(default_factory=dict)

@@ -1,8 +1,7 @@
-"""From tables to streams and back, by the descriptions of their columns.
+"""Conversion between tables and streams by the descriptions of their columns.
 
-A sensor whose stream has the columns as its fields needs no more than their description, a
-:class:`~factorgraph_loc.files.columns.Table`; others say in their package how rows become a stream, the ``assemble`` of a channel,
-and a stream becomes rows, its ``disassemble``.
+A sensor whose stream fields are columns needs only a description, a :class:`~factorgraph_loc.files.columns.Table`; others define
+``assemble`` and ``disassemble`` of their channels.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """What rows are made into a stream with: the ``rig``, the absolute time of t = 0, and where warnings go."""
+    """The context of reading rows: the ``rig``, the absolute time of t = 0, and the list of warnings."""
 
     rig: Rig
     t0_ns: int
@@ -40,7 +39,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """What a stream is made into rows with: the name of its log, the absolute time of t = 0, and the ``folder`` of the tables."""
+    """The context of writing a stream: the name of its log, the absolute time of t = 0, and the ``folder`` of the tables."""
 
     log: str
     t0_ns: int
@@ -49,13 +48,13 @@ class Writing:
 
 @cache
 def tables_of(channel: Channel) -> tuple[Table, ...]:
-    """The tables in which a log keeps a channel; several of one name may stand for one another."""
+    """The tables of a channel in a log; several of one name are alternatives."""
     return tuple(load(place) for place in channel.tables)
 
 
 @cache
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
-    """The channel and the descriptions of each table of a log, by its name."""
+    """The channel and the descriptions of each table of a log, by table name."""
     return {
         table.name: (channel, tuple(other for other in tables_of(channel) if other.name == table.name))
         for channel in channels().values()
@@ -72,7 +71,7 @@ def all_tables() -> Iterator[Table]:
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The stream of a channel from the ``rows`` of its tables by their names; what is wrong is an InputError or a warning."""
+    """The stream of a channel from the ``rows`` of its tables; problems are an InputError or a warning."""
     if channel.assemble:
         made: Stream = load(channel.assemble)(rows, reading)
         return made
@@ -84,10 +83,10 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 
 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
-    """Rows as the stream of their table.
+    """The stream of a table's rows.
 
-    Rows of one stamp that are one measurement together keep the last of each name, others the last of each stamp. InputError names
-    file, row and column of what lies outside its bounds, stamps that go back, and rows in which nothing was measured.
+    If the rows of one timestamp form a measurement, the last row of each name is kept, otherwise the last row of each timestamp.
+    InputError names file, row and column of values out of bounds, decreasing timestamps, and rows without any value.
     """
     values: dict[str, Any] = dict(rows.names)
     measured = [column for column in table.columns if column.name in rows.numbers]
@@ -117,24 +116,24 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) ->
 
 
 def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
-    """In which rows (N,) no column has a number."""
+    """The rows (N,) in which no column has a number."""
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
 def _without_small(column: Column, rows: TableRows, warnings: list[str]) -> Array:
-    """The numbers (N,) of a column without those that it leaves out."""
+    """The numbers (N,) of a column, with those below its ``left_out_below`` removed."""
     values = rows.numbers[column.name]
     small = np.flatnonzero(values < column.left_out_below)
     if not len(small):
         return values
     first = f"{rows.path}:{int(rows.rows[small[0]])}: {column.name} is {values[small[0]]:g}"
-    warnings.append(f"{first}: {len(small)} {column.name}s that are not above 0 are left out")
+    warnings.append(f"{first}: {len(small)} {column.name}s that are not above 0 are skipped")
     return np.where(values >= column.left_out_below, values, np.nan)
 
 
 def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """The columns of a stream's tables by their names; files that a table names are copied into the folder. InputError where a
-    stream has none."""
+    """The columns of a stream's tables by table name; referenced files are copied into the folder. InputError if a stream has no
+    table."""
     if channel.disassemble:
         made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
         return made
@@ -148,7 +147,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 
 
 def rows_of(table: Table, stream: Stream) -> Iterator[dict[str, Any]]:
-    """The rows of a stream's table, values by the names of its columns, without stamps."""
+    """The rows of a stream's table: values by column, without timestamps."""
     names = [column.name for column in table.columns[1:]]
     columns = [getattr(stream, column.field or column.name) for column in table.columns[1:]]
     plain = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns]
@@ -156,7 +155,7 @@ def rows_of(table: Table, stream: Stream) -> Iterator[dict[str, Any]]:
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
-    """The bounds of a stream's numbers, by the names of its fields."""
+    """The columns that describe a stream's numbers, named by its fields."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream == f"{type(stream).__module__}:{type(stream).__qualname__}":
             yield from (column.measured for column in table.columns if column.kind == "number")

@@ -1,4 +1,4 @@
-"""How a run uses a sensor: what the sensors' packages are told of it, and what they make ready for it."""
+"""How a run uses a sensor."""
 
 from collections.abc import Container
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from factorgraph_loc.sensors.registry import channels
 
 @dataclass(frozen=True)
 class Use:
-    """A run of a log. ``sensors``: names of those that it may use; ``estimator``: its name, and its ``settings``; ``modalities``:
-    of measurements that it uses; ``estimates_points``: whether it may estimate points that the map lacks."""
+    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``modalities``: of
+    measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the map."""
 
     log: Log
     sensors: tuple[str, ...]
@@ -24,8 +24,8 @@ class Use:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A ``log`` that can be run: no images are left in it that are used. ``images``: of how many the features were found or
-    taken from the cache, in ``seconds``."""
+    """A ``log`` that can be run, with images replaced by features. ``images``: number of images whose features were computed or
+    loaded from the cache, in ``seconds``."""
 
     log: Log
     warnings: tuple[str, ...] = ()

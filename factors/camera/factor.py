@@ -1,4 +1,4 @@
-"""Points seen by a camera as a factor on a pose, and where they are not known, or constants of the camera are not, on those too."""
+"""The reprojection factor: points seen by a camera, on a pose and optionally on camera constants and a point."""
 
 from __future__ import annotations
 
@@ -27,20 +27,19 @@ from factors.displaced import carried, common_error, delayed, displaced
 from factors.se2 import Array
 
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
-BEHIND = 100.0  # standard deviations that a sighting of a point behind the camera is off by
+BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """K points seen in one image, as a factor on the robot's pose then or a little earlier.
+    """K points seen in one image, as a factor on the robot's pose at that time or shortly before.
 
-    ``points`` (K, 3): of the world; ``pixels`` (K, 2): where they are seen; ``point_covariances`` (K, 3, 3) of a
-    map that is not exact widen the noise. ``offset`` (3,): the pose at the image's time in the frame of the variable's pose,
-    known from odometry; ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. ``twist`` (3,): the
-    robot's velocity then.
+    ``points`` (K, 3): in the world; ``pixels`` (K, 2): measured; ``point_covariances`` (K, 3, 3) of an inexact map are added to the
+    noise. ``offset`` (3,): the pose at the image's time in the frame of the variable's pose, from odometry; its body-frame
+    covariance ``offset_covariance`` (3, 3) is added to the noise. ``twist`` (3,): the robot's velocity at that time.
 
-    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
-    constants (P,); then, where ``free``, the position (3,) of the one point, in place of ``points``.
+    The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
+    if any; and, if ``free``, the position (3,) of the one point, instead of ``points``.
     """
 
     model: CameraModel
@@ -55,11 +54,11 @@ class ReprojectionFactor:
 
     @property
     def of_pose_alone(self) -> bool:
-        """Whether its only value is the pose."""
+        """Whether the pose is its only variable."""
         return not self.estimated and not self.free
 
     def packed(self) -> pixel_kernels.Seen:
-        """As compiled code takes it, where it is a factor :attr:`of_pose_alone`."""
+        """The arguments of the compiled code, for a factor :attr:`of_pose_alone`."""
         model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
         return pixel_kernels.Seen(
             lens_of(model),
@@ -95,7 +94,7 @@ class ReprojectionFactor:
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.whitened(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -105,7 +104,7 @@ class ReprojectionFactor:
         pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
         error = (pixels - self.pixels) / self.model.sigma
         if self.free and in_camera(here.model, at, here.points)[0, 2] < NEAREST:
-            # nothing behind a camera is seen by it: no way leads from there to where it is
+            # a point behind the camera has a constant residual, as no gradient leads to its true position
             error, by_pose, by_point, by_parameters = (
                 BEHIND + 0.0 * error,
                 0.0 * by_pose,
@@ -132,15 +131,15 @@ class ReprojectionFactor:
         return displaced(error, blocks, offset, spread)
 
     def is_astray(self, pose: Array, point: Array) -> bool:
-        """Whether a free ``point`` (3,) cannot be what was seen by a robot at the variable's ``pose`` (3,): it lies behind the
-        camera, or is seen :data:`BEHIND` standard deviations away."""
+        """Whether a free ``point`` (3,) cannot be what a robot at the variable's ``pose`` (3,) saw: it is behind the camera, or
+        :data:`BEHIND` standard deviations away."""
         at = pose if self.offset is None else se2.compose(pose, self.offset)
         local = in_camera(self.model, at, point[None])
         error = (project(self.model, local) - self.pixels) / self.model.sigma
         return bool(local[0, 2] < NEAREST or np.sum(error**2) > BEHIND**2)
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> ReprojectionFactor:
-        """The factor on the pose alone, at given constants (one array (P,), or none) and position (3,) of a free point."""
+        """The factor on the pose only, at given constants (one array (P,), or none) and position (3,) of a free point."""
         if not parameters and point is None:
             return self
         model, offset = self.model, self.offset
@@ -153,13 +152,13 @@ class ReprojectionFactor:
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
 
     def dof(self) -> int:
-        """How many coordinates of pixels are measured."""
+        """Number of measured pixel coordinates."""
         return 2 * len(self.pixels)
 
 
 def _turns(estimated: tuple[int, ...], changes: Array) -> Array:
-    """How small turns (3, 3) follow from changes of the camera's turn: the left Jacobian of SO(3), which is the right one of
-    the opposite turn."""
+    """Jacobian (3, 3) of a small rotation by the corrections of the camera's rotation: the left Jacobian of SO(3), which is the
+    right one of the opposite rotation."""
     turn = np.zeros(3)
     for place, value in zip(estimated, changes.tolist(), strict=True):
         if place in (3, 4, 5):

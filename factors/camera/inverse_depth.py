@@ -1,12 +1,12 @@
-"""Points given by where they were first seen from, the direction from there, and the inverse of their depth.
+"""Inverse-depth parametrization of points.
 
 Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on Robotics 24(5), 2008, sections
-III (the parametrization and what a camera sees), IV (a new point) and VI (when it may become x, y, z). Six values: the camera's
-position (x, y, z) [m] at the first sighting, azimuth and elevation [rad] of the ray in the world, and the inverse depth [1/m]. The
-world's z axis is up here, so that the direction is singular for points straight above or below only.
+III (parametrization and measurement), IV (initialization) and VI (conversion to x, y, z). Six values: the camera's position
+(x, y, z) [m] at the first sighting, azimuth and elevation [rad] of the ray in the world, and the inverse depth [1/m]. The world's
+z axis is up here, so the direction is singular only for points straight above or below.
 
-A point that is seen for the first time has no depth, but a Gaussian of the inverse depth covers all from a nearest one
-to infinity: such a point tells of the camera's turn at once, and of its shift when it has parallax.
+A Gaussian of the inverse depth represents all depths from a minimum to infinity, so a new point gives information on the camera's
+rotation at once, and on its translation when there is parallax.
 """
 
 import numpy as np
@@ -15,12 +15,12 @@ from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.se2 import Array
 
 SIZE = 6  # values of a point
-LEAST_FLAT = 1e-6  # of a direction's horizontal part: straight up and down have no azimuth
-LINEAR = 0.1  # of the linearity index, below which x, y, z are as good (section VI)
+LEAST_FLAT = 1e-6  # minimum horizontal part of a direction; vertical directions have no azimuth
+LINEAR = 0.1  # linearity index below which x, y, z are nearly Gaussian (section VI)
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """Unit vectors (K, 3) of ``rays`` (K, 6) in the world, and how they depend on azimuth and elevation (K, 3, 2)."""
+    """Unit vectors (K, 3) of ``rays`` (K, 6) in the world, and their Jacobian (K, 3, 2) by azimuth and elevation."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -30,7 +30,7 @@ def directions(rays: Array) -> tuple[Array, Array]:
 
 
 def positions(rays: Array) -> tuple[Array, Array]:
-    """Positions (K, 3) of ``rays`` (K, 6) with inverse depths above zero, and their Jacobian (K, 3, 6)."""
+    """Positions (K, 3) of ``rays`` (K, 6) with positive inverse depths, and their Jacobian (K, 3, 6)."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -41,16 +41,15 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
-    """Pixels (K, 2) of ``rays`` (K, 6) seen from a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their
-    Jacobians by the camera's perturbation (K, 2, 6) as of :func:`~factors.camera.model.linearize_in_space`, and by the rays
-    (K, 2, 6).
+    """Pixels (K, 2) of ``rays`` (K, 6) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their Jacobians by
+    the camera's perturbation (K, 2, 6), as in :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6).
 
-    A pixel depends on the direction alone, so the inverse depth may be zero (section III).
+    A pixel depends on the direction only, so the inverse depth may be zero (section III).
     """
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5, None]
     away = rays[:, :3] - position
-    # the way to the point, times its inverse depth
+    # the vector to the point, times its inverse depth
     way = inverse * away + ahead
     pixels, by_camera, by_way = linearize_in_space(model, np.zeros(3), rotation, way)
     by_camera[..., 3:] = -inverse[:, None] * (by_way @ rotation)
@@ -64,8 +63,8 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 def begin(
     model: CameraModel, position: Array, rotation: Array, pixel: Array, inverse_depth: float
 ) -> tuple[Array, Array, Array]:
-    """The ray (6,) of a ``pixel`` (2,) seen for the first time, from a camera as of :func:`linearize`; how it depends on the
-    camera's perturbation (6, 6), and on the pixel and the inverse depth (6, 3) (section IV)."""
+    """Initialize a ray (6,) from its first ``pixel`` (2,), in a camera as in :func:`linearize`. Returns also its Jacobians by the
+    camera's perturbation (6, 6), and by the pixel and the inverse depth (6, 3) (section IV)."""
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])
     ahead = rotation @ local
@@ -90,7 +89,8 @@ def begin(
 
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
     """The linearity index (K,) of ``rays`` (K, 6) with standard deviations ``sigmas`` (K,) of their inverse depths, seen from
-    ``position`` (3,); below :data:`LINEAR` the Gaussian is one of x, y, z too (section VI). Infinite beyond infinity."""
+    ``position`` (3,), infinite for inverse depths that are not positive. Below :data:`LINEAR`, x, y, z are nearly Gaussian
+    (section VI)."""
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)
     near = inverse > 0.0

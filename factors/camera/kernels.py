@@ -1,4 +1,4 @@
-"""The arithmetic of :mod:`factors.camera.model`, compiled: one camera, many points or many poses."""
+"""Compiled kernels of :mod:`factors.camera.model`."""
 
 import math
 
@@ -8,17 +8,17 @@ import numpy as np
 from factors.se2 import Array
 
 NEAREST = 0.05  # m in front of the camera
-MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method; the length of a residual that needs no further step
-BLOCK = 256  # poses whose likelihood is found together: what is known of them stays in the fastest cache
+MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method: maximum steps, and norm of the residual at convergence
+BLOCK = 256  # poses whose likelihoods are computed together, so that their data fit into the cache
 
-# fx, fy, cx, cy, k1, k2, p1, p2, and the reciprocal of the x^2 + y^2 up to which the polynomial of the distortion is used
+# fx, fy, cx, cy, k1, k2, p1, p2, and the reciprocal of the x^2 + y^2 up to which the distortion polynomial is used
 Lens = tuple[float, ...]
 Place = tuple[tuple[float, ...], ...]
 
 
 @numba.njit(cache=True, inline="always")
 def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """The polynomial at the direction (x, y), and its derivatives xx, xy = yx and yy."""
+    """The distortion polynomial at direction (x, y), and its derivatives xx, xy = yx and yy."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     rr = x * x + y * y
     radial = 1.0 + k1 * rr + k2 * rr * rr
@@ -33,8 +33,8 @@ def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, flo
 
 @numba.njit(cache=True, inline="always")
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """The distorted direction, and its Jacobian by rows. Beyond the end of the polynomial B it goes on straight outwards, as
-    t B(x / t) with t = r / end, so that nothing far outside of the image is seen in it."""
+    """The distorted direction, and its Jacobian by rows. Beyond its valid radius the polynomial B is extrapolated radially, as
+    t B(x / t) with t = r / radius, so that nothing far outside of the image appears in it."""
     t = math.sqrt(max(1.0, k[8] * (x * x + y * y)))
     inverse = 1.0 / t
     ex, ey = inverse * x, inverse * y
@@ -48,7 +48,7 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """The pixel of a point, and how its two coordinates depend on the point."""
+    """The pixel of a point, and the gradients of its two coordinates."""
     near = 1.0 / max(p2, NEAREST)
     x, y = p0 * near, p1 * near
     xd, yd, xx, xy, yx, yy = _distorted(k, x, y)
@@ -60,7 +60,7 @@ def pixel(
 
 @numba.njit(cache=True, inline="always")
 def mounting(position: Array, rotation: Array) -> Place:
-    """The camera's place in the robot's frame, as numbers: its position, and its axes."""
+    """The camera's pose in the robot frame as numbers: position and axes."""
     p, r = position, rotation
     right, down, ahead = (r[0, 0], r[1, 0], r[2, 0]), (r[0, 1], r[1, 1], r[2, 1]), (r[0, 2], r[1, 2], r[2, 2])
     return (p[0], p[1], p[2]), right, down, ahead
@@ -70,8 +70,8 @@ def mounting(position: Array, rotation: Array) -> Place:
 def in_camera(
     place: Place, c: float, s: float, dx: float, dy: float, z: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """A point that is (dx, dy, z) from a robot with the heading (c, s): as it lies from the camera along the robot's axes, and in
-    the camera's frame."""
+    """A point at (dx, dy, z) from a robot with heading (cosine c, sine s): relative to the camera along the robot's axes, and in
+    the camera frame."""
     position, right, down, ahead = place
     ax, ay, az = c * dx + s * dy - position[0], c * dy - s * dx - position[1], z - position[2]
     lx = right[0] * ax + right[1] * ay + right[2] * az
@@ -89,7 +89,7 @@ def _huber(squared: float, scale: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def huber_losses(squared: Array, scale: float) -> Array:
-    """Of squared residuals (K,)."""
+    """Huber losses of squared residuals (K,)."""
     losses = np.empty_like(squared)
     for i in range(len(squared)):
         losses[i] = _huber(squared[i], scale)
@@ -98,19 +98,19 @@ def huber_losses(squared: Array, scale: float) -> Array:
 
 @numba.njit(cache=True, error_model="numpy")
 def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
-    """The directions (K, 2) that are distorted to ``seen`` (K, 2), where the determinant is positive, and how far off they are when
-    distorted (K,); NaN of NaN."""
+    """The directions (K, 2) that are distorted to ``seen`` (K, 2) with positive determinant, and the remaining errors (K,) of the
+    distorted directions; NaN for NaN."""
     n = len(seen)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
     for i in range(n):
-        # from the axis, where every lens is invertible, first to the direction without distortion
+        # start on the axis, where every lens is invertible, towards the direction without distortion
         x, y, step_x, step_y, share = 0.0, 0.0, seen[i, 0], seen[i, 1], 1.0
         for _ in range(MOST_STEPS):
             to_x, to_y = x + share * step_x, y + share * step_y
             xd, yd, xx, xy, yx, yy = _distorted(k, to_x, to_y)
             eu, ev, determinant = seen[i, 0] - xd, seen[i, 1] - yd, xx * yy - xy * yx
             error = math.sqrt(eu * eu + ev * ev)
-            if not (determinant > 0.0 and error < errors[i]):  # too far, or over a fold
+            if not (determinant > 0.0 and error < errors[i]):  # step too long, or over a fold
                 share *= 0.5
                 continue
             x, y, errors[i] = to_x, to_y, error
@@ -123,7 +123,7 @@ def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
 
 @numba.njit(cache=True, error_model="numpy")
 def project(k: Lens, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) of points (K, 3) in the camera's frame, and their Jacobians (K, 2, 3)."""
+    """Pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3)."""
     n = len(points)
     pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
     for i in range(n):
@@ -136,7 +136,7 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
 
 @numba.njit(cache=True, error_model="numpy")
 def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
-    """As of :func:`factors.camera.model.linearize_in_space`."""
+    """See :func:`factors.camera.model.linearize_in_space`."""
     n = len(points)
     pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
     for i in range(n):
@@ -148,7 +148,7 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
         pixels[i, 0], pixels[i, 1] = u, v
         for r in range(2):
             a, b, c = by_u if r == 0 else by_v
-            # a turn w moves the point in the camera's frame by -w x p
+            # a rotation w moves the point in the camera frame by -w x p
             by_camera[i, r, 0], by_camera[i, r, 1], by_camera[i, r, 2] = b * z - c * y, c * x - a * z, a * y - b * x
             by_camera[i, r, 3], by_camera[i, r, 4], by_camera[i, r, 5] = -a, -b, -c
             for j in range(3):
@@ -160,7 +160,7 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
 def linearize(
     k: Lens, position: Array, rotation: Array, pose: Array, points: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """As of :func:`factors.camera.model.linearize`."""
+    """See :func:`factors.camera.model.linearize`."""
     n, place = len(points), mounting(position, rotation)
     pixels, by_pose, by_point = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
     by_parameters = np.zeros((n, 2, 8))
@@ -199,7 +199,7 @@ def log_likelihood(
     whiteners: Array,
     scale: float,
 ) -> Array:
-    """As of :func:`factors.camera.model.log_likelihood`, untempered, with ``whiteners`` (K, 2, 2) of the residuals."""
+    """See :func:`factors.camera.model.log_likelihood`; untempered, with ``whiteners`` (K, 2, 2) of the residuals."""
     place = mounting(position, rotation)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])
     out = np.zeros(len(poses))
@@ -209,7 +209,7 @@ def log_likelihood(
         for i in range(len(points)):
             x, y, z, seen_u, seen_v = points[i, 0], points[i, 1], points[i, 2], pixels[i, 0], pixels[i, 1]
             uu, uv, vu, vv = whiteners[i, 0, 0], whiteners[i, 0, 1], whiteners[i, 1, 0], whiteners[i, 1, 1]
-            # poses side by side, and no other array than theirs: several are computed by one instruction
+            # the inner loop runs over poses, to vectorise
             for n in range(len(total)):
                 _, (lx, ly, lz) = in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
                 u, v, _, _ = pixel(k, lx, ly, lz)

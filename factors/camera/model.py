@@ -1,15 +1,14 @@
-"""A pinhole camera with distortion on a robot: where points are seen, and how that depends on everything.
+"""A pinhole camera with lens distortion on a robot: projection and its derivatives.
 
-The camera sits on the robot at ``rTc``; its axes are z forward, x right, y down. A point p in the camera's frame is seen at the
+The camera is mounted on the robot at ``rTc``; its axes are z forward, x right, y down. A point in the camera frame is seen at the
 pixel (fx x + cx, fy y + cy) of its distorted direction (x, y), with radial and tangential distortion (k1, k2, p1, p2) after
-Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as OpenCV and ``gtsam.Cal3DS2`` have it. The noise
-of a pixel is Gaussian in its core; the loss of Huber (1964) limits the pull of a point that is wrong.
+Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as in OpenCV and ``gtsam.Cal3DS2``. Pixel noise is
+Gaussian with Huber's loss (1964) against outliers.
 
-That polynomial grows along the radius only up to where the lens would fold the image; directions farther out, outside of the image
-of a lens that can be inverted, are continued straight outwards, so that what lies there is not seen in the image.
-
-Points that are nearer than :data:`~factors.camera.kernels.NEAREST` or behind the camera are taken as that far away, and are
-seen far outside of the image: nothing throws, and every value is finite.
+The polynomial is used up to the radius where the lens would fold the image; directions beyond it, outside of the image of an
+invertible lens, are extrapolated radially, so that they do not appear in the image. Points nearer than
+:data:`~factors.camera.kernels.NEAREST`, or behind the camera, are treated as at that depth: all values are finite and nothing
+raises.
 """
 
 import math
@@ -24,25 +23,25 @@ from factors.camera import kernels as reprojection_kernels
 from factors.camera.kernels import Lens
 from factors.se2 import Array
 
-# the constants of a camera that can be estimated: its place [m] and small turns [rad] about the robot's axes, the
-# logarithm of its focal length, and how much later it saw than its stamp says [s]
+# the constants of a camera that can be estimated: position [m] and small rotations [rad] about the robot's axes, logarithm of the
+# focal length, and time offset [s] by which images are later than their timestamps
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
-WIDEST = 4.0  # of x^2 + y^2: farther out, 63 degrees off the axis, no polynomial of distortion is used
+WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distortion polynomial
 GRID = 33  # rows and columns of pixels at which a lens is checked
-NONE = 1e-9  # of a distorted direction: no difference
+NONE = 1e-9  # tolerance of distorted directions
 
-# columns: the camera's axes in the frame of a robot that looks along its x axis, z up
+# columns: the camera's axes in the frame of a robot with z up, for a camera that looks along the robot's x axis
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """What we believe about a camera.
+    """A camera and its noise.
 
     ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2); ``width``, ``height`` [px] of its images. ``position``
-    (3,) [m] and ``rotation`` (3, 3) of the camera in the robot's frame. ``sigma`` [px] in u and in v; ``robust``: scale of
-    Huber's loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 where errors stay from image to image.
+    (3,) [m] and ``rotation`` (3, 3) of the camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's
+    loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
     """
 
     fx: float
@@ -67,19 +66,19 @@ class CameraModel:
         return np.array(((self.fx, 0.0, self.cx), (0.0, self.fy, self.cy), (0.0, 0.0, 1.0)))
 
     def calibration(self) -> gtsam.Cal3DS2:
-        """The same as GTSAM has it."""
+        """The calibration for GTSAM."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """Whether ``pixels`` (..., 2) lie in the image, or at most ``margin`` pixels outside of it: truth values (...)."""
+        """Whether ``pixels`` (..., 2) are in the image, or at most ``margin`` pixels outside of it: booleans (...)."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
 
 
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
-    """The rotation (3, 3) of a camera in the robot's frame that looks along x and is then turned: ``roll`` about x,
-    ``pitch`` about y (down where positive), ``yaw`` about z (to the left)."""
+    """The rotation (3, 3) of a camera in the robot frame that looks along x, rotated by ``roll`` about x, ``pitch`` about y (down
+    is positive), ``yaw`` about z (left is positive)."""
     (a, b), (c, d), (e, f) = ((math.cos(w), math.sin(w)) for w in (roll, pitch, yaw))
     about_x = np.array(((1.0, 0.0, 0.0), (0.0, a, -b), (0.0, b, a)))
     about_y = np.array(((c, 0.0, d), (0.0, 1.0, 0.0), (-d, 0.0, c)))
@@ -97,7 +96,7 @@ def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
 
 
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
-    """The model with ``changes`` (8,) of the constants :data:`PARAMETERS`; the time offset is the caller's business."""
+    """The model with corrections ``changes`` (8,) of :data:`PARAMETERS`; the time offset is ignored."""
     turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())
     scale = math.exp(float(changes[FOCAL]))
     return replace(
@@ -110,12 +109,12 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 
 
 def project(model: CameraModel, points: Array) -> Array:
-    """Pixels (K, 2) of ``points`` (K, 3) in the camera's frame."""
+    """Pixels (K, 2) of ``points`` (K, 3) in the camera frame."""
     return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
 
 
 def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
-    """``points`` (K, 3) of the world in the frame of the camera of a robot at ``pose`` (3,)."""
+    """World ``points`` (K, 3) in the frame of the camera of a robot at ``pose`` (3,)."""
     local = np.empty_like(points, dtype=float)
     local[:, :2] = se2.transform_to(pose, points[:, :2])
     local[:, 2] = points[:, 2]
@@ -123,12 +122,12 @@ def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
 
 
 def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of the camera of a robot in space, at ``position`` with ``rotation``."""
+    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``position`` (3,) with ``rotation`` (3, 3)."""
     return position + rotation @ model.position, rotation @ model.rotation
 
 
 def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """The inverse of :func:`mounted`: position and rotation of the robot whose camera is at ``position`` (3,) with ``rotation``."""
+    """The inverse of :func:`mounted`: the robot whose camera is at ``position`` (3,) with ``rotation`` (3, 3)."""
     turn = rotation @ model.rotation.T
     return position - turn @ model.position, turn
 
@@ -141,28 +140,27 @@ def camera_pose(model: CameraModel, pose: Array) -> tuple[Array, Array]:
 
 
 def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) at which ``points`` (K, 3) of the world are seen from ``pose`` (3,), and their depths (K,) [m], below zero
-    behind the camera."""
+    """Pixels (K, 2) of world ``points`` (K, 3) from ``pose`` (3,), and their depths (K,) [m], negative behind the camera."""
     local = in_camera(model, pose, points)
     return project(model, local), local[:, 2]
 
 
 def undistorted(model: CameraModel, pixels: Array) -> Array:
-    """Directions (K, 2), as (x, y) at depth 1 in the camera's frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
+    """Directions (K, 2), as (x, y) at depth 1 in the camera frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
     Newton's method."""
     seen = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
     return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(seen))[0])
 
 
 def rays(model: CameraModel, pixels: Array) -> Array:
-    """The points (K, 3) at depth 1 in the camera's frame that are seen at ``pixels`` (K, 2)."""
+    """The points (K, 3) at depth 1 in the camera frame of ``pixels`` (K, 2)."""
     return np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
 
 
 def folded(model: CameraModel) -> Array | None:
-    """A pixel (2,) at which the lens is not invertible, of a grid over the image with its corners; None where there is none.
+    """A pixel (2,) at which the lens is not invertible, on a grid over the image; None if it is invertible everywhere.
 
-    It is invertible up to where its polynomial is used, as long as the determinant of its Jacobian stays positive.
+    The lens is invertible where the determinant of its Jacobian is positive within the valid radius of the polynomial.
     """
     if not any(model.distortion):
         return None
@@ -176,9 +174,9 @@ def folded(model: CameraModel) -> Array | None:
 
 
 def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) seen from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame
-    perturbation (K, 2, 3), by the points (K, 2, 3), and by small changes of :data:`PARAMETERS` (K, 2, 8), of which that by the
-    time offset is zero here, as it needs the robot's velocity."""
+    """Pixels (K, 2) of ``points`` (K, 3) from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame perturbation
+    (K, 2, 3), by the points (K, 2, 3), and by corrections of :data:`PARAMETERS` (K, 2, 8); that by the time offset is zero, as it
+    needs the robot's velocity."""
     found: tuple[Array, Array, Array, Array] = reprojection_kernels.linearize(
         lens_of(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
     )
@@ -188,9 +186,9 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
 def linearize_in_space(
     model: CameraModel, position: Array, rotation: Array, points: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) seen from a camera anywhere in space, at ``position`` (3,) with ``rotation`` (3, 3) in the
-    world; their Jacobians by the camera's perturbation (K, 2, 6), turn first, then shift, both in the camera's frame as
-    ``gtsam.Pose3`` has them, and by the points (K, 2, 3)."""
+    """Pixels (K, 2) of ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their Jacobians by
+    the camera's perturbation (K, 2, 6), rotation before translation, both in the camera frame as in ``gtsam.Pose3``, and by the
+    points (K, 2, 3)."""
     found: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
         lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
     )
@@ -200,10 +198,10 @@ def linearize_in_space(
 def log_likelihood(
     model: CameraModel, poses: Array, points: Array, pixels: Array, covariances: Array | None = None
 ) -> Array:
-    """The log-likelihood (N,), robust and tempered, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses`` (N, 3), up to a
-    constant.
+    """The robust, tempered log-likelihood (N,), up to a constant, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses``
+    (N, 3).
 
-    ``covariances`` (K, 2, 2) [px^2]: of each pixel, from its noise and that of the map; by default that of the model.
+    ``covariances`` (K, 2, 2) [px^2]: of each pixel, including the map's error; by default the pixel noise only.
     """
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
@@ -222,7 +220,7 @@ def log_likelihood(
 
 
 def huber_loss(squared: Array, scale: float) -> Array:
-    """The loss of squared whitened residuals: half of them up to ``scale`` standard deviations, linear beyond."""
+    """Huber's loss of squared whitened residuals: half of them up to ``scale`` standard deviations, linear beyond."""
     return np.asarray(reprojection_kernels.huber_losses(np.ravel(squared), scale)).reshape(np.shape(squared))
 
 
@@ -232,12 +230,12 @@ def huber_weight(squared: Array, scale: float) -> Array:
 
 
 def lens_of(model: CameraModel) -> Lens:
-    """What the kernels know of a camera: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which its
-    polynomial is used: where the radial part grows no more, at most :data:`WIDEST`; 0 without distortion, for everywhere."""
+    """The camera's constants for the kernels: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which the
+    polynomial is used: where the radial part stops growing, at most :data:`WIDEST`; 0 without distortion, for no limit."""
     end = 0.0
     if any(model.distortion):
         k1, k2, *_ = model.distortion
-        # the radial part's slope at q = x^2 + y^2 is 1 + 3 k1 q + 5 k2 q^2: a quadratic of 1 / q
+        # the slope of the radial part at q = x^2 + y^2 is 1 + 3 k1 q + 5 k2 q^2: a quadratic in 1 / q
         square = 9.0 * k1 * k1 - 20.0 * k2
         end = max(1.0 / WIDEST, 0.5 * (math.sqrt(square) - 3.0 * k1) if square > 0.0 else 0.0)
     return (*map(float, (model.fx, model.fy, model.cx, model.cy, *model.distortion)), end)

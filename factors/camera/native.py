@@ -1,7 +1,7 @@
-"""One point of unknown place seen in an image, as GTSAM's own factor on a planar pose and the point.
+"""GTSAM's own factor of one point with unknown position seen in an image, on a planar pose and the point.
 
-Its error, Jacobians and loss are those of a free :class:`factors.camera.factor.ReprojectionFactor` without estimated
-constants, at a tenth of the time. Unlike that it throws where the point is behind the camera.
+It is equal to a free :class:`factors.camera.factor.ReprojectionFactor` without estimated constants, and ten times as fast, but it
+raises if the point is behind the camera.
 """
 
 import gtsam
@@ -11,7 +11,7 @@ from factors.se2 import Array
 
 
 class PointSightings:
-    """Makes the factors of a camera."""
+    """Creates the factors of a camera."""
 
     def __init__(self, model: CameraModel) -> None:
         self._mounting = gtsam.Pose3(gtsam.Rot3(model.rotation), model.position)
@@ -20,5 +20,5 @@ class PointSightings:
         self._noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
 
     def factor(self, pose: int, point: int, pixel: Array) -> gtsam.NonlinearFactor:
-        """The point with the key ``point``, seen at ``pixel`` (2,) from the pose with the key ``pose``."""
+        """The factor of ``point`` (a key) seen at ``pixel`` (2,) from ``pose`` (a key)."""
         return gtsam.PlanarProjectionFactor2(pose, point, pixel, self._mounting, self._calibration, self._noise)

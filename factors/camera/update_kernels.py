@@ -1,8 +1,7 @@
-"""Known points seen by a camera as a factor on a robot's planar pose, and the Kalman update by it, compiled.
+"""Compiled Kalman update by known points in an image.
 
-An estimator makes a dozen small matrices of each image, and NumPy takes longer for each than its arithmetic does. What is done
-is that of :mod:`factors.camera.factor`, and of the update of all sightings, in information form
-(:mod:`factors.update`), for this one kind of factor.
+Equal to the update in information form (:mod:`factors.update`) by a factor of :mod:`factors.camera.factor` on the pose. Compiled,
+because an update uses a dozen small matrices, for which NumPy's overhead exceeds the arithmetic.
 """
 
 import math
@@ -19,10 +18,10 @@ Row = tuple[float, float, float]
 
 
 class Seen(NamedTuple):
-    """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose alone, as compiled code takes it.
+    """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, for compiled code.
 
-    ``point_covariances`` (K, 3, 3), or (0, 3, 3) of a map that is exact; ``offset`` (3,) and ``offset_covariance`` (3, 3): zero
-    where there is none. The rest: of the factor and its model.
+    ``point_covariances`` (K, 3, 3), or (0, 3, 3) for an exact map; ``offset`` (3,) and ``offset_covariance`` (3, 3): zero for none.
+    The other fields are those of the factor and its model.
     """
 
     lens: Lens
@@ -40,7 +39,7 @@ class Seen(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy")
 def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
-    """As of :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2) and Jacobian (K, 2, 3)."""
+    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2) and Jacobian (K, 2, 3)."""
     residual, jacobian = np.empty((len(seen.points), 2)), np.empty((len(seen.points), 2, 3))
     _whiten(seen, pose[0], pose[1], pose[2], residual, jacobian)
     return residual, jacobian
@@ -48,7 +47,7 @@ def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
 
 @numba.njit(cache=True, error_model="numpy")
 def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
-    """As of :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
+    """See :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
     residual, jacobian = whitened(seen, pose)
     for k in range(len(residual)):
         root = math.sqrt(_weight(seen, residual[k, 0] ** 2 + residual[k, 1] ** 2))
@@ -63,8 +62,8 @@ def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
 def updated(
     seen: Seen, pose: Array, covariance: Array, iterations: int, converged: float, gate: float
 ) -> tuple[Array, Array, Array, float]:
-    """As of :func:`~factors.update.robust_update`: correction (S,) and covariance (S, S) afterwards;
-    whitened residuals (K, 2) at the prediction, and their normalised square. ``gate``: of a single point's."""
+    """See :func:`~factors.update.robust_update`: correction (S,) and covariance (S, S) afterwards; whitened residuals (K, 2) at the
+    prediction, and their normalised square. ``gate``: of a single point."""
     n, size = len(seen.points), len(covariance)
     prior = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     first, jacobian = np.empty((n, 2)), np.empty((n, 2, 3))
@@ -106,8 +105,8 @@ def updated(
 
 @numba.njit(cache=True, error_model="numpy")
 def placed(position: Array, rotation: Array, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of a camera that is mounted at ``position`` with ``rotation`` on a robot at
-    ``pose`` (3,), and the covariance (6, 6) of its perturbation in its own frame, turn first, from that of the pose's, (3, 3)."""
+    """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
+    (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, 3)), np.empty((6, 6))
     where[0] = pose[0] + c * position[0] - s * position[1]
@@ -129,7 +128,7 @@ def placed(position: Array, rotation: Array, pose: Array, covariance: Array) -> 
 
 @numba.njit(cache=True, error_model="numpy")
 def spread(by_point: Array, covariances: Array, sigma: float) -> Array:
-    """The covariance (K, 2, 2) of pixels that have the noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
+    """The covariance (K, 2, 2) of pixels with noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]
@@ -157,13 +156,13 @@ def _weight(seen: Seen, squared: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jacobian: Array) -> None:
-    """Whitened residuals, predicted less measured, and their Jacobians by the pose (x, y, heading), into (K, 2) and (K, 2, 3)."""
+    """Whitened residuals (K, 2), predicted minus measured, and their Jacobians (K, 2, 3) by the pose (x, y, heading), in place."""
     place, scale, n = mounting(seen.position, seen.rotation), 1.0 / seen.sigma, len(seen.points)
     c, s = math.cos(heading), math.sin(heading)
     dx, dy, turned = seen.offset[0], seen.offset[1], seen.offset[2]
     x, y = x + c * dx - s * dy, y + s * dx + c * dy
     c, s = math.cos(heading + turned), math.sin(heading + turned)
-    # of the pose where it is a variable, seen from where the image was taken
+    # of the variable's pose, seen from the pose of the image
     co, so = math.cos(turned), math.sin(turned)
     back_x, back_y = -co * dx - so * dy, so * dx - co * dy
     exact = len(seen.point_covariances) == 0
@@ -189,7 +188,7 @@ def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jac
                 )
                 uu, uv, vv = uu + _product(of, in_u, in_u), uv + _product(of, in_v, in_u), vv + _product(of, in_v, in_v)
             if common:
-                # all points have this error in common: together they must not seem to be rid of it
+                # this error is common to all points, so it must not average out
                 of = seen.offset_covariance
                 uu += n * _product(of, by_p, by_p)
                 uv += n * _product(of, by_q, by_p)
@@ -211,7 +210,7 @@ def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jac
 
 @numba.njit(cache=True, inline="always")
 def _along(rotation: Array, by_local: Row, scale: float) -> Row:
-    """How a pixel depends on a point that moves along the robot's axes."""
+    """Gradient of a pixel coordinate by a point in the robot's axes."""
     a, b, c = scale * by_local[0], scale * by_local[1], scale * by_local[2]
     return (
         a * rotation[0, 0] + b * rotation[0, 1] + c * rotation[0, 2],
@@ -224,8 +223,8 @@ def _along(rotation: Array, by_local: Row, scale: float) -> Row:
 def _solved(
     prior: Array, residual: Array, jacobian: Array, weights: Array, at: Array
 ) -> tuple[Array, Array, tuple[float, float, float]]:
-    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (S,); and what pulls
-    at the correction."""
+    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (S,), and the
+    gradient at the correction."""
     information = prior.copy()
     xx = xy = xa = yy = ya = aa = px = py = pa = 0.0
     for k in range(len(residual)):
@@ -254,7 +253,7 @@ def _solved(
 
 @numba.njit(cache=True, inline="always")
 def _normalised(residual: Array, jacobian: Array, covariance: Array) -> float:
-    """Normalised innovation squared of one point by itself."""
+    """Normalised innovation squared of a single point."""
     p = (jacobian[0, 0], jacobian[0, 1], jacobian[0, 2])
     q = (jacobian[1, 0], jacobian[1, 1], jacobian[1, 2])
     a, b, c = 1.0 + _product(covariance, p, p), _product(covariance, p, q), 1.0 + _product(covariance, q, q)

@@ -1,15 +1,13 @@
-"""What matches between two images tell of a planar robot's motion between them.
+"""Information on a planar motion from the matches between two images.
 
-A match is a pair of rays that should meet: with the camera's translation tau from the first image to the second, and the rotation R
-between them, the epipolar constraint is ``a . (tau x R b) = 0`` (Longuet-Higgins, Nature 293, 1981). Its first-order geometric
-error is Sampson's: the constraint over the standard deviation that the noise of both pixels gives it (Hartley and Zisserman,
-"Multiple View Geometry in Computer Vision", 2nd edition, 2004, eq. 11.9), here with the noise of each pixel carried through the
-lens. How long tau is cannot be seen: the error does not change along tau, so matches tell two of the three numbers of a
-planar motion.
+A match is a pair of rays that should intersect: with the camera's translation tau from the first image to the second, and the
+rotation R between them, the epipolar constraint is ``a . (tau x R b) = 0`` (Longuet-Higgins, Nature 293, 1981). Its first-order
+geometric error is Sampson's: the constraint divided by its standard deviation from the noise of both pixels (Hartley and Zisserman,
+"Multiple View Geometry in Computer Vision", 2nd edition, 2004, eq. 11.9), here with the pixel noise propagated through the lens.
+The length of tau is unobservable, so matches determine two of the three numbers of a planar motion.
 
-Two motions that follow each other share the image between them. Their errors are those of a moving average, whose power is at
-most twice, at any frequency, that of independent ones: with :data:`SHARED` of their information each, a chain of them claims
-no more than it knows.
+Consecutive motions share an image. Their errors form a moving average, whose power at any frequency is at most twice that of
+independent ones: with the share :data:`SHARED` of their information, a chain of motions is conservative.
 """
 
 from __future__ import annotations
@@ -26,14 +24,14 @@ from factors import se2
 from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.se2 import Array
 
-SHARED = 0.5  # share of the information that counts of a motion whose images are those of its neighbours too
+SHARED = 0.5  # share of the information that is used, because consecutive motions share an image
 
 
 @dataclass(frozen=True, slots=True)
 class RayPairs:
-    """K matches: rays ``first`` and ``second`` (K, 3) in the robot's frame at the time of each image, of depth 1 along the
-    camera's ``axis`` (3,); how they move with the noise of their pixels, in standard deviations of it (K, 3, 2); and where the
-    camera is on the robot, ``position`` (3,) [m]."""
+    """K matches: rays ``first`` and ``second`` (K, 3) in the robot frame at the time of each image, of depth 1 along the camera's
+    ``axis`` (3,); their derivatives (K, 3, 2) by the pixel noise in standard deviations; and the camera's ``position`` (3,) [m]
+    on the robot."""
 
     first: Array
     second: Array
@@ -44,7 +42,7 @@ class RayPairs:
 
     @classmethod
     def of(cls, model: CameraModel, first: Array, second: Array) -> RayPairs:
-        """Of pixels (K, 2) in both images."""
+        """From pixels (K, 2) in both images."""
         a, first_noise = _rays(model, np.asarray(first, dtype=float))
         b, second_noise = _rays(model, np.asarray(second, dtype=float))
         return cls(a, b, first_noise, second_noise, np.asarray(model.position, dtype=float), model.rotation[:, 2])
@@ -53,18 +51,18 @@ class RayPairs:
         return len(self.first)
 
     def chosen(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> RayPairs:
-        """Those at ``which`` (M,), or where it (K,) is true."""
+        """The matches with indices ``which`` (M,), or mask (K,)."""
         noises = self.first_noise[which], self.second_noise[which]
         return RayPairs(self.first[which], self.second[which], *noises, self.position, self.axis)
 
 
 def sampson(pairs: RayPairs, motion: Array) -> tuple[Array, Array, Array]:
-    """Whitened errors (K,) of the matches under the robot's ``motion`` (3,) from the first image to the second, their Jacobian
-    (K, 3) by its body-frame perturbation, and how the constraint itself depends on that (K, 3), whitened, of the nearest rays that
-    meet. Zero where the motion leaves the camera where it is.
+    """Whitened errors (K,) of the matches for the robot's ``motion`` (3,) from the first image to the second, their Jacobian (K, 3)
+    by its body-frame perturbation, and the whitened Jacobian (K, 3) of the constraint at the nearest intersecting rays. Zero if
+    the camera does not move.
 
-    The Jacobian gives the slope of the cost. Its square is no information: near the epipole the standard deviation goes to
-    zero, and the Jacobian holds how noise over it changes. The square of the last is.
+    The first Jacobian gives the gradient of the cost. The information must be computed from the second one, because near the
+    epipole the standard deviation vanishes, and the first one includes the noise divided by it.
     """
     residual, jacobian, signal = np.empty(len(pairs)), np.empty((len(pairs), 3)), np.empty((len(pairs), 3))
     arguments = (pairs.first, pairs.second, pairs.first_noise, pairs.second_noise, pairs.position)
@@ -73,16 +71,16 @@ def sampson(pairs: RayPairs, motion: Array) -> tuple[Array, Array, Array]:
 
 
 def translation(position: Array, motion: Array) -> Array:
-    """How far the camera at ``position`` (3,) on the robot moves (2,) [m] with the robot's ``motion`` (3,), in the robot's frame at
-    the first image; its height does not change."""
+    """The translation (2,) [m] of the camera at ``position`` (3,) on the robot by the robot's ``motion`` (3,), in the robot frame
+    at the first image; its height does not change."""
     c, s = math.cos(motion[2]), math.sin(motion[2])
     x, y = float(position[0]), float(position[1])
     return np.array((motion[0] + c * x - s * y - x, motion[1] + s * x + c * y - y))
 
 
 def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
-    """The inverse of the depth (K,) [1/m] at which the rays of each match come nearest to each other under a robot's ``motion``
-    (3,), below zero where that is behind the camera, and its standard deviation (K,)."""
+    """The inverse depth (K,) [1/m] at which the rays of each match are nearest to each other for a robot's ``motion`` (3,),
+    negative behind the camera, and its standard deviation (K,)."""
     c, s = math.cos(motion[2]), math.sin(motion[2])
     x, y = translation(pairs.position, motion)
     a, b = pairs.first, pairs.second
@@ -97,8 +95,8 @@ def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
 
 
 def from_epipole(pairs: RayPairs, motion: Array) -> Array:
-    """How far from the epipole both rays of each match are (K,), the nearer one, in standard deviations of its pixel, under a
-    robot's ``motion`` (3,). Sampson's error is of first order: it holds where that is many."""
+    """Distance (K,) of the nearer ray of each match from the epipole, in standard deviations of its pixel, for a robot's ``motion``
+    (3,). Sampson's first-order error is valid if it is large."""
     x, y = translation(pairs.position, motion)
     c, s = math.cos(motion[2]), math.sin(motion[2])
     found = []
@@ -113,7 +111,7 @@ def from_epipole(pairs: RayPairs, motion: Array) -> Array:
 
 
 class VisualOdometryFactor:
-    """A motion between two poses of which some numbers are told.
+    """A relative pose of which some components are measured.
 
     ``delta`` (3,): the second pose in the frame of the first; ``information`` (3, 3): of its body-frame perturbation, of any rank.
     The values of the factor are the two poses (3,).
@@ -140,7 +138,7 @@ class VisualOdometryFactor:
 def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
     local = rays(model, pixels)
     _, by_camera, _ = linearize_in_space(model, np.zeros(3), np.eye(3), local)
-    # a shift of the camera moves the point the other way
+    # a translation of the camera moves the point in the opposite direction
     by_ray = -by_camera[:, :, 3:5]
     noise = model.sigma * np.linalg.inv(by_ray)
     return np.ascontiguousarray(local @ model.rotation.T), np.ascontiguousarray(model.rotation[:, :2] @ noise)
@@ -163,13 +161,13 @@ def _sampson(
     c, s = math.cos(turn), math.sin(turn)
     lever_x, lever_y = c * position[0] - s * position[1], s * position[0] + c * position[1]
     tx, ty = dx + lever_x - position[0], dy + lever_y - position[1]
-    # how tau changes with a step along x or y of the robot's frame at the second image, and with a turn
+    # derivatives of tau by x and y in the robot frame at the second image, and by the rotation
     change_x, change_y = (c, -s, -lever_y), (s, c, lever_x)
     for k in range(len(first)):
         a0, a1, a2 = first[k, 0], first[k, 1], first[k, 2]
         b0, b1, b2 = second[k, 0], second[k, 1], second[k, 2]
         q0, q1 = c * b0 - s * b1, s * b0 + c * b1
-        # by the first ray tau x R b, by the second one the cross product a x tau, turned back
+        # by the first ray tau x R b, by the second one the cross product a x tau, rotated back
         g0, g1, g2 = ty * b2, -tx * b2, tx * q1 - ty * q0
         h0, h1, h2 = -a2 * ty, a2 * tx, a0 * ty - a1 * tx
         k0, k1 = c * h0 + s * h1, c * h1 - s * h0
@@ -187,7 +185,7 @@ def _sampson(
         sigma = math.sqrt(variance)
         value = (a0 * g0 + a1 * g1 + a2 * g2) / sigma
         residual[k] = value
-        # the rays that would meet
+        # the intersecting rays
         shift = value / sigma
         m0, m1, m2 = (
             a0 - shift * (p[0, 0] * u0 + p[0, 1] * u1),
@@ -206,7 +204,7 @@ def _sampson(
             dh0, dh1, dh2 = -a2 * sy, a2 * sx, a0 * sy - a1 * sx
             dk0, dk1 = c * dh0 + s * dh1, c * dh1 - s * dh0
             if j == 2:
-                dg2 += tx * q0 + ty * q1  # R b turns too
+                dg2 += tx * q0 + ty * q1  # R b rotates too
                 dk0, dk1 = dk0 + k1, dk1 - k0
             slope = u0 * (p[0, 0] * dg0 + p[1, 0] * dg1 + p[2, 0] * dg2)
             slope += u1 * (p[0, 1] * dg0 + p[1, 1] * dg1 + p[2, 1] * dg2)

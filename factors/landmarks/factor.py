@@ -1,4 +1,4 @@
-"""Identified landmarks as a factor on a pose, and where they are not known, or constants of the sensor are not, on those too."""
+"""The bearing-range factor: landmarks on a pose, and optionally on sensor constants and a landmark."""
 
 from __future__ import annotations
 
@@ -23,21 +23,20 @@ from factors.landmarks.model import (
 )
 from factors.se2 import Array
 
-LEAST_TOLD = 1e-6  # of a landmark's place, in standard deviations per metre, and as a share of what is told best
+LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """K landmarks seen at one time, as a factor on the robot's pose then or a little earlier.
+    """K landmarks seen at one time, as a factor on the robot's pose at that time or shortly before.
 
-    ``points`` (K, 2): where the landmarks are; ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise.
-    ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, known from odometry;
-    ``offset_covariance`` (3, 3): its body-frame covariance, which widens the noise. All landmarks of the look have this error in
-    common; ``in_look``: how many they are, if those of other factors share it too, else K. ``twist`` (3,): the robot's velocity
-    then.
+    ``points`` (K, 2): positions of the landmarks; ``point_covariances`` (K, 2, 2) of an inexact map are added to the noise.
+    ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, from odometry; its body-frame
+    covariance ``offset_covariance`` (3, 3) is added to the noise. This error is common to all landmarks of the measurement;
+    ``in_look``: their number including those in other factors, by default K. ``twist`` (3,): the robot's velocity at that time.
 
-    The values of the factor are the pose (3,); then, where ``estimated`` names places in :data:`PARAMETERS`, changes of these
-    constants (P,); then, where ``free``, the position (2,) of the one landmark, in place of ``points``.
+    The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
+    if any; and, if ``free``, the position (2,) of the one landmark, instead of ``points``.
     """
 
     model: BearingRangeModel
@@ -65,8 +64,8 @@ class BearingRangeFactor:
         return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
-        """The log-likelihood (N,) of ``poses`` (N, 3) at the time of the look, up to a constant, each with its own ``parameters``
-        (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
+        """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement, each with its own
+        ``parameters`` (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
         seen = self.points, self.ranges, self.bearings
         return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances)
 
@@ -75,11 +74,11 @@ class BearingRangeFactor:
         return robust_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> BearingRangeFactor:
-        """The same with a robust loss that is ``width`` times as wide."""
+        """The factor with a robust loss that is ``width`` times as wide."""
         return replace(self, model=replace(self.model, robust=width * self.model.robust))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2), predicted less measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
         here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
         offset = here.offset
         at = values[0] if offset is None else se2.compose(values[0], offset)
@@ -104,7 +103,7 @@ class BearingRangeFactor:
         return displaced(error, blocks, offset, spread)
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
-        """The factor on the pose alone, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
+        """The factor on the pose only, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
         if not parameters and point is None:
             return self
         model, offset = self.model, self.offset
@@ -117,14 +116,14 @@ class BearingRangeFactor:
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
 
     def dof(self) -> int:
-        """How many ranges and bearings are measured."""
+        """Number of measured ranges and bearings."""
         return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
 
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Where the one landmark is, of which range and bearing are measured, as the pose and the constants have it.
+        """Position of the one landmark, whose range and bearing are measured, for a given pose and constants.
 
-        Returns its position (2,), the Jacobian (2, d) of that by each of ``values`` (the landmark is none of them), and its
-        covariance (2, 2) from the noise of the measurement.
+        Returns its position (2,), the Jacobian (2, d) by each of ``values`` (which exclude the landmark), and its covariance (2, 2)
+        from the measurement noise.
         """
         here = self.fixed(values[1:], None)
         at = values[0] if here.offset is None else se2.compose(values[0], here.offset)
@@ -136,8 +135,8 @@ class BearingRangeFactor:
 
 
 def _inverse(by_point: Array) -> Array:
-    """The inverse of a whitened Jacobian (2, 2) by a landmark; in a direction of which it tells nothing, as of a landmark where the
-    sensor is, that of one that hardly does."""
+    """The inverse of a whitened Jacobian (2, 2) by a landmark; singular values below the minimum are raised, as for a landmark at
+    the sensor."""
     rows, values, columns = np.linalg.svd(by_point)
     if values[1] > LEAST_TOLD * values[0]:
         return np.asarray(np.linalg.inv(by_point))

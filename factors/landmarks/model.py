@@ -1,10 +1,9 @@
-"""Identified landmarks seen as bearing and range, or as range alone (ranging beacons).
+"""The measurement model of identified landmarks: bearing and range, or range only (ranging beacons).
 
-A sensor sits on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and
-``bearing = direction in the sensor's frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
-eq. 6.40). A camera that tells range from the size of what it sees reports the depth along its axis instead of the distance:
-the distance times the cosine of the direction. The noise is Gaussian in its core; far from it the loss of Geman and
-McClure levels off, jointly for range and bearing of one landmark.
+The sensor is mounted on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and ``bearing =
+direction in the sensor frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40). A camera
+that measures range by apparent size reports depth instead of distance: the distance times the cosine of the direction. The noise is
+Gaussian with the robust loss of Geman and McClure, jointly for range and bearing of a landmark.
 """
 
 import math
@@ -16,21 +15,21 @@ import numpy as np
 from factors import se2
 from factors.se2 import Array
 
-# the constants of a sensor that can be estimated: those of its model, and how much later it saw than its stamp says [s]
+# the constants of a sensor that can be estimated: those of its model, and the time offset [s] of its timestamps
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
-EXACT = np.empty((0, 2, 2))  # covariances of points that are known exactly
-MINIMUM_COSINE = 0.1  # no sensor that measures depth sees farther to the side
+EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
+MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeModel:
-    """What we believe about the sensor.
+    """A landmark sensor and its noise.
 
-    ``mounting``: (x, y, heading) of the sensor in the robot's frame. ``range_scale``: reported over true. ``depth``: what is
-    reported as range is the distance along one axis only, at the angle ``depth_axis`` in the sensor's frame. The standard
-    deviation of a range r is ``hypot(range_sigma, range_sigma_relative * r)`` [m]; that of a bearing is ``bearing_sigma`` [rad].
-    ``robust``: scale of the Geman-McClure loss in standard deviations.
+    ``mounting``: (x, y, heading) of the sensor in the robot frame. ``range_scale``: reported divided by true. ``depth``: ranges are
+    distances along one axis, at the angle ``depth_axis`` in the sensor frame. The standard deviation of a range r is
+    ``hypot(range_sigma, range_sigma_relative * r)`` [m], that of a bearing ``bearing_sigma`` [rad]. ``robust``: scale of the
+    Geman-McClure loss in standard deviations.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -45,7 +44,7 @@ class BearingRangeModel:
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
-    """Expected range [m] and bearing [rad] of ``points`` (..., 2) in the world from ``poses`` (..., 3)."""
+    """Predicted range [m] and bearing [rad] of ``points`` (..., 2) in the world from ``poses`` (..., 3)."""
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors, points)
     distance = np.hypot(local[..., 0], local[..., 1])
@@ -56,7 +55,7 @@ def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Arra
 
 
 def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
-    """Where points (K, 2) are in the robot's frame, from their ranges (K,) and bearings (K,)."""
+    """Positions (K, 2) in the robot frame of points with ranges (K,) and bearings (K,)."""
     direction = bearings - model.bearing_bias
     distance = ranges / model.range_scale
     if model.depth:
@@ -68,18 +67,18 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array, Array]:
     """Derivatives of (range, bearing) at ``poses`` (..., 3) and ``points`` (..., 2).
 
-    Returns those by the pose's body-frame perturbation (..., 2, 3), by the point (..., 2, 2), and by :data:`PARAMETERS`
-    (..., 2, 6): the range scale's by a relative change, the time offset's zero, as it needs the robot's velocity.
+    Returns those by the pose's body-frame perturbation (..., 2, 3), by the point (..., 2, 2), and by :data:`PARAMETERS` (..., 2,
+    6): that by the range scale is relative, and that by the time offset is zero, as it needs the robot's velocity.
     """
     poses = np.asarray(poses, dtype=float)
     mx, my, turn = model.mounting
     axis = turn + model.depth_axis
-    robot = se2.transform_to(poses, points)  # the point in the robot's frame
+    robot = se2.transform_to(poses, points)  # the point in the robot frame
     dx, dy = robot[..., 0] - mx, robot[..., 1] - my
     distance = np.maximum(np.hypot(dx, dy), 1e-6)
     ux, uy = dx / distance, dy / distance
     ahead_x, ahead_y = math.cos(axis), math.sin(axis)
-    # by the point in the robot's frame
+    # by the point in the robot frame
     local = np.empty((*np.shape(distance), 2, 2))
     local[..., 0, 0] = model.range_scale * (ahead_x if model.depth else ux)
     local[..., 0, 1] = model.range_scale * (ahead_y if model.depth else uy)
@@ -101,7 +100,7 @@ def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Ar
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """Standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,); a missing range has the near one's."""
+    """Standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,); a missing range is replaced by 0."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -110,10 +109,8 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
-    """Whitened residuals (..., K, 2), predicted less measured, of K points (K, 2) at ``poses`` (..., 1, 3) or (3,).
-
-    A missing (NaN) range or bearing has residual zero.
-    """
+    """Whitened residuals (..., K, 2), predicted minus measured, of K points (K, 2) at ``poses`` (..., 1, 3) or (3,); zero for a
+    missing (NaN) range or bearing."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))
@@ -124,7 +121,7 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 
 
 def recalibrated(model: BearingRangeModel, parameters: Array) -> BearingRangeModel:
-    """The model with :data:`PARAMETERS` changed by (6,) values: the range scale by a share, and the time offset has no part."""
+    """The model with corrections (6,) of :data:`PARAMETERS`: relative for the range scale; the time offset is ignored."""
     x, y, bearing_bias, range_scale, depth_axis = _constants(model, parameters).tolist()
     return replace(
         model,
@@ -136,7 +133,7 @@ def recalibrated(model: BearingRangeModel, parameters: Array) -> BearingRangeMod
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:
-    """The constants (..., 5) of a model that :data:`PARAMETERS` (..., 6) change, in their order."""
+    """The constants (..., 5) of a model with corrections ``parameters`` (..., 6), in the order of :data:`PARAMETERS`."""
     x, y, _ = model.mounting
     out: Array = (
         np.array((x, y, model.bearing_bias, model.range_scale, model.depth_axis)) + parameters[..., :TIME_OFFSET]
@@ -148,10 +145,8 @@ def _constants(model: BearingRangeModel, parameters: Array) -> Array:
 def whitened(
     model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
 ) -> tuple[Array, Array]:
-    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, 3) by its body-frame perturbation.
-
-    Compiled, as it is the inner loop of every filter and graph; :func:`residuals` and :func:`jacobians` are its plain twins.
-    """
+    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, 3) by its body-frame perturbation. Compiled; equal to
+    :func:`residuals` and :func:`jacobians`."""
     error, by_pose, _, _ = _evaluate(model, pose, points, ranges, bearings, 0)
     return error, by_pose
 
@@ -159,7 +154,7 @@ def whitened(
 def whitened_all(
     model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The same with the Jacobians by the points (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6), that by the time offset zero."""
+    """As :func:`whitened`, with the Jacobians by the points (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6)."""
     return _evaluate(model, pose, points, ranges, bearings, len(points))
 
 
@@ -207,7 +202,7 @@ def _whitened(
     more = len(by_point) > 0
     for k in range(len(points)):
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
-        px, py = c * dx + s * dy, c * dy - s * dx  # in the robot's frame
+        px, py = c * dx + s * dy, c * dy - s * dx  # in the robot frame
         sx, sy = px - mounting[0], py - mounting[1]
         error[k, 0], error[k, 1], distance, vx, vy, weight = _seen(
             sx, sy, mounting[2], model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
@@ -228,7 +223,7 @@ def _whitened(
                 by_sensor[k, 1, 2] = 1.0 / bearing_sigma
         if more:
             for i in range(2):
-                # moving the sensor is moving the robot; moving the point is the opposite, in the world's frame
+                # moving the sensor is moving the robot; moving the point is the opposite, in the world frame
                 by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
                 by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
                 by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
@@ -246,8 +241,8 @@ def _seen(
     measured_range: float,
     measured_bearing: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """Whitened errors of the range and bearing of a point that lies (sx, sy) from the sensor, in the robot's axes, zero where
-    missing; its distance; the direction in which the range grows; and the weight of a range."""
+    """Whitened errors of range and bearing, zero if missing, of a point at (sx, sy) from the sensor in the robot's axes; its
+    distance; the gradient direction of the range; and the inverse standard deviation of the range."""
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
     distance = max(math.hypot(sx, sy), 1e-6)
@@ -262,15 +257,13 @@ def _seen(
 
 
 def robust_weight(squared: Array, scale: float) -> Array:
-    """Weight of a squared whitened residual under the loss of Geman and McClure (1985)."""
+    """Weight of a squared whitened residual for the loss of Geman and McClure (1985)."""
     return (1.0 + np.asarray(squared) / scale**2) ** -2
 
 
 def robust_loss(squared: Array, scale: float) -> Array:
-    """Loss of Geman and McClure of a squared whitened residual: a half of it where that is small, never above ``scale^2 / 2``.
-
-    It forgets what is far off: a landmark that stands elsewhere than the map says does not pull at all.
-    """
+    """Loss of Geman and McClure of a squared whitened residual: half of it for small residuals, at most ``scale^2 / 2``, so that
+    gross outliers have no influence."""
     return 0.5 * np.asarray(squared) / (1.0 + np.asarray(squared) / scale**2)
 
 
@@ -285,9 +278,8 @@ def log_likelihood(
 ) -> Array:
     """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3).
 
-    ``parameters`` (N, 6): changes of :data:`PARAMETERS`, as in :func:`recalibrated`, of each pose's own sensor.
-    ``point_covariances`` (K, 2, 2) of a map that is not exact widen the noise, at each pose by what they do to range and bearing
-    from there.
+    ``parameters`` (N, 6): corrections of :data:`PARAMETERS`, as in :func:`recalibrated`, for each pose. ``point_covariances``
+    (K, 2, 2) of an inexact map are added to the noise, propagated from each pose.
     """
     changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
     constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
@@ -319,8 +311,8 @@ def _squared(
 ) -> None:
     """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5).
 
-    Where points have ``spreads`` (K, 2, 2), with the noise that is wider by these, and ``widths`` (N, K): the logarithm of by how
-    much, in standard deviations of range and bearing together.
+    For points with covariances ``spreads`` (K, 2, 2) the noise is widened, and ``widths`` (N, K) is the logarithm of the ratio of
+    the determinants' roots.
     """
     range_sigma, range_sigma_relative, bearing_sigma = noise
     for i in range(len(poses)):
@@ -336,7 +328,7 @@ def _squared(
             )
             squared[i, k] = range_error**2 + bearing_error**2
             if len(spreads):
-                # by the point, in the robot's axes: the range grows along v, the bearing across the line of sight
+                # by the point, in the robot's axes: the range grows along v, the bearing perpendicular to the line of sight
                 by_range = range_scale * weight
                 by_bearing = 0.0 if math.isnan(bearings[k]) else 1.0 / (distance * bearing_sigma)
                 ax, ay = by_range * (c * vx - s * vy), by_range * (s * vx + c * vy)
@@ -345,7 +337,7 @@ def _squared(
                 rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
                 rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
                 bb = 1.0 + bx * (xx * bx + xy * by) + by * (xy * bx + yy * by)
-                # rounding may take all of the difference, which is never less than that
+                # rounding may cancel the difference completely, which is never less than that
                 determinant = max(rr * bb - rb * rb, 0.5 * (rr + bb))
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
                 squared[i, k] = mixed / determinant

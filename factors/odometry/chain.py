@@ -1,13 +1,10 @@
-"""The odometry of a run so far, as a chain of knots in its own frame.
+"""Integration of the odometry of a run as a chain of knots in its own frame.
 
-Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9).
-Commanded velocities act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
+Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9). Commanded velocities
+act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
 
-A gyro replaces the rotation that the wheels tell, of velocities and of increments; where it is silent, that of the wheels counts.
-While the wheels report that the robot stands, it does: noise and bias of a gyro do not turn it.
-
-The step from knot to knot is compiled: an estimator takes hundreds of rows a second, a calibration integrates whole logs
-many times.
+A gyro replaces the rotation of the wheels, for velocities and increments; without recent gyro rows that of the wheels is used.
+While the wheels report rest the robot is at rest, whatever noise and bias of the gyro.
 """
 
 import math
@@ -21,15 +18,15 @@ from factors.odometry.kernels import relative
 from factors.odometry.model import OdometryModel, composed
 from factors.se2 import Array
 
-# columns of a row: when it takes effect, its kind, and its values
+# columns of a row: time of its effect, its kind, and its values
 _ROW = 5
 _VELOCITY, _INCREMENT, _GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
-# columns of a knot: state at the time of a row, the velocity in the robot's frame then, the velocity that it tends to, and
-# whether the wheels stand, and the time of the last row of a gyro
+# columns of a knot: state at the time of a row, the velocity in the robot frame, the velocity that it converges to, whether the
+# wheels are at rest, and the time of the last row of a gyro
 _T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
 _KNOT, _STATE = 16, 8
 
-# m/s and rad/s, beyond the biases: what is reported at rest; a gyro, that the robot does not turn although its wheels stand
+# m/s and rad/s, relative to the biases: wheels below are at rest; a gyro below agrees that the robot does not turn
 _REST, _GYRO_REST = 1e-3, 0.02
 
 # scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
@@ -41,10 +38,10 @@ _arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
 
 
 class OdometryChain:
-    """The odometry of a run so far, as a chain of knots in its own frame.
+    """The integrated odometry of a run, as a chain of knots in its own frame.
 
-    Rows come in time order, or late (then the knots behind them are computed anew). Beyond the last row its velocity is held.
-    What lies more than ``horizon`` seconds before the newest row is forgotten; adding a row older than that returns False.
+    Rows arrive in order of time, or late (then the knots after them are computed again). After the last row its velocity is held.
+    Rows more than ``horizon`` seconds before the newest one are forgotten; adding an older row returns False.
     """
 
     def __init__(self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0) -> None:
@@ -62,15 +59,15 @@ class OdometryChain:
             (m.lag, m.max_hold),
             (m.gyro_bias, use_gyro),
         )
-        self._noise = np.array(m.noise())  # an array is handed to compiled code in less time than a tuple
+        self._noise = np.array(m.noise())  # an array, because a tuple is slower to pass to compiled code
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
         return self._insert(t + self.model.delay, _VELOCITY, v, w, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
-        """A row with the motion from the previous row until ``t``, in the robot's frame at the previous row; at the stamp of that
-        one it goes on from there, and both are one motion."""
+        """A row with the motion from the previous row until ``t``, in the robot frame at the previous row. A row with an equal
+        timestamp continues the previous one."""
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != _INCREMENT:
             last -= 1
@@ -81,20 +78,20 @@ class OdometryChain:
         return self._insert(t, _INCREMENT, *se2.log(move).tolist())
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
-        """A gyro's row [rad/s], held from ``t`` until the next; it replaces the rotation that the wheels tell."""
+        """A row of a gyro [rad/s], held from ``t`` until the next; it replaces the rotation of the wheels."""
         return self._insert(t, _GYRO, w, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> None:
-        """Rows (N,) at once, in time order and after all others."""
+        """Add rows (N,), in order of time and after all others."""
         self._extend(t + self.model.delay, _VELOCITY, np.column_stack((v, w, np.zeros(len(t)))))
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
-        """Rows (N,) at once, in time order and after all others; of equal stamps they are one motion."""
+        """Add rows (N,), in order of time and after all others; rows with equal timestamps are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         self._extend(t[last], _INCREMENT, se2.log(moves))
 
     def state(self, t: float) -> ChainState:
-        """The state of the chain at ``t``; before the first kept knot the robot is taken to stand, its motion unknown."""
+        """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant."""
         return ChainState(*_state(self._knots, self._count, t, self._constants[2]))
 
     def states(self, t: Array) -> Array:
@@ -104,10 +101,8 @@ class OdometryChain:
         return out
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The motion from ``start`` to ``end``.
-
-        ``start`` may be what was believed at its time: the difference then includes what later rows corrected.
-        """
+        """The motion from ``start`` to ``end``. ``start`` may be an earlier result of :meth:`state`; the motion then includes
+        corrections by later rows."""
         return Increment(*relative(self._noise, start, end))
 
     def _insert(self, *row: float) -> bool:
@@ -144,7 +139,7 @@ class OdometryChain:
             self._knots = np.concatenate((self._knots, np.zeros((more, _KNOT))))
 
     def _forget(self) -> None:
-        # seldom, and many at a time: moving what is kept to the front costs its length
+        # rarely, and many rows at once, because the remaining ones are moved to the front
         n = self._count
         newest = self._knots[n - 1, _T]
         if newest - self._knots[0, _T] > 2.0 * self.horizon:
@@ -157,7 +152,7 @@ class OdometryChain:
 
 @numba.njit(cache=True)
 def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Constants) -> None:
-    """The knots of the rows from ``begin`` to ``end``, each from the knot before it."""
+    """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
     scales, (c, s), (lag, hold), gyro = constants
     scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, turn_slowdown = scales
     gyro_bias, use_gyro = gyro
@@ -172,7 +167,7 @@ def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Cons
         elif kind == _INCREMENT:
             previous = knots[i - 1]
             duration = t - previous[_T]
-            if duration > 0.0:  # else it has no time to happen in
+            if duration > 0.0:  # otherwise there is no time for motion
                 forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
                 stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
                 if stands:
@@ -210,15 +205,15 @@ def _take_gyro(knot: Array, t: float, turn: float) -> None:
 
 @numba.njit(cache=True)
 def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: _Constants) -> None:
-    """The knot of an increment in row ``i``, and anew those of the gyro since the increment before it: on all of the way the robot
-    moves as the increment says, and turns as the gyro did."""
+    """Compute the knot of an increment in row ``i``, and again those of the gyro since the previous increment: the robot moves by
+    the increment and rotates by the gyro."""
     scales, (c, s), (_, hold), (gyro_bias, _) = constants
     scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, _ = scales
     t, a, b, phi = rows[i, 0], rows[i, 2], rows[i, 3], rows[i, 4]
     first = i - 1
     while first >= 0 and rows[first, 1] != _INCREMENT:
         first -= 1
-    told = first >= 0 and t > knots[first, _T]  # else nothing says when the motion began
+    told = first >= 0 and t > knots[first, _T]  # otherwise the start of the motion is unknown
     first = max(first, 0)
     duration = t - knots[first, _T]
     forward, sideways, turn, stands = 0.0, 0.0, 0.0, False
@@ -245,7 +240,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: _Constants) -> N
 
 @numba.njit(cache=True)
 def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
-    """The knot ``duration`` seconds on: the motion goes on for at most ``hold`` of them, then it is unknown."""
+    """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown."""
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)
     rests = knot[_STANDS] and uw == 0.0

@@ -1,5 +1,4 @@
-"""The compiled part of the odometry: each measurement asks for relative motion, and graphs linearise the factor tens of thousands
-of times a run."""
+"""Compiled kernels of the odometry: relative motion for each measurement, and linearisation for graphs."""
 
 import math
 
@@ -9,33 +8,33 @@ import numpy as np
 from factors.se2 import Array, Integers
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
 
-# Of a covariance of positions: what is less than this share of it is a matter of rounding. A robot that is not known to a hundred
-# metres is not known better than to a tenth of a millimetre in any direction: else its covariance could not be inverted.
+# Minimum variance of positions relative to the largest one. A pose known only to a hundred metres is not known better than to a
+# tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
 ROUNDING, FAR = 1e-12, 1e4  # m^2
 
-# direction of travel; variances per distance, rotation and time, of what is along, lateral and of the heading; those per time
-# without odometry, of position and of heading; the least ones, and the least ones per time
+# direction of travel; variances per distance, rotation and time of longitudinal, lateral and heading error; variances per time
+# without odometry of position and heading; minimum variances, and minimum variances per time
 Noise = tuple[float, ...]
 State = tuple[float, float, float, float, float, float, float, float]
 
 
 @numba.njit(cache=True)
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
-    """As of :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, of two states
+    """See :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, for two states
     of a chain (t, x, y, heading, path, turn, unknown, still)."""
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrapped(end[3] - start[3])
     distance, rotation, duration = abs(end[4] - start[4]), abs(end[5] - start[5]), abs(end[0] - start[0])
     unknown, still = max(0.0, end[6] - start[6]), min(duration, abs(end[7] - start[7]))
-    # what grows with time does so while the robot moves; no odometry is better than the least noise
+    # time-dependent noise grows in motion only; the total is at least the minimum noise
     moving, least_position, least_heading = duration - still, noise[14] * duration, noise[15] * duration
     along = max(noise[1] * distance + noise[2] * rotation + noise[3] * moving, least_position) + noise[10] * unknown
     lateral = max(noise[4] * distance + noise[5] * rotation + noise[6] * moving, least_position) + noise[10] * unknown
     heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
-    # the start as seen from the end, turned by 90 degrees: how the end moves when the heading changes at the start
+    # the start seen from the end, rotated by 90 degrees: displacement of the end by a heading change at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y
-    # on the way the robot looked, on average, half the turn back from where it looks at the end
+    # the mean heading on the way differs from that at the end by half the rotation
     ahead, aside = math.cos(noise[0] - turned / 2.0), math.sin(noise[0] - turned / 2.0)
     covariance = np.empty((3, 3))
     covariance[0, 0] = ahead**2 * along + aside**2 * lateral + heading * nx * nx / 3.0 + noise[12]
@@ -50,7 +49,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 @numba.njit(cache=True)
 def carried(covariance: Array, delta: Array, noise: Array) -> Array:
-    """The body-frame covariance (3, 3) of a pose that has moved by ``delta`` (3,), which has the covariance ``noise``."""
+    """The body-frame covariance (3, 3) of a pose after the motion ``delta`` (3,) with covariance ``noise``."""
     c, s = math.cos(delta[2]), math.sin(delta[2])
     x, y = s * delta[0] - c * delta[1], c * delta[0] + s * delta[1]
     # the adjoint of the inverse of the motion
@@ -70,7 +69,7 @@ def carried(covariance: Array, delta: Array, noise: Array) -> Array:
 
 @numba.njit(cache=True, inline="always")
 def _widen(covariance: Array) -> None:
-    """Keep a covariance (3, 3) that can be inverted: see :data:`FAR`."""
+    """Keep a covariance (3, 3) invertible: see :data:`FAR`."""
     spread = covariance[0, 0] + covariance[1, 1]
     if spread > FAR:
         covariance[0, 0] += ROUNDING * spread
@@ -79,8 +78,8 @@ def _widen(covariance: Array) -> None:
 
 @numba.njit(cache=True)
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
-    """The increment ``delta`` (3,) alone of :func:`factors.odometry.model.recalibrated`, where ``constants`` (P,) change, whose
-    places among all are ``indices`` (P,)."""
+    """``delta`` (3,) of :func:`factors.odometry.model.recalibrated`, for corrections ``constants`` (P,) with ``indices`` (P,) among
+    all constants."""
     changes = _full(constants, indices)
     x, y, phi = log(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
@@ -106,8 +105,7 @@ def whitener(covariance: Array) -> Array:
 
 @numba.njit(cache=True)
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
-    """See :func:`factors.odometry.model.recalibrated`, of which ``twist`` (3,) is the logarithm of the increment, ``moving`` its
-    time."""
+    """See :func:`factors.odometry.model.recalibrated`; ``twist`` (3,): log of the increment, ``moving``: its time in motion."""
     x, y, phi = twist[0], twist[1], twist[2]
     way = math.hypot(x, y)
     cx, cy = x + changes[0] * x, y + changes[0] * y
@@ -124,8 +122,7 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 
 @numba.njit(cache=True)
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """:func:`recalibrate` where only ``constants`` (P,) change, whose places among all are ``indices`` (P,): the Jacobian (3, P) is
-    by these."""
+    """:func:`recalibrate` for corrections ``constants`` (P,) with ``indices`` (P,) among all constants; the Jacobian is (3, P)."""
     delta, by_changes = recalibrate(twist, moving, _full(constants, indices))
     return delta, np.ascontiguousarray(by_changes[:, indices])
 
@@ -142,8 +139,8 @@ def _full(constants: Array, indices: Integers) -> Array:
 def linearize(
     start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and by what changes
-    ``delta`` as ``by_changes`` (3, P) says, (3, P)."""
+    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
+    (3, P) of ``delta``, by the constants (3, P)."""
     rx, ry, turned = _between(start, end)
     relative = np.array((rx, ry, turned))
     ex, ey, angle = _between(delta, relative)
@@ -174,7 +171,7 @@ def _right_jacobian(x: float, y: float, angle: float) -> Array:
 
 @numba.njit(cache=True)
 def _inverse(j: Array) -> Array:
-    """Of a right Jacobian."""
+    """The inverse of a right Jacobian."""
     p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
     scale = 1.0 / (p * p + q * q)
     return np.array(

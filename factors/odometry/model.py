@@ -1,14 +1,12 @@
-"""Wheel odometry (and a gyro): what we believe about it, and relative poses with covariance.
+"""The model of wheel odometry and gyro: relative poses with covariance.
 
-The path of the wheels is kept as a chain (:mod:`factors.odometry.chain`) in an odometry frame; any relative pose is the difference
-of two poses of that chain.
+Odometry is integrated in its own frame (:mod:`factors.odometry.chain`); a relative pose is the difference of two of its states.
 
-Noise: variances of along-track, lateral and heading error each grow linearly with distance, rotation and time, so that the
-result does not depend on how finely a path is cut into pieces.
+Variances of longitudinal, lateral and heading errors grow linearly with distance, rotation and time, so that the result does not
+depend on how a path is divided.
 
-A robot at rest is a measurement of its own: while the wheels report no motion its velocity is zero, what grows with time does
-not grow, and the pose diffuses by the least noise alone. No odometry is better than that noise, whatever the model says: an
-increment without noise would make a graph that cannot be solved.
+Rest is a measurement of zero velocity: errors that grow with time do not grow, and only the minimum noise acts. That minimum
+applies to all odometry, because an increment without noise would make a graph singular.
 """
 
 import math
@@ -24,10 +22,10 @@ from factors.motion import ChainState, Increment
 from factors.odometry.kernels import Noise, linearize, recalibrate, relative, whitener
 from factors.se2 import Array
 
-# of an increment that takes no time, whose covariance must still be one that can be inverted
+# minimum noise of an increment without duration, whose covariance must be invertible
 MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
-LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): the least noise
+LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): minimum noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +40,7 @@ class Growth:
     per_time: float = 0.0
 
     def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
-        """The same with independent errors of these standard deviations added."""
+        """With independent errors of these standard deviations added."""
         return Growth(
             math.hypot(self.per_distance, per_distance),
             math.hypot(self.per_rotation, per_rotation),
@@ -56,14 +54,13 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class OdometryModel:
-    """What we believe about wheel odometry (and about the gyro that may replace its rotation).
+    """Wheel odometry, optionally with the rotation from a gyro.
 
-    ``scale_distance``, ``scale_rotation``: true over reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
-    ``gyro_bias`` [rad/s] are what is reported at rest; ``heading_drift`` [rad/m] is what the heading turns, unreported, on the
-    way. ``direction`` [rad]: that of travel, in the robot's frame.
-    ``delay`` and ``lag`` [s] belong to commanded velocities, and so does ``turn_slowdown`` [m/rad]: by how much a robot
-    that turns falls short of the forward speed, per turn rate. A velocity is held for at most ``max_hold`` seconds; after
-    that the motion is unknown and its variance grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation``.
+    ``scale_distance``, ``scale_rotation``: true divided by reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
+    ``gyro_bias`` [rad/s]: reported at rest; ``heading_drift`` [rad/m]: unreported change of heading. ``direction`` [rad]: of
+    travel, in the robot frame. For commanded velocities: ``delay`` and ``lag`` [s], and ``turn_slowdown`` [m/rad], the loss of
+    forward speed per turn rate. A velocity is held for at most ``max_hold`` seconds; then the motion is unknown, and its variance
+    grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation`` [rad per sqrt(s)].
     """
 
     scale_distance: float = 1.0
@@ -84,7 +81,7 @@ class OdometryModel:
     heading: Growth = field(default_factory=Growth)
 
     def noise(self) -> Noise:
-        """What compiled code knows of it: see :data:`factors.odometry.kernels.Noise`."""
+        """The noise for compiled code: see :data:`factors.odometry.kernels.Noise`."""
         growths = (self.along, self.lateral, self.heading)
         sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
         sigmas += [self.unknown_distance, self.unknown_rotation]
@@ -95,8 +92,8 @@ class OdometryModel:
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
     """The motion between two states of a chain, with its covariance.
 
-    The heading error is a random walk along the way, so it also displaces the end: with the chord seen from the end and
-    the walk spread evenly over it, by a third of its variance (and half of it as covariance).
+    The heading error is a random walk along the path, so it also displaces the end: by a third of its variance, and half of it as
+    covariance, if the walk is uniform along the chord.
     """
     return Increment(*relative(np.array(model.noise()), start, end))
 
@@ -106,12 +103,11 @@ PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias", "heading_
 
 
 def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]:
-    """The increment under changed parameters, and its Jacobian.
+    """The increment with corrected constants, and its Jacobian.
 
-    ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional
-    heading-rate bias [rad/s] while the robot moves, additional drift of the heading [rad/m]. Returns ``delta`` (..., 3) and the
-    Jacobian (..., 3, 4) of its body-frame perturbation by the parameters. The increment is taken as one arc, exact at constant
-    curvature.
+    ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional heading-rate
+    bias [rad/s] in motion, additional heading drift [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of its
+    body-frame perturbation. The increment is treated as one arc, which is exact at constant curvature.
     """
     arc = se2.log(increment.delta)
     parameters = np.asarray(parameters, dtype=float)
@@ -125,8 +121,8 @@ def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]
 
 
 def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:
-    """Which rows (M,) are the last of their stamps ``t`` (N,), which never go back, and the motions (M, 3) since the one before of
-    these: ``moves`` (N, 3) of equal stamps follow one another."""
+    """Compose motions with equal timestamps ``t`` (N,), sorted: indices (M,) of the last row of each timestamp, and the motions (M,
+    3) since the timestamp before, from ``moves`` (N, 3)."""
     last = np.flatnonzero(np.append(np.diff(t) > 0, True)[: len(t)])
     first = np.append(0, last[:-1] + 1)[: len(last)]
     out = np.array(moves[first], dtype=float)
@@ -137,16 +133,16 @@ def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int
 
 
 def between_factor(from_key: int, to_key: int, increment: Increment) -> gtsam.NonlinearFactor:
-    """The increment as GTSAM's factor between two ``Pose2`` variables."""
+    """The increment as a GTSAM factor between two ``Pose2`` variables."""
     noise = gtsam.noiseModel.Gaussian.Covariance(increment.covariance)
     return gtsam.BetweenFactorPose2(from_key, to_key, gtsam.Pose2(*increment.delta), noise)
 
 
 class OdometryFactor:
-    """The increment between two poses, with constants of the odometry as a third variable.
+    """The increment between two poses, with odometry constants as a third variable.
 
-    ``estimated``: positions in :data:`PARAMETERS` of the P constants that the variable holds. The values of the factor are the two
-    poses (3,) and the constants (P,), or the poses alone where P is zero.
+    ``estimated``: indices in :data:`PARAMETERS` of the P constants. The values of the factor are the two poses (3,), and the
+    constants (P,) unless P is zero.
     """
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:

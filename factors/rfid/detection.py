@@ -1,11 +1,10 @@
-"""The likelihood of what RFID antennas read and did not read, of many poses at once, with gradient and Fisher information.
+"""The likelihood of RFID reads and misses for many poses, with gradient and Fisher information.
 
-Each antenna that listens for a tag in n inventory rounds reads it in k of them, with probability q each
-(:mod:`factors.rfid.model`): the negative log-likelihood is ``-tempering * sum(k log q + (n - k) log(1 - q))``. Its Hessian is
-replaced by the expected one, Fisher's information, which is never indefinite. A tag that may be dead counts by a mixture
-(:mod:`factors.rfid.tag_states`): its gradient and its information are those of an alive tag, times the probability that it is alive
-given that it is silent; of the Hessian of the mixture that leaves out what the state, not being known, takes away (Louis, JRSS B
-44(2), 1982, eq. 3.2').
+An antenna reads a tag in k of n inventory rounds with probability q each (:mod:`factors.rfid.model`), so the negative
+log-likelihood is ``-tempering * sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by the Fisher information, which is
+positive semi-definite. A tag that may be dead has a mixture likelihood (:mod:`factors.rfid.tag_states`): gradient and information
+are those of an alive tag times the probability that it is alive given its silence, which neglects the information lost by the
+unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN where it is not known."""
+    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown."""
 
     points: Array
     facing: Array
 
     @cached_property
     def normals(self) -> Array:
-        """The directions (T, 2) in which the tags face, zero where that is not known."""
+        """The directions (T, 2) in which the tags face, zero if unknown."""
         known = np.isfinite(self.facing)
         angle = np.where(known, self.facing, 0.0)
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
@@ -41,12 +40,11 @@ class TagArray:
 
 @dataclass(frozen=True, eq=False)
 class TagReadCounts:
-    """What K antennas read of T tags, each at its own place on the way.
+    """Read counts of T tags by K antennas, each at its own pose.
 
-    ``offsets`` (K, 3): the robot's pose at the look, in the frame of the pose that the likelihood is of; ``antennas`` (K,): places
-    in the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): in how many of them each tag was read. ``odds`` (T,): log-odds
-    before these looks that each tag is dead, against alive (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` where it
-    lives, as by default all do.
+    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
+    the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``odds`` (T,): prior
+    log-odds that each tag is dead (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for alive, the default.
     """
 
     offsets: Array
@@ -60,12 +58,12 @@ class TagReadCounts:
             object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
 
     def moved(self, offset: Array) -> TagReadCounts:
-        """The same looks, of the pose that lies ``offset`` (3,) before theirs."""
+        """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
         return TagReadCounts(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits, self.odds)
 
 
 def together(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Several looks as one, all of the same pose, in the order in which they were made: the odds are those before the first."""
+    """Merge counts relative to one pose, in order of time; the odds are those of the first."""
     if len(parts) == 1:
         return parts[0]
     return TagReadCounts(
@@ -78,9 +76,9 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
 
 
 class Score(NamedTuple):
-    """Of N poses, all tempered. ``nll`` (N,); ``gradient`` (N, 3) and ``information`` (N, 3, 3) by body-frame perturbation;
-    ``expected`` (N,) and ``variance`` (N,): mean and variance of ``nll`` if model and pose are right. The variance too is in
-    proportion to the tempering, which stands for how much the reads go together."""
+    """Tempered likelihoods of N poses. ``nll`` (N,); ``gradient`` (N, 3) and ``information`` (N, 3, 3) by body-frame perturbation;
+    ``expected`` (N,) and ``variance`` (N,): mean and variance of ``nll`` for a correct model and pose. The variance is proportional
+    to the tempering, which accounts for correlated reads."""
 
     nll: Array
     gradient: Array
@@ -91,7 +89,7 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of an antenna model with a map of tags; ``packed``: the model as compiled code takes it."""
+    """The likelihood of an antenna model with a map of tags; ``packed``: the model for compiled code."""
 
     model: RfidModel
     tags: TagArray
@@ -111,8 +109,8 @@ class RfidLikelihood:
         return out
 
     def silence(self, pose: Array, covariance: Array, looks: TagReadCounts) -> Array:
-        """Tempered negative log-likelihood (T,), if they are alive, that tags of which that is not certain were not read, from a
-        pose (3,) with body-frame ``covariance`` (3, 3); less what it is out of reach, and 0 where a tag was read or is certain."""
+        """Tempered negative log-likelihood (T,) of the silence of uncertain tags if they are alive, at a pose (3,) with body-frame
+        ``covariance`` (3, 3), relative to a tag out of range; 0 for tags that were read or are certain."""
         out = np.empty(len(self.tags.points))
         pose, covariance = np.asarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         tags, where = (self.tags.points, self.tags.normals), (looks.offsets, looks.antennas)
@@ -122,7 +120,7 @@ class RfidLikelihood:
         return out
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`): for particles."""
+        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`), for particles."""
         poses = np.ascontiguousarray(poses, dtype=float)
         certain, silent, which = self.by_silence(poses, looks)
         if len(which):
@@ -130,9 +128,9 @@ class RfidLikelihood:
         return certain
 
     def by_silence(self, poses: Array, looks: TagReadCounts) -> tuple[Array, Array32, NDArray[np.int64]]:
-        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,
-        of the silence of U tags that may be dead, each by itself if it is alive, above what it is out of reach, (U, N), with the
-        places (U,) of these tags in the map."""
+        """The log-likelihood at poses (N, 3) in two parts: tempered (N,), of tags that are alive or were read; and untempered (U,
+        N), of the silence of each of U uncertain tags if it is alive, relative to a tag out of range, with the indices (U,) of
+        these tags in the map."""
         out = np.zeros(len(poses))
         which = np.flatnonzero((looks.odds > -np.inf) & ~looks.hits.any(axis=0) & self._near(poses, looks))
         apart = np.full(len(looks.odds), -1, dtype=np.int64)
@@ -145,7 +143,7 @@ class RfidLikelihood:
         return self.model.tempering * out, silent, which
 
     def _near(self, poses: Array, looks: TagReadCounts) -> NDArray[np.bool_]:
-        """Which tags (T,) may be in reach of an antenna from any of the poses."""
+        """The tags (T,) that may be in range of an antenna from any of the poses."""
         packed = self.packed
         way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
         reach = way + float(np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
@@ -159,7 +157,7 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
-        """What each tag says on its own, at one pose (3,): tempered negative log-likelihood (T,), its gradient (T, 2) by the tag's
+        """The contribution of each tag at one pose (3,): tempered negative log-likelihood (T,), its gradient (T, 2) by the tag's
         position in the world, and information (T, 2, 2)."""
         count = len(self.tags.points)
         nll, gradient, information = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))

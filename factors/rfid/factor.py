@@ -1,4 +1,4 @@
-"""What RFID antennas read and did not read, how strongly and with which phase, as factors on a pose."""
+"""Likelihoods of RFID reads and misses, signal strength and phase as factors on a pose."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ TagScore = Score | RssiScore | PhaseScore
 
 @dataclass(frozen=True, eq=False)
 class RfidFactor:
-    """A likelihood of what was read, on the one pose (3,) that looks or reads are placed around, in compressed Fisher form:
-    whatever their number there are four residuals, whose squares have the value, the gradient and the expected curvature of the
-    likelihood. ``seen``: looks for a :class:`RfidLikelihood`, reads for the other two."""
+    """An RFID likelihood as a factor on one pose (3,), in compressed Fisher form: four residuals with the value, the gradient and
+    the expected curvature of the likelihood. ``seen``: read counts for :class:`RfidLikelihood`, reads for the other two."""
 
     likelihood: RfidLikelihood | RssiLikelihood | PhaseLikelihood
     seen: TagReadCounts | RssiReads | PhaseReads
 
     @property
     def is_phase(self) -> bool:
-        """Whether it has many optima, centimetres apart."""
+        """Whether it is a phase likelihood, which has many local optima, centimetres apart."""
         return isinstance(self.likelihood, PhaseLikelihood)
 
     def with_odds(self, odds: Array) -> RfidFactor:
-        """The same, with other log-odds (T,) that each tag is dead; these are of looks alone."""
+        """The factor with other log-odds (T,) that each tag is dead; for read counts only."""
         return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, TagReadCounts) else self
 
     def score(self, pose: Array) -> TagScore:
-        """Of one pose (3,); every part has a leading axis of length 1."""
+        """The score of one pose (3,); every field has a leading axis of length 1."""
         match self.likelihood, self.seen:
             case RfidLikelihood() as detection, TagReadCounts() as looks:
                 return detection.score(pose, looks)
@@ -42,7 +41,7 @@ class RfidFactor:
                 return strength.score(pose, reads)
             case PhaseLikelihood() as phase, PhaseReads() as reads:
                 return phase.score(pose, reads)
-        raise TypeError(f"{type(self.likelihood).__name__} is no likelihood of {type(self.seen).__name__}")
+        raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.seen).__name__}")
 
     def log_likelihood(self, poses: Array) -> Array:
         """The tempered log-likelihood (N,) of poses (N, 3)."""
@@ -53,7 +52,7 @@ class RfidFactor:
                 return strength.log_likelihood(poses, reads)
             case PhaseLikelihood() as phase, PhaseReads() as reads:
                 return phase.log_likelihood(poses, reads)
-        raise TypeError(f"{type(self.likelihood).__name__} is no likelihood of {type(self.seen).__name__}")
+        raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.seen).__name__}")
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Residual (4,) and its Jacobian (4, 3)."""

@@ -1,4 +1,4 @@
-"""Compiled loops behind :mod:`factors.rfid.detection`: each is one pass over poses, antennas and tags."""
+"""Compiled loops of :mod:`factors.rfid.detection`, over poses, antennas and tags."""
 
 import math
 
@@ -10,12 +10,12 @@ from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array
 from factors.se2_kernels import wrapped
 
-FAST = {"contract", "reassoc", "arcp", "nsz"}  # what an optimiser may do, without taking infinities for impossible
+FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
 
 
 @numba.njit(cache=True)
 def moved(offset: Array, offsets: Array) -> Array:
-    """The poses (K, 3) that lie ``offset`` (3,) behind ``offsets`` (K, 3)."""
+    """The poses (K, 3) ``offset`` (3,) composed with ``offsets`` (K, 3)."""
     c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
     for k in range(len(offsets)):
         out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
@@ -28,7 +28,7 @@ def moved(offset: Array, offsets: Array) -> Array:
 def seen(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Logit of a tag at (p, q, height) from the antenna, in axes turned by its yaw alone, and derivatives by p, q, height, c."""
+    """Logit of a tag at (p, q, height) from the antenna, in axes rotated by its yaw only, and derivatives by p, q, height, c."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -40,8 +40,8 @@ def seen(
 
 @numba.njit(cache=True, inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
-    """Where an antenna is in the world (x, y, cosine and sine of its heading), for a robot at ``offset`` from ``pose``; and the
-    cosine and sine of the robot's heading."""
+    """The antenna's x, y, cosine and sine of its heading in the world, for a robot at ``offset`` from ``pose``; and the cosine and
+    sine of the robot's heading."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
@@ -54,8 +54,8 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float]:
-    """Logit of one tag for an antenna at (x, y) that looks along (c, s), and its derivatives: by the tag's place along and across
-    the boresight, and by the antenna's heading. Beyond the reach it is constant."""
+    """Logit of a tag for an antenna at (x, y) with boresight (c, s), and its derivatives: by the tag's position along and across
+    the boresight, and by the antenna's heading. It is constant out of range."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
@@ -74,11 +74,11 @@ def of_tag(
 
 @numba.njit(cache=True, inline="always")
 def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Negative log-likelihood of k hits in n rounds, its derivative by the logit, Fisher's information on the logit, and mean and
+    """Negative log-likelihood of ``hits`` in ``rounds``, its derivative by the logit, Fisher information on the logit, and mean and
     variance of the negative log-likelihood."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     q = packed.false_read + packed.span * sigmoid
-    # a model without a floor may be certain, and certainty has no logarithm
+    # without a floor probabilities may be 0 or 1, whose logarithms diverge
     q = min(max(q, 1e-12), 1.0 - 1e-12)
     by_z = packed.span * sigmoid * (1.0 - sigmoid)
     log_q, log_p = math.log(q), math.log1p(-q)
@@ -92,8 +92,8 @@ def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, floa
 
 @numba.njit(cache=True, inline="always")
 def _place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Rows (K, 8) of looks: place and boresight of the antenna in the world, then in the frame of the pose. Returns how far from
-    the pose [m] the farthest antenna reaches."""
+    """Rows (K, 8): position and boresight of each antenna in the world, then in the frame of the pose. Returns the largest distance
+    [m] from the pose that an antenna covers."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]
@@ -117,15 +117,15 @@ def _alive(
     normal: Array,
     far: Array,
 ) -> tuple[float, float, float, float, tuple[float, float, float], tuple[float, float, float, float, float, float]]:
-    """Of one tag that is alive, over all looks: negative log-likelihood, that of a silence, their mean and variance over all that
-    could be read; gradient, and information (its upper triangle)."""
+    """For one alive tag, over all measurements: negative log-likelihood, that of a silence, their mean and variance over all
+    outcomes; gradient, and information (upper triangle)."""
     e_sum = silent = mean_sum = spread_sum = 0.0
     g_x = g_y = g_a = 0.0
     xx = xy = xa = yy = ya = aa = 0.0
     for k in range(len(antennas)):
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
         z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, point, normal)
-        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
+        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of range and not read, the usual case
             e_sum, silent = e_sum + far[k, 0], silent + far[k, 0]
             mean_sum, spread_sum = mean_sum + far[k, 1], spread_sum + far[k, 2]
             continue
@@ -153,19 +153,18 @@ def _alive(
 def _mixed(
     odds: float, silent: float, mean: float, spread: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """Of a tag that is dead with prior log-odds ``odds``, and is not read (:mod:`factors.rfid.tag_states`): the tempered negative
-    log-likelihood, by how much the tag counts, and mean and variance of the likelihood over all that could be read.
+    """For a tag that is dead with prior log-odds ``odds`` and is not read (:mod:`factors.rfid.tag_states`): the tempered negative
+    log-likelihood, the weight of the tag, and mean and variance of the likelihood over all outcomes. A read has the likelihood of a
+    tag that is known to be alive, as its state does not depend on the pose.
 
-    A read costs what it does of a tag that is known to live: that this one does, too, tells nothing of the pose.
-
-    ``silent``: negative log-likelihood of the silence if the tag is alive, ``mean`` and ``spread``: mean and variance of that of
-    all that could be read, ``none``: that of a silence out of reach.
+    ``silent``: negative log-likelihood of the silence if the tag is alive; ``mean`` and ``spread``: mean and variance of that over
+    all outcomes; ``none``: that of a silence out of range.
     """
     alive, dead = 1.0 / (1.0 + math.exp(odds)), 1.0 / (1.0 + math.exp(-odds))
     left = alive * math.exp(-tempering * (silent - none))
     total = left + dead
     nll = tempering * none - math.log(total)
-    # a silence costs nll, whether the tag is dead or alive; the rest is of an alive one that is read
+    # a silence costs nll whether the tag is dead or alive; the rest is an alive tag that is read
     quiet = math.exp(-silent)
     expected = (alive * quiet + dead) * nll + alive * tempering * (mean - quiet * silent)
     squared = tempering**2 * (spread + mean * mean - quiet * silent * silent)
@@ -196,7 +195,7 @@ def score(
     for k in range(looks):
         for t in range(tags):
             heard[t] += hits[k, t]
-    # what a tag that is out of reach of all looks adds
+    # contribution of a tag that is out of range of all antennas
     far = np.empty((looks, 3))
     far_e = far_mean = far_spread = 0.0
     for k in range(looks):
@@ -204,7 +203,7 @@ def score(
         far_e, far_mean, far_spread = far_e + far[k, 0], far_mean + far[k, 1], far_spread + far[k, 2]
     at = np.empty((looks, 8))
     for n in range(len(poses)):
-        # sums in registers, not in arrays: a scan is one pose, and this loop is most of a smoother's step
+        # sums in local variables, for speed: this loop dominates a smoother's update
         e_sum = mean_sum = spread_sum = 0.0
         g_x = g_y = g_a = 0.0
         xx = xy = xa = yy = ya = aa = 0.0
@@ -287,7 +286,7 @@ def silence(
             g[0] += by_z * by_x
             g[1] += by_z * by_y
             g[2] += by_z * (by_heading - by_x * at[k, 7] + by_y * at[k, 6])
-        # the mean of exp(-E) over a Gaussian, E linear: it is larger than at the middle, a silence then tells less
+        # the mean of exp(-E) over a Gaussian for linear E; it exceeds the value at the mean
         across = 0.0
         for i in range(3):
             for j in range(3):

@@ -1,9 +1,9 @@
-"""RFID antennas: the probability that an inventory round of an antenna reads a tag.
+"""The detection model of RFID antennas: the probability that an inventory round of an antenna reads a tag.
 
-A detection model gives the logit of that probability, as a function of where the tag is in the antenna's frame (x along the
-boresight, y to the left, z up) and of how it faces the antenna. The probability that counts is
-``q = false_read + (1 - false_read - miss) * sigmoid(logit)``: the floor makes a read from anywhere possible, as misplaced
-tags and reflections do, which is what makes the likelihood robust. The likelihood itself: :mod:`factors.rfid.detection`.
+A model gives the logit of that probability as a function of the tag's position in the antenna's frame (x along the boresight, y to
+the left, z up) and its facing. The final probability is ``q = false_read + (1 - false_read - miss) * sigmoid(logit)``: the floor
+allows a read from anywhere, as by misplaced tags and reflections, which makes the likelihood robust. The likelihood is in
+:mod:`factors.rfid.detection`.
 """
 
 import math
@@ -19,21 +19,21 @@ from factors.se2 import Array
 
 BEAM, LOGISTIC, GRID = 0, 1, 2
 FEATURES = ("1", "r", "r^2", "w", "w^2", "r w", "|z|", "c", "c^2", "r c", "w c")
-NEGLIGIBLE_LOGIT = -14.0  # beyond a model's reach nothing but the floor is left
-NEAR = 1e-2  # m: nearer than that to an antenna no direction is defined
-PARAMETERS = 12  # the longest parameter vector of a compiled model
+NEGLIGIBLE_LOGIT = -14.0  # out of range
+NEAR = 1e-2  # m; minimum distance with a defined direction
+PARAMETERS = 12  # maximum length of a parameter vector of a compiled model
 ALMOST_ONE = 1.0 - 1e-9
 
 
 class DetectionModel(Protocol):
-    """What an antenna reads. ``reach`` [m]: beyond it, in the plane, only false reads are left."""
+    """A detection model. ``reach`` [m]: range in the plane, beyond which there are only false reads."""
 
     @property
     def reach(self) -> float: ...
 
     @property
     def uses_facing(self) -> bool:
-        """Whether the logit depends on how the tag faces the antenna."""
+        """Whether the logit depends on the tag's facing."""
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         """Kind, parameters, and knots (H, F, NX, NY) of a grid (empty for others)."""
@@ -41,8 +41,8 @@ class DetectionModel(Protocol):
 
 @dataclass(frozen=True)
 class BeamModel:
-    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2)``, with the distance r [m] and the bearing phi [rad]
-    in the plane of the boresight: the default where there is no log to learn from."""
+    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2)``, with distance r [m] and bearing phi [rad] in the
+    plane of the boresight; the default of uncalibrated antennas."""
 
     p0: float = 0.9
     r_max: float = 4.5
@@ -65,7 +65,7 @@ class BeamModel:
 @dataclass(frozen=True)
 class LogisticModel:
     """A logit that is linear in :data:`FEATURES`: distance r [m] in the plane, w = 1 - cosine of the bearing, height difference z
-    [m], and c, the cosine between the direction that the tag faces and that to the antenna (0 where the facing is not known)."""
+    [m], and c, the cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown)."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -83,10 +83,9 @@ class GridModel:
     """The paper's Cartesian field: ``logits`` (H, F, NX, NY) at knots ``cell`` [m] apart, the first at (``x0``, ``y0``) in the
     antenna's frame.
 
-    H ``heights`` (H,) [m], in ascending order, of the tag above the antenna, and F facings, evenly from -1 to 1, the cosine between
-    the direction that the tag faces and that to the antenna; one knot where it does not matter. Between knots: cubic
-    convolution in the plane and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), linear in height; beyond them the value
-    of the edge, and beyond ``reach`` nothing.
+    H ascending ``heights`` (H,) [m] of the tag above the antenna, and F evenly spaced facings from -1 to 1 (cosine of the angle
+    between the tag's facing and the direction to the antenna), or one if irrelevant. Interpolation: cubic convolution in the plane
+    and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), linear in height; constant beyond the edge up to ``reach``.
     """
 
     logits: Array
@@ -113,8 +112,8 @@ class GridModel:
 
 @dataclass(frozen=True)
 class Antenna:
-    """Place and boresight in the robot's frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (upwards) [rad]; ``model``: which of
-    the models it has."""
+    """Position and boresight of an antenna in the robot frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (up is positive) [rad];
+    ``model``: index of its model."""
 
     x: float = 0.0
     y: float = 0.0
@@ -125,9 +124,9 @@ class Antenna:
 
 
 class Packed(NamedTuple):
-    """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
-    ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
-    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model."""
+    """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch; ``which`` (A,): model
+    indices; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first index in ``knots``; ``reach``
+    (M,); ``span``: range of probabilities between the floors."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -142,7 +141,7 @@ class Packed(NamedTuple):
 
 @dataclass(frozen=True)
 class RfidModel:
-    """All antennas of a robot. ``false_read`` and ``miss``: see the module; ``tempering``: the exponent of the likelihood."""
+    """All antennas of a robot. ``false_read`` and ``miss``: see the module; ``tempering``: exponent of the likelihood."""
 
     antennas: tuple[Antenna, ...]
     models: tuple[DetectionModel, ...]
@@ -151,7 +150,7 @@ class RfidModel:
     tempering: float = 1.0
 
     def packed(self) -> Packed:
-        """As compiled code takes it."""
+        """The model for compiled code."""
         compiled = [model.compiled() for model in self.models]
         parameters = np.zeros((len(compiled), PARAMETERS))
         shapes = np.zeros((len(compiled), 5), dtype=np.int64)
@@ -180,7 +179,7 @@ class RfidModel:
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
     """Logit (N,) and its gradient (N, 4) by x, y, z and facing, for tags at ``points`` (N, 3) [m] in the antenna's frame.
 
-    ``facing`` (N,): cosine between the direction that the tag faces and that to the antenna.
+    ``facing`` (N,): cosine of the angle between the tag's facing and the direction to the antenna.
     """
     packed = RfidModel((Antenna(),), (model,)).packed()
     points = np.atleast_2d(np.asarray(points, dtype=float))
@@ -198,7 +197,7 @@ def probability(model: DetectionModel, points: Array, facing: Array | float = 0.
 def bake(
     model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
 ) -> GridModel:
-    """Any model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
+    """Sample a model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
     count = 2 * math.ceil(extent / cell) + 1
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
@@ -273,7 +272,7 @@ def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, 
 
 @numba.njit(cache=True)
 def _cubic(f: float) -> tuple[float, float, float, float]:
-    """Weights of the four knots around a place ``f`` in [0, 1] between the middle ones."""
+    """Weights of four knots for a position ``f`` in [0, 1] between the middle ones."""
     return (
         ((-0.5 * f + 1.0) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1.0,
@@ -284,7 +283,7 @@ def _cubic(f: float) -> tuple[float, float, float, float]:
 
 @numba.njit(cache=True)
 def _slope(f: float) -> tuple[float, float, float, float]:
-    """Derivatives of these weights."""
+    """Derivatives of the weights of :func:`_cubic`."""
     return (
         (-1.5 * f + 2.0) * f - 0.5,
         (4.5 * f - 5.0) * f,
@@ -295,7 +294,7 @@ def _slope(f: float) -> tuple[float, float, float, float]:
 
 @numba.njit(cache=True)
 def _place(s: float, count: int) -> tuple[int, float, float]:
-    """The knot below ``s`` (in knots), the place above it, and whether ``s`` lies inside (the derivative is zero outside)."""
+    """The knot below ``s``, the fraction above it, and the derivative of clipping (1 inside, 0 outside)."""
     if count == 1 or s <= 0.0:
         return 0, 0.0, 0.0
     if s >= count - 1:

@@ -1,16 +1,15 @@
-"""The likelihood of the phase of RFID reads: from decimetres to centimetres, where the pose is known to decimetres.
+"""The likelihood of the phase of RFID reads, which refines a pose known to decimetres to centimetres.
 
-The carrier goes from an antenna to a tag and back, so a reader reports ``phi = offset - 4 pi d / lambda`` (mod 2 pi), with the
-distance d [m] and an offset of each antenna, tag and channel that nobody knows (Nikitin et al., IEEE RFID 2010, eq. 4).
-Many readers add pi at random; twice the phase has no such ambiguity: ``psi = 2 phi + 8 pi d / lambda`` is constant over the R
-reads of a group, one antenna's of one tag on one channel within a window. Under von Mises' density of concentration kappa, the
-offset at its most likely value, the negative log-likelihood of a group is
+A reader reports ``phi = offset - 4 pi d / lambda`` (mod 2 pi) for the distance d [m] to the tag, with an unknown offset of each
+antenna, tag and channel (Nikitin et al., IEEE RFID 2010, eq. 4). Many readers add pi at random, to which twice the phase is
+invariant: ``psi = 2 phi + 8 pi d / lambda`` is constant over the R reads of a group (one antenna, tag and channel in a window).
+With a von Mises density of concentration kappa and the most likely offset, the negative log-likelihood of a group is
 
-    nll = kappa (R - |S|),  S = sum exp(i psi),
+ nll = kappa (R - |S|),  S = sum exp(i psi),
 
-without any phase to be unwrapped. With c and s, cosine and sine of psi - arg S, its gradient is ``kappa sum s dpsi``, and its
-Hessian, but for the curvature of the distances, ``kappa sum c (dpsi - m)(dpsi - m)^T`` with m the mean of dpsi weighted by c. Reads
-with c < 0 are left out of that, which makes it positive semi-definite.
+without phase unwrapping. With c and s, cosine and sine of psi - arg S, its gradient is ``kappa sum s dpsi``, and its Hessian,
+neglecting the curvature of the distances, ``kappa sum c (dpsi - m)(dpsi - m)^T`` with m the mean of dpsi weighted by c. Reads with
+c < 0 are excluded from it, which makes it positive semi-definite.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from factors.se2 import Array
 
 Integers = NDArray[np.int64]
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
-CHANNEL = 1e3  # Hz: carriers nearer than that are one channel
+CHANNEL = 1e3  # Hz; carriers closer than that are one channel
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseReads:
-    """R reads of a window, or of several, each at its own place on the way.
+    """R reads of one or several windows, each at its own pose.
 
-    ``offsets`` (R, 3): the robot's pose at the read, in the frame of the pose that the likelihood is of; ``antennas`` (R,) and
-    ``tags`` (R,): places in the model and in the map; ``phase`` (R,) [rad] as reported, ``frequency`` (R,) [Hz] of the carrier;
-    ``windows`` (R,): numbers of the windows that they belong to, where these are several.
+    ``offsets`` (R, 3): the robot's pose at the read, in the frame of the likelihood's pose; ``antennas`` (R,) and ``tags`` (R,):
+    indices in the model and in the map; ``phase`` (R,) [rad] as reported, ``frequency`` (R,) [Hz] of the carrier; ``windows`` (R,):
+    window numbers, if there are several.
     """
 
     offsets: Array
@@ -51,23 +50,23 @@ class PhaseReads:
     windows: Integers
 
     def moved(self, offset: Array) -> PhaseReads:
-        """The same reads, of the pose that lies ``offset`` (3,) before theirs."""
+        """The reads relative to the pose that lies ``offset`` (3,) before theirs."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> PhaseReads:
-        """Some of them, in a given order."""
+        """The selected reads."""
         return PhaseReads(*(getattr(self, f.name)[which] for f in fields(self)))
 
     @cached_property
     def groups(self) -> Integers:
-        """Which group each read belongs to (R,), numbered from 0."""
+        """The group of each read (R,), numbered from 0."""
         channel = np.rint(self.frequency / CHANNEL).astype(np.int64)
         rows = np.column_stack((self.windows, self.tags, self.antennas, channel))
         return np.asarray(np.unique(rows, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
 
     @cached_property
     def ordered(self) -> _Ordered:
-        """Group by group, as compiled code takes them."""
+        """The reads sorted by group, for compiled code."""
         order = np.argsort(self.groups, kind="stable")
         counts = np.bincount(self.groups)
         return _Ordered(
@@ -93,9 +92,8 @@ class _Ordered(NamedTuple):
 
 @dataclass(frozen=True)
 class PhaseModel:
-    """``antennas``: where they are on the robot; ``kappa``: concentration of twice the phase; ``tempering``: exponent of the
-    likelihood, for reads and windows that go together; ``max_range`` [m]: beyond it reflections spoil the phase, which then turns
-    too slowly with the distance; ``min_reads``: of a group, fewer of which say nothing."""
+    """``antennas``: their mounting; ``kappa``: concentration of twice the phase; ``tempering``: exponent of the likelihood, for
+    correlated reads and windows; ``max_range`` [m]: limit because of reflections; ``min_reads``: minimum per group."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
@@ -105,7 +103,7 @@ class PhaseModel:
 
 
 class PhaseScore(NamedTuple):
-    """Of N poses, all tempered. ``nll`` (N,); ``gradient`` (N, 3) and ``information`` (N, 3, 3) by body-frame perturbation."""
+    """Tempered likelihoods of N poses. ``nll`` (N,); ``gradient`` (N, 3), ``information`` (N, 3, 3) by body-frame perturbation."""
 
     nll: Array
     gradient: Array
@@ -114,7 +112,7 @@ class PhaseScore(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PhaseLikelihood:
-    """The likelihood of a model with a map of tags."""
+    """The likelihood of a phase model with a map of tags."""
 
     model: PhaseModel
     tags: TagArray
@@ -125,9 +123,9 @@ class PhaseLikelihood:
         object.__setattr__(self, "_antennas", places)
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
-        """The reads within the model's range of a pose (3,), of groups that have enough of them.
+        """The reads within the model's range of a pose (3,), in groups with enough of them.
 
-        To be called once for a window, with the best pose known: a choice that followed the pose would tear the likelihood.
+        Call this once per window with the best known pose: a selection that depends on the pose makes the likelihood discontinuous.
         """
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]
@@ -145,7 +143,7 @@ class PhaseLikelihood:
         return PhaseScore(*(self.model.tempering * self.model.kappa * part for part in out))
 
     def log_likelihood(self, poses: Array, reads: PhaseReads) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3): for particles."""
+        """Tempered log-likelihood (N,) at poses (N, 3), for particles."""
         out = np.zeros(len(poses))
         poses = np.ascontiguousarray(poses, dtype=float)
         _log_likelihood(self._antennas, self.tags.points, poses, *reads.ordered, out)
@@ -185,7 +183,7 @@ def _log_likelihood(
 
 @numba.njit(cache=True)
 def _on_robot(offset: Array, place: Array) -> tuple[float, float]:
-    """Where an antenna was, in the frame of the pose that the reads are of."""
+    """Position of an antenna in the frame of the likelihood's pose."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * place[0] - s * place[1], offset[1] + s * place[0] + c * place[1]
 
@@ -226,7 +224,7 @@ def _score(
 
 @numba.njit(cache=True)
 def _add_group(psi: Array, by: Array, begin: int, end: int, gradient: Array, information: Array) -> float:
-    """Gradient (3,) and information (3, 3) of a group, for kappa 1, are added to; its negative log-likelihood is returned."""
+    """Add gradient (3,) and information (3, 3) of a group, for kappa 1; returns its negative log-likelihood."""
     real = imaginary = 0.0
     for r in range(begin, end):
         real += math.cos(psi[r])

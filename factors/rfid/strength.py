@@ -1,9 +1,9 @@
-"""The likelihood of how strong RFID reads were received: log-distance path loss with the antenna's pattern.
+"""The likelihood of the signal strength of RFID reads: log-distance path loss with the antenna's pattern.
 
 ``rssi = a0 - 10 a1 log10(d) + a2 w + a3 w^2 + a4 c + a5 c^2`` [dBm], with the distance d [m] from the antenna to the tag,
-w = 1 - cosine of the angle from the boresight, and c the cosine between the direction that the tag faces and that to the antenna
-(0 where that is not known): Rappaport, "Wireless Communications", 2002, eq. 4.69a, with a series for the gains. Residuals have
-Student's density, as reflections make outliers (Lange, Little, Taylor, JASA 84, 1989); Fisher's information of it is
+w = 1 - cosine of the angle from the boresight, and c the cosine of the angle between the tag's facing and the direction to the
+antenna (0 if unknown): Rappaport, "Wireless Communications", 2002, eq. 4.69a, with a series for the gains. Residuals have a Student
+density, because reflections cause outliers (Lange, Little, Taylor, JASA 84, 1989); its Fisher information is
 ``(dof + 1) / (dof + 3) / sigma^2``.
 """
 
@@ -25,16 +25,16 @@ from factors.se2 import Array
 
 Integers = NDArray[np.int64]
 FEATURES = ("1", "-10 log10 d", "w", "w^2", "c", "c^2")
-NEAR = 0.1  # m: nearer than that no path loss is known
+NEAR = 0.1  # m; minimum distance of the path loss
 DECIBEL = 10.0 / math.log(10.0)
 
 
 @dataclass(frozen=True, eq=False)
 class RssiReads:
-    """R reads, each at its own place on the way.
+    """R reads, each at its own pose.
 
-    ``offsets`` (R, 3): the robot's pose at the read, in the frame of the pose that the likelihood is of; ``antennas`` (R,) and
-    ``tags`` (R,): places in the model and in the map; ``rssi`` (R,) [dBm].
+    ``offsets`` (R, 3): the robot's pose at the read, in the frame of the likelihood's pose; ``antennas`` (R,) and ``tags`` (R,):
+    indices in the model and in the map; ``rssi`` (R,) [dBm].
     """
 
     offsets: Array
@@ -43,18 +43,18 @@ class RssiReads:
     rssi: Array
 
     def moved(self, offset: Array) -> RssiReads:
-        """The same reads, of the pose that lies ``offset`` (3,) before theirs."""
+        """The reads relative to the pose that lies ``offset`` (3,) before theirs."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> RssiReads:
-        """Some of them, in a given order."""
+        """The selected reads."""
         return RssiReads(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class RssiModel:
-    """``antennas``: where they are and look; ``coefficients`` (6,) in the order of :data:`FEATURES`; ``sigma`` [dB] and ``dof``: of
-    Student's density; ``tempering``: exponent of the likelihood, for reads that go together."""
+    """``antennas``: their mounting; ``coefficients`` (6,) in the order of :data:`FEATURES`; ``sigma`` [dB] and ``dof``: of the
+    Student density; ``tempering``: exponent of the likelihood, for correlated reads."""
 
     antennas: tuple[Antenna, ...]
     coefficients: Sequence[float]
@@ -64,7 +64,7 @@ class RssiModel:
 
 
 class RssiScore(NamedTuple):
-    """Of N poses, all tempered. ``nll`` (N,), less what it is without residuals, so never negative; ``gradient`` (N, 3) and
+    """Tempered likelihoods of N poses. ``nll`` (N,), relative to zero residuals, so never negative; ``gradient`` (N, 3) and
     ``information`` (N, 3, 3) by body-frame perturbation."""
 
     nll: Array
@@ -74,7 +74,7 @@ class RssiScore(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of a model with a map of tags."""
+    """The likelihood of a strength model with a map of tags."""
 
     model: RssiModel
     tags: TagArray
@@ -95,7 +95,7 @@ class RssiLikelihood:
         return RssiScore(*(m.tempering * part for part in out))
 
     def log_likelihood(self, poses: Array, reads: RssiReads) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), up to a constant: for particles."""
+        """Tempered log-likelihood (N,) at poses (N, 3), up to a constant, for particles."""
         m = self.model
         out = np.zeros(len(poses))
         poses = np.ascontiguousarray(poses, dtype=float)
@@ -105,7 +105,7 @@ class RssiLikelihood:
 
 
 def placed(antennas: Sequence[Antenna]) -> Array:
-    """Place and boresight (A, 6) of antennas, in the robot's frame."""
+    """Position and boresight (A, 6) of antennas in the robot frame."""
     rows = [
         (a.x, a.y, a.z, math.cos(a.yaw) * math.cos(a.pitch), math.sin(a.yaw) * math.cos(a.pitch), math.sin(a.pitch))
         for a in antennas
@@ -130,7 +130,7 @@ def _features(antenna: Array, point: Array, normal: Array, pose: Array, offset: 
     """Features (6,) and their derivatives (6, 3) by the pose's body-frame perturbation."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     co, so = math.cos(offset[2]), math.sin(offset[2])
-    # in the frame of the pose: the antenna, its boresight, the way to the tag, the tag's normal
+    # in the frame of the pose: the antenna, its boresight, the vector to the tag, the tag's normal
     px, py = offset[0] + co * antenna[0] - so * antenna[1], offset[1] + so * antenna[0] + co * antenna[1]
     bx, by_, bz = co * antenna[3] - so * antenna[4], so * antenna[3] + co * antenna[4], antenna[5]
     wx, wy = point[0] - pose[0], point[1] - pose[1]
@@ -141,7 +141,7 @@ def _features(antenna: Array, point: Array, normal: Array, pose: Array, offset: 
     c = -(nx * ex + ny * ey) / d
     out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, -DECIBEL * math.log(d), w, w * w, c, c * c
     for i in range(3):
-        # x, y: the antenna moves, the tag does not; heading: way and normal turn backwards
+        # x, y: the antenna moves, the tag does not; heading: vector and normal rotate backwards
         if i == 0:
             dx, dy, dnx, dny = -1.0, 0.0, 0.0, 0.0
         elif i == 1:
@@ -170,7 +170,7 @@ def _log_likelihood(
     rssi: Array,
     out: Array,
 ) -> None:
-    """What ``_score`` does, for many poses, without derivatives."""
+    """:func:`_score` for many poses, without derivatives."""
     heading = np.column_stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])))
     for r in range(len(rssi)):
         antenna, point, normal = antennas[which[r]], points[tags[r]], normals[tags[r]]

@@ -1,7 +1,7 @@
-"""The likelihood of reads for many poses without derivatives, as particles need it: from tables of each model's field.
+"""Tabulated likelihood of RFID reads for many poses without derivatives, for particles.
 
-A table holds the field of one antenna model at one height of tags, in cells of :data:`CELL`, and with facing where the model
-has it. Tags are taken one by one, as all poses look at places of a tag's table that are close together.
+A table holds the field of an antenna model at one height of tags, in cells of :data:`CELL`, and with facings if the model uses
+them. The outer loop runs over tags, because all poses access nearby cells for one tag.
 """
 
 import math
@@ -20,14 +20,14 @@ Array32 = NDArray[np.float32]
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
 STEP = 0.01  # of the logit, in the tables of logarithms
-LEVEL = 0.04  # m: tags at the same height, to so much, share a table
+LEVEL = 0.04  # m; tags within this height range share a table
 
 
 class Tables(NamedTuple):
-    """``logits``: places in ``logs`` of all tables, one after another, each (F, NX, NX), and ``missed``: log(1 - q) there;
-    ``start`` (L,): first place of each;
-    ``half`` (L,): knots from its middle to its edge; ``facings`` (L,); ``level`` (A, T): which table an antenna has for a tag;
-    ``logs`` (Z, 2): log q and log(1 - q) of logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative."""
+    """``logits``: indices into ``logs`` of all tables, each (F, NX, NX), and ``missed``: log(1 - q) there; ``start`` (L,): first
+    index of each table; ``half`` (L,): knots from its middle to its edge; ``facings`` (L,); ``level`` (A, T): table of each
+    antenna and tag; ``logs`` (Z, 2): log q and log(1 - q) for logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its
+    negative."""
 
     logits: NDArray[np.uint16]
     missed: NDArray[np.float32]
@@ -39,7 +39,7 @@ class Tables(NamedTuple):
 
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
-    """One table for each model, pitch and height difference that there is, for tags at ``heights`` (T,) [m]."""
+    """One table for each model, pitch and height difference, for tags at ``heights`` (T,) [m]."""
     z = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
     q = packed.false_read + packed.span / (1.0 + np.exp(-z))
     with np.errstate(divide="ignore"):
@@ -88,9 +88,9 @@ def add_log_likelihood(
     out: Array,
     each: Array32,
 ) -> None:
-    """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
-    (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
-    added by itself, above what it is out of reach, -1 of tags that go to ``out``."""
+    """Add to ``out`` (N,) the untempered log-likelihood that an antenna at robot poses (N, 3) reads each tag at ``points`` (T, 3)
+    with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): row of ``each`` (U, N) to which a tag is added
+    instead, relative to a tag out of range; -1 for ``out``."""
     arrays = (points, normals, hits, rounds, apart)
     if packed.kinds[packed.which[antenna]] == LOGISTIC:
         _add_direct(packed, antenna, poses, *arrays, tables.logs, out, each)
@@ -100,8 +100,8 @@ def add_log_likelihood(
 
 @numba.njit(cache=True, fastmath=FAST)
 def add_mixed(each: Array32, odds: Array, tempering: float, out: Array) -> None:
-    """Add to ``out`` (N,) the tempered log-likelihood of U silent tags that may be dead, with log-odds ``odds`` (U,) before, of
-    which ``each`` (U, N) is that if they are alive (:mod:`factors.rfid.tag_states`)."""
+    """Add to ``out`` (N,) the tempered log-likelihood of U silent tags with prior log-odds ``odds`` (U,) of being dead; ``each``
+    (U, N): that of alive tags (:mod:`factors.rfid.tag_states`)."""
     for u in range(len(odds)):
         dead = 1.0 / (1.0 + math.exp(-odds[u]))
         for n in range(len(out)):
@@ -111,7 +111,7 @@ def add_mixed(each: Array32, odds: Array, tempering: float, out: Array) -> None:
 
 @numba.njit(cache=True)
 def _index(z: float) -> int:
-    """Place of a logit in the tables of logarithms."""
+    """Index of a logit in the tables of logarithms."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
 
 
@@ -128,7 +128,7 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
 
 @numba.njit(cache=True)
 def _out_of_reach(poses: Array, points: Array, reach: float) -> NDArray[np.bool_]:
-    """Which tags (T,) no robot at any of the poses, with an antenna that reaches so far from its middle, can read."""
+    """The tags (T,) that are out of range of an antenna with this reach for all poses."""
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
     for n in range(1, len(poses)):
@@ -161,7 +161,7 @@ def _add_tabled(
     ax, ay, ca, sa = a[0], a[1], a[3], a[4]
     logs = tables.logs
     far = _out_of_reach(poses, points, packed.reach[packed.which[antenna]] + math.sqrt(ax * ax + ay * ay))
-    # place and direction of the antenna at each pose, in cells
+    # position and direction of the antenna at each pose, in cells
     x, y = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
     c, s = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
     inverse = 1.0 / CELL
@@ -172,7 +172,7 @@ def _add_tabled(
         y[n] = (poses[n, 1] - middle_y + st * ax + ct * ay) * inverse
         c[n], s[n] = ct * ca - st * sa, st * ca + ct * sa
     constant = 0.0
-    # tag by tag, as all poses look at places of its table that are close together
+    # tags in the outer loop, because all poses access nearby cells for one tag
     certain = np.zeros(len(poses), np.float32)
     for t in range(len(points)):
         if far[t]:
@@ -221,12 +221,12 @@ def _add_missed(
     rounds: np.float32,
     total: Array32,
 ) -> None:
-    """The commonest case: a tag that was not read."""
+    """Add a tag that was not read, the most frequent case."""
     width, ends = np.int32(size), np.int32(size - 1)
     to_middle = np.float32((size - 1) // 2 + 0.5)
     for n in range(len(x)):
         ex, ey = tx - x[n], ty - y[n]
-        # beyond the table nothing is left, as at its edge
+        # constant beyond the edge of the table
         i = min(max(np.int32(c[n] * ex + s[n] * ey + to_middle), np.int32(0)), ends)
         j = min(max(np.int32(c[n] * ey - s[n] * ex + to_middle), np.int32(0)), ends)
         total[n] += rounds * missed[np.int32(i * width + j)]
@@ -249,7 +249,7 @@ def _add_facing(
     logs: Array,
     total: Array32,
 ) -> None:
-    """A tag whose facing matters: between two layers of its table."""
+    """Add a tag with facing, interpolated between two layers of its table."""
     ends = size - 1
     to_middle = np.float32((size - 1) // 2 + 0.5)
     for n in range(len(x)):
@@ -279,7 +279,7 @@ def _add_direct(
     out: Array,
     each: Array32,
 ) -> None:
-    """The same for a logistic model, which is computed faster than it is looked up for all facings."""
+    """The same for a logistic model, which is faster to compute than to look up for all facings."""
     m = packed.which[antenna]
     b = packed.parameters[m]
     reach2 = packed.reach[m] ** 2

@@ -1,4 +1,4 @@
-"""What RFID antennas read and did not read of one tag whose place is not known, as a factor on a pose and that place."""
+"""Reads and misses of one tag with unknown position, as a factor on a pose and that position."""
 
 import math
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ UNKNOWNS = 5
 
 @dataclass(frozen=True, eq=False)
 class RfidTagFactor:
-    """The likelihood of looks at tag number ``tag`` of ``likelihood``, on the pose (3,) that they are placed around and on the
-    tag's position (2,) in the world, in compressed Fisher form (:mod:`factors.compressed`): six residuals for any number of looks.
+    """The likelihood of read counts of tag number ``tag`` of ``likelihood``, as a factor on the pose (3,) and the tag's position
+    (2,) in the world, in compressed Fisher form (:mod:`factors.compressed`): six residuals.
 
-    Height and facing of the tag are those that ``likelihood`` has; its position there is not used.
+    Height and facing of the tag are those in ``likelihood``; its position there is not used.
     """
 
     likelihood: RfidLikelihood
@@ -41,8 +41,8 @@ class RfidTagFactor:
         return self.score(values)[0]
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
-        """Tempered: negative log-likelihood, its gradient (5,) and Fisher's information (5, 5) by the body-frame perturbation of
-        the pose and the position in the world."""
+        """Tempered negative log-likelihood, its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation of the
+        pose and the position in the world."""
         gradient, information = np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS))
         tags, looks = self.likelihood.tags, self.looks
         point = np.array((values[1][0], values[1][1], tags.points[self.tag, 2]))
@@ -80,10 +80,10 @@ def _joint(
         nll += e
         if f == 0.0 and g == 0.0:
             continue
-        # by the tag's place in the world, and in the frame of the pose
+        # by the tag's position in the world, and in the frame of the pose
         wx, wy = c * by_p - s * by_q, s * by_p + c * by_q
         gx, gy = c0 * wx + s0 * wy, c0 * wy - s0 * wx
-        # the antenna's place in the frame of the pose
+        # the antenna's position in the frame of the pose
         px, py = c0 * (x - pose[0]) + s0 * (y - pose[1]), c0 * (y - pose[1]) - s0 * (x - pose[0])
         by[0], by[1], by[2], by[3], by[4] = -gx, -gy, by_heading + gx * py - gy * px, wx, wy
         for i in range(5):

@@ -1,4 +1,4 @@
-"""Gaussian update of a pose by what antennas read."""
+"""Gaussian update of a pose by RFID likelihoods."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from factors.se2 import Array, Integers
 
 _Tags = tuple[Array, Array]  # points and normals
 _Seen = tuple[Array, Integers, Integers, Integers, Array]  # offsets, antennas, rounds, hits and odds
-CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
-LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
+CONVERGED = 0.1  # standard deviations; convergence limit of a step
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: maximum step
 ITERATIONS = 4
-NOTHING_TOLD = 1e-9  # added to an information that may be singular
-TELLING = 1e-6  # eigenvalue of an information that counts
+NOTHING_TOLD = 1e-9  # added to an information matrix that may be singular
+TELLING = 1e-6  # minimum relevant eigenvalue of an information matrix
 
 
 @dataclass(frozen=True)
 class TagUpdate:
-    """A pose (3,) with body-frame covariance (3, 3) after looks at tags.
+    """A pose (3,) with body-frame covariance (3, 3) after an RFID update.
 
-    ``nis``: normalised square of the score before, of ``dof`` degrees of freedom; ``excess_nll`` and ``variance``: how much larger
-    the negative log-likelihood was there than expected, and the variance of that; ``evidence``: log-probability of the looks,
-    by Laplace's method.
+    ``nis``: normalised square of the prior score, with ``dof`` degrees of freedom; ``excess_nll`` and ``variance``: excess of the
+    prior negative log-likelihood over its expected value, and its variance; ``evidence``: log-probability of the measurements, by
+    Laplace's method.
     """
 
     pose: Array
@@ -47,14 +47,14 @@ class TagUpdate:
 def update(
     likelihood: RfidLikelihood, looks: TagReadCounts, pose: Array, covariance: Array, iterations: int = ITERATIONS
 ) -> TagUpdate:
-    """The most likely pose after looks at tags; see :func:`updated`."""
+    """The most likely pose after reads and misses of tags; see :func:`updated`."""
     return updated([RfidFactor(likelihood, looks)], pose, covariance, iterations)
 
 
 def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int = ITERATIONS) -> TagUpdate:
-    """The most likely pose under a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
+    """The most likely pose for a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
 
-    A step that does not lower the cost is halved. What is told of the innovation is that of the first factor.
+    A step that does not lower the cost is halved. The innovation is that of the first factor.
     """
     pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
     likelihood, looks = factors[0].likelihood, factors[0].seen
@@ -64,7 +64,7 @@ def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, itera
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
     try:
         return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
-    except np.linalg.LinAlgError:  # rounding made it singular
+    except np.linalg.LinAlgError:  # singular by rounding
         return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations))
 
 
@@ -74,7 +74,7 @@ def scored_update(factors: Sequence[RfidFactor], pose: Array, covariance: Array,
     sigmas = np.sqrt(np.diag(covariance))
     scores = [factor.score(pose) for factor in factors]
     first = scores[0]
-    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
+    # the scatter of a single scan's score does not depend on the tempering, which accounts for correlation between scans
     tempering = factors[0].likelihood.model.tempering
     nis, dof = _innovation(first.gradient[0], first.information[0], covariance, tempering)
     surprise = variance = 0.0
@@ -116,7 +116,7 @@ def _total(scores: Sequence[TagScore]) -> tuple[float, Array, Array]:
 def _updated(
     packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array, covariance: Array, iterations: int
 ) -> tuple[Array, Array, float, int, float, float, float]:
-    """What :func:`scored_update` does, by one factor of looks."""
+    """:func:`scored_update` by one factor of read counts."""
     here = _score(packed, tags, seen, tempering, pose)
     prior_information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     nis, dof = _innovation(here.gradient[0], here.information[0], covariance, tempering)
@@ -148,7 +148,7 @@ def _updated(
 
 @numba.njit(cache=True)
 def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
-    """Of one pose (3,), as of :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
+    """The score of one pose (3,), see :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
     points, normals = tags
     offsets, antennas, rounds, hits, odds = seen
     nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
@@ -169,7 +169,7 @@ def _stepped(pose: Array, step: Array) -> Array:
 
 @numba.njit(cache=True)
 def _apart(pose: Array, other: Array) -> Array:
-    """The twist that leads from one pose to another."""
+    """The twist from one pose to another."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     dx, dy = other[0] - pose[0], other[1] - pose[1]
     return np.array(se2_kernels.log(c * dx + s * dy, c * dy - s * dx, other[2] - pose[2]))
@@ -177,7 +177,7 @@ def _apart(pose: Array, other: Array) -> Array:
 
 @numba.njit(cache=True)
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
-    """The step (3,) of Fisher scoring from where the pose has ``moved`` (3,) to, shortened to the largest allowed."""
+    """The step (3,) of Fisher scoring at a displacement ``moved`` (3,) from the prior, limited to the maximum step."""
     step = -np.linalg.solve(prior_information + information, gradient + prior_information @ moved)
     step *= min(1.0, np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12)))
     return np.asarray(step)
@@ -185,7 +185,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @numba.njit(cache=True)
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """Covariance (3, 3) after an update, and the log of its determinant's ratio to that before."""
+    """Covariance (3, 3) after an update, and the log ratio of its determinant to the prior's."""
     posterior = np.asarray(np.linalg.inv(prior_information + information))
     return posterior, float(np.linalg.slogdet(posterior)[1] + np.linalg.slogdet(prior_information)[1])
 
@@ -194,9 +194,7 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
     spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(3)
-    if (
-        covariance[0, 0] + covariance[1, 1] > FAR
-    ):  # of one direction so much more than of the others that these would be lost
+    if covariance[0, 0] + covariance[1, 1] > FAR:  # one direction dominates so much that the others would be lost
         units = np.sqrt(np.diag(spread))
         gradient = gradient / units
         spread = spread / units.reshape(3, 1) / units + ROUNDING * np.eye(3)

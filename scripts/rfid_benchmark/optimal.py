@@ -58,7 +58,7 @@ def optimal_filter(log: Log) -> Trajectory:
     motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
     likelihood = tags.likelihood
     if likelihood is None:
-        raise InputError(f"{log.name}: its rig says nothing of RFID")
+        raise InputError(f"{log.name}: its rig has no RFID antennas")
     grid = GridFilter(prior, *extent(log.world, tags.map.tags))
     before = None
     t, means, covariances = [], [], []

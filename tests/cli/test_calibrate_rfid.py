@@ -95,4 +95,4 @@ def test_without_places_of_antennas_nothing_is_learnt(fgloc, calibrated, tmp_pat
     empty.write_text('name = "empty"\n')
     result = fgloc("calibrate", log, "--rig", empty, "-o", tmp_path / "a.rig.toml")
     assert result.exit_code == 2
-    assert "its rig says nothing of RFID, expected the antennas' places in [rfid.antennas]" in result.stderr
+    assert "its rig has no RFID antennas, expected their mounting in [rfid.antennas]" in result.stderr

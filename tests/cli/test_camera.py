@@ -45,7 +45,7 @@ def hall(tmp_path):
 def test_info(fgloc, hall):
     result = fgloc("info", hall)
     assert result.exit_code == 0
-    line = r"images: 10, of 160x120 px; 10 of the 10 looked at can be read, with \d\d orb features \(median\)"
+    line = r"images: 10, of 160x120 px; 10 of the 10 examined can be read, with \d\d orb features \(median\)"
     assert re.search(line, result.stdout)
     assert json.loads(fgloc("info", hall, "--json").stdout)["images"]["sizes"] == {"160x120": 10}
 
@@ -67,7 +67,7 @@ def test_bad_images_are_told_of_and_the_run_goes_on(fgloc, hall, tmp_path):
     result = fgloc("run", hall, "-e", "ekf", "-o", tmp_path / "out")
     assert result.exit_code == 0
     for text in (
-        "camera.csv: 1 of 10 images are missing and left out, the first is 1.png of row 3",
+        "camera.csv: 1 of 10 images are missing and skipped, the first is 1.png of row 3",
         "hall: 1 of 9 images cannot be read and are without features",
         "hall: 1 of 9 images have another size and are without features",
         "hall: 1 of 9 images show no features",

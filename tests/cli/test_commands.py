@@ -184,7 +184,7 @@ def test_run_aligns_where_the_map_was_free(fgloc, short_log, tmp_path, monkeypat
 
     monkeypatch.setattr("factorgraph_loc.experiments.run.run", mapping)
     result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
-    assert "final, aligned as the map was free: position RMSE 0." in result.stdout
+    assert "final, aligned because the map was free: position RMSE 0." in result.stdout
     assert "learnt landmarks: 4, aligned RMSE 0." in result.stdout
 
 

@@ -29,7 +29,7 @@ def file(tmp_path, short_log, monkeypatch):
 def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     plan = fgloc("experiment", "run", file, "--dry-run")
     assert plan.exit_code == 0, plan.output
-    assert "2 runs, 2 to be made" in plan.stdout
+    assert "2 runs, 2 to do" in plan.stdout
     made = fgloc("experiment", "run", file, "--jobs", 1)
     assert made.exit_code == 0, made.output
     assert "1 of 1" in made.stdout
@@ -76,7 +76,7 @@ def test_a_damaged_table_of_results_is_written_anew(fgloc, file, tmp_path, conte
         pl.DataFrame({"label": [1], "estimator": ["ekf"], "log": ["short"], "duration": ["x"]}).write_parquet(index)
     else:
         index.write_bytes(content)
-    assert "2 runs, 2 to be made" in fgloc("experiment", "run", file, "--dry-run").stdout
+    assert "2 runs, 2 to do" in fgloc("experiment", "run", file, "--dry-run").stdout
     assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
     assert len(pl.read_parquet(index)) == 2
 
@@ -152,7 +152,7 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, proc
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
     stderr = process.communicate(timeout=processes.PATIENCE)[1]
     assert process.returncode == 130
-    assert stderr.endswith("the same command goes on\n")
+    assert stderr.endswith("the same command resumes\n")
     assert stderr.count("\n") == 1
     assert "Traceback" not in stderr
     assert len(pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")) == 1

@@ -64,7 +64,7 @@ def test_a_reference_in_space(fgloc, tmp_path, monkeypatch):
     monkeypatch.setattr(LogOptions, "load_one", lambda *_: log)  # the native format has no logs in space
     assert fgloc("export", "carried", "-o", tmp_path / "a.kitti").exit_code == 0
     assert np.loadtxt(tmp_path / "a.kitti")[1].tolist() == [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3]
-    assert "goes into .kitti only" in fgloc("export", "carried", "-o", tmp_path / "a.tum").stderr
+    assert "which only .kitti supports" in fgloc("export", "carried", "-o", tmp_path / "a.tum").stderr
 
 
 def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):
@@ -88,8 +88,8 @@ def test_bad_input(fgloc, short_log, comparison, ekf, tmp_path):
 
     assert "has the suffix '.csv', expected one of .mcap, .tum, .kitti, .g2o" in error(ekf, short_log, "-o", "a.csv")
     several = error(comparison, short_log, "-o", tmp_path / "a.tum")
-    assert "is of one run, and there are 2 (dead_reckoning, ekf), expected the folder of one" in several
-    assert "is of one run, and there is none" in error(short_log, "-o", tmp_path / "a.g2o")
+    assert "holds one run, and there are 2 (dead_reckoning, ekf), expected the folder of one" in several
+    assert "holds one run, and there is none" in error(short_log, "-o", tmp_path / "a.g2o")
     bare = tmp_path / "bare"
     bare.mkdir()
     for file in short_log.iterdir():

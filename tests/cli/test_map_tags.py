@@ -44,7 +44,7 @@ def test_a_map_along_the_reference_can_be_used(fgloc, on_disk, room, tmp_path):
     result = fgloc("map", folder, "-o", out)
     assert result.exit_code == 0, result.output
     assert "never read: silent" in result.stdout
-    assert "root mean square distance from the given places: 0." in result.stdout
+    assert "root mean square distance from the given positions: 0." in result.stdout
     assert "the frame of the new map is that of the reference" in result.stdout
     made = read_world(out)
     assert rms(made.tags, room.world.tags) < 0.6

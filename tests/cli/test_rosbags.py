@@ -54,13 +54,13 @@ def test_a_manifest_as_json(recorded, fgloc, monkeypatch):
     monkeypatch.chdir(recorded.parent)
     document = json.loads(fgloc("manifest", recorded, "--json").stdout)
     assert document["manifest"] == tomllib.loads(fgloc("manifest", recorded).stdout)
-    assert document["remarks"][0].startswith("rfid: each message is taken as one inventory round")
+    assert document["remarks"][0].startswith("rfid: each message is treated as one inventory round")
 
 
 def test_a_manifest_of_a_bag_elsewhere(recorded, fgloc, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     proposed = fgloc("manifest", recorded)
-    assert f"put it into {recorded.parent}, or give --data-root {recorded.parent}" in proposed.stderr
+    assert f"save it in {recorded.parent}, or give --data-root {recorded.parent}" in proposed.stderr
     assert 'path = "drive.bag"' in proposed.stdout
 
 

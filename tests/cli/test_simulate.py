@@ -87,8 +87,8 @@ def test_nothing_is_rendered_for_a_folder_that_holds_something(fgloc, tmp_path):
     ("arguments", "message"),
     [
         (("office", "--images", "--image-rate", 0), "images.rate is 0"),
-        (("office", "--image-rate", 5), "expected --images with it"),
-        (("office", "--set", "images.exposure=0.01"), "expected --images with it"),
+        (("office", "--image-rate", 5), "expected --images with them"),
+        (("office", "--set", "images.exposure=0.01"), "expected --images with them"),
         (("ofice",), "did you mean office?"),
         (("missing.toml",), "missing.toml: cannot be read"),
         (("office", "--seeds", "5:5"), "expected a number such as 3, or a range"),

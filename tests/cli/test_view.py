@@ -30,7 +30,7 @@ def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run)
 
 def test_runs_without_particles_are_told(fgloc, short_log, run_folder, tmp_path):
     result = fgloc("view", run_folder, short_log, "--particles", "--rrd", tmp_path / "view.rrd", "--json")
-    assert result.stderr == "warning: no run has particles, as only a particle_filter and switching do\n"
+    assert result.stderr == "warning: no run has particles; only particle_filter and switching use them\n"
     assert json.loads(result.stdout)["runs"] == {"ekf": str(run_folder)}
 
 

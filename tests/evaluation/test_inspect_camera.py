@@ -58,7 +58,7 @@ def test_images_that_cannot_be_read(log):
     found = inspect(log)
     assert found.images.readable == 16
     (problem,) = found.problems
-    assert problem.startswith("24 of the 40 images looked at cannot be read: ")
+    assert problem.startswith("24 of the 40 examined images cannot be read:  ")
     assert "is not an image" in problem
 
 
@@ -78,7 +78,7 @@ def test_sizes(log):
 def test_black_images(log):
     for file in log.streams["camera"].file:
         cv2.imwrite(str(file), np.zeros((120, 160), dtype=np.uint8))
-    assert inspect(log).problems == ("half of the images looked at, or more, show no orb features",)
+    assert inspect(log).problems == ("half of the examined images, or more, show no orb features",)
 
 
 def test_a_rig_without_camera(log):

@@ -101,7 +101,7 @@ def test_headings_that_run_clockwise_are_told(log):
     reference = Trajectory(log.reference.t, se2.wrap(log.reference.poses * (1.0, 1.0, -1.0)))
     lines = motion_problems(replace(log, reference=reference, streams={"odometry": log.streams["odometry"]}))
     assert lines == [
-        "the reference turns the other way than the odometry: angles are counter-clockwise, seen from above"
+        "the reference turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
     ]
 
 

@@ -74,7 +74,7 @@ def test_a_log_without_reads() -> None:
     none = inspect(make_log(**only(np.zeros(360, dtype=bool)[: len(stream_of(log).t)])))
     assert none.rfid is not None
     assert none.rfid.reads == none.rfid.rounds == 0
-    assert "antenna left of the rig never listens" in none.problems
+    assert "antenna left of the rig is never active" in none.problems
 
 
 def test_tags_that_do_not_match_the_map() -> None:
@@ -92,7 +92,7 @@ def test_antennas_that_do_not_match_the_rig() -> None:
     rig = Rig(rfid=RfidSettings(antennas={"left": AntennaSettings(), "rear": AntennaSettings()}), sensors=("odometry",))
     assert inspect(dataclasses.replace(make_log(), rig=rig)).problems == (
         "antenna right is not on the rig: 60 reads, 120 rounds",
-        "antenna rear of the rig never listens",
+        "antenna rear of the rig is never active",
     )
 
 

@@ -116,7 +116,7 @@ NOTHING = np.full(8, np.nan)
 def test_landmarks_that_no_sighting_can_place_are_not_estimated(log, name, lacks):
     alone = with_sightings(log, **{lacks: NOTHING})
     message = (
-        f"straight: {name}.landmarks is unknown, but no sighting has a {lacks}, so no landmark can be placed; give a map of them "
+        f"straight: {name}.landmarks is unknown, but no sighting has a {lacks}, so no landmark can be located; give a map of them "
         f"\\(--world\\) with {name}.landmarks=known, or leave out bearing_range \\(--sensors\\)"
     )
     with pytest.raises(InputError, match=f"^{message}$"):

@@ -85,7 +85,7 @@ def test_an_estimator_that_takes_no_pixels_waits_for_no_features(seeing, fake, m
     result = run(seeing, RunConfig("fake"))
     assert result.timings.images == 0
     assert len(frames_fed(fake)) == 8
-    assert "straight: fake takes no images: all 8 are ignored" in result.warnings
+    assert "straight: fake does not use images: all 8 are ignored" in result.warnings
 
 
 def test_images_that_are_not_used_are_left_alone(seeing, sees):

@@ -133,7 +133,7 @@ def test_gaps_without_ticks_are_a_setting(log):
 def test_stamps_that_are_no_times_of_a_log(log):
     for far in (np.nan, np.inf, 1e300):
         stream = replace(log.streams["odometry"], t=np.append(log.streams["odometry"].t[:-1], far))
-        with pytest.raises(InputError, match="has a stamp"):
+        with pytest.raises(InputError, match="has a timestamp"):
             run(replace(log, streams={"odometry": stream}), RunConfig("fake", prior="0,0,0"))
 
 

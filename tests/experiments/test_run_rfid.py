@@ -111,4 +111,4 @@ def test_a_log_of_tags_alone_that_never_tells_the_place_says_so_of_tags(reading)
 def test_an_estimator_without_tags_says_so():
     log = simulate(preset("office", {"drive": {"duration": 60.0}}), 0)
     (warning,) = set(run(log, RunConfig("monoslam")).warnings) - set(run(log, RunConfig("dead_reckoning")).warnings)
-    assert warning == f"{log.name}: monoslam takes no tags: all 960 inventory rounds are ignored"
+    assert warning == f"{log.name}: monoslam does not use RFID: all 960 inventory rounds are ignored"

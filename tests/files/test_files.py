@@ -197,7 +197,7 @@ def test_long_words_and_numbers_with_points_are_no_long_keys(tmp_path):
         ("9" * 5000, "5000 digits"),
         ('{"a": NaN}', "NaN"),
         ("-Infinity", "Infinity"),
-        ('{"a": 1, "a": 2}', "'a' is there twice"),
+        ('{"a": 1, "a": 2}', "'a' is duplicate"),
         ('{"a": 1', "is not JSON"),
         ("", "is not JSON"),
         ("\ufeff1", "is not JSON"),
@@ -224,7 +224,7 @@ def test_what_another_library_raises_is_one_line():
             raise error
 
     refused(lambda: fail(ValueError("first\nsecond")), "a.npz: is no grid: first")
-    refused(lambda: fail(MemoryError()), "more memory than there is")
+    refused(lambda: fail(MemoryError()), "more memory than is available")
     refused(lambda: fail(ValueError()), "ValueError")
     refused(lambda: fail(InputError("as it is")), "as it is")
     with pytest.raises(Panic):

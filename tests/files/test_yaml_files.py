@@ -89,12 +89,12 @@ def test_keys_without_a_value_are_left_out(read):
     [
         ("a: 1\nb: [1, 2\nc: 3\n", "a.yaml:2: is not YAML that can be read: while parsing a flow sequence"),
         ("a: 1\nb 2\nc: 3\n", "a.yaml:2: is not YAML that can be read: while scanning a simple key"),
-        ("a: &x 1\nb: *x\n", "a.yaml:2: [*]x is an alias, expected what it stands for"),
+        ("a: &x 1\nb: *x\n", "a.yaml:2: [*]x is an alias, expected the value itself"),
         ("a: &x {c: 1}\nb:\n  <<: *x\n", "a.yaml:3: [*]x is an alias"),
-        ("a: 1\nb: " + "[" * 1000 + "]" * 1000, f"a.yaml:2: more than {DEEPEST} blocks are within each other"),
+        ("a: 1\nb: " + "[" * 1000 + "]" * 1000, f"a.yaml:2: blocks are nested more than {DEEPEST} deep"),
         ("a: 1\n---\nb: 2\n", "a.yaml:1: .* expected a single document"),
         ("- 1\n- 2\n", "a.yaml:1: .* expected key: value"),
-        ("a: 1\n? [b]\n: 2\n", "a.yaml:2: a key is no text"),
+        ("a: 1\n? [b]\n: 2\n", "a.yaml:2: a key is not text"),
         ("a: 1\n\tb: 2\n", "a.yaml:2: is not YAML"),
         ("a: \x07\n", "a.yaml: is not YAML"),
     ],
@@ -117,6 +117,6 @@ def test_lists_within_lists_take_no_longer_than_others(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("a: 1\nb: " + "[" * 50_000 + "\n")
     started = time.monotonic()
-    with pytest.raises(InputError, match=r"a.yaml:2: more than 20 blocks are within each other"):
+    with pytest.raises(InputError, match=r"a.yaml:2: blocks are nested more than 20 deep"):
         read_yaml(path)
     assert time.monotonic() - started < 2.0

@@ -62,7 +62,7 @@ def test_what_lies_within_the_bounds_comes_back(tmp_path_factory, place, share, 
     (log,) = load(str(folder))
     stream = log.streams["rfid" if table.name == "inventories" else table.name]
     if table is BEARING_RANGE and column.name == "range" and value < 1e-3:
-        assert any("not above 0 are left out" in line for line in log.warnings)
+        assert any("not above 0 are skipped" in line for line in log.warnings)
     elif table is not INVENTORIES:
         assert float(getattr(stream, column.name)[-1]) == value
 
@@ -133,7 +133,9 @@ def test_what_no_reader_looked_at_is_found_in_the_log(native, one):
     moves = IncrementStream(t, np.array((0.0, 2000.0, 0.0)), np.zeros(3), np.zeros(3))
     with pytest.raises(InputError, match=r"hall: odometry at 0.500 s: dx is 2000.0, expected a finite number of m"):
         require_bounds(replace(log, streams={"odometry": moves}))
-    with pytest.raises(InputError, match=r"hall: the start is at -1700000000 s after the first stamp, expected one at"):
+    with pytest.raises(
+        InputError, match=r"hall: the start is at -1700000000 s after the first timestamp, expected one at"
+    ):
         require_one_span(replace(log, start=StartPose(-1.7e9, np.zeros(3), np.ones(3))))
     with pytest.raises(InputError, match=r"hall: start at 0.000 s: x is 1e\+300, expected"):
         require_bounds(replace(log, start=StartPose(0.0, np.array((1e300, 0.0, 0.0)), np.ones(3))))

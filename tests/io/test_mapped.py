@@ -77,7 +77,7 @@ units = {{ t = "s", wx = "deg/s", wy = "deg/s", wz = "deg/s" }}
     down = one(with_options(options + 'axes = "x -z y"\n'))
     np.testing.assert_allclose(np.degrees(down.streams["imu"].w), (20.0, 30.0))
     one_axis = options.replace('wx = "a", wy = "b", wz = "c"', 'w = "c"').replace('wx = "deg/s", wy = "deg/s", wz', "w")
-    refused(with_options(one_axis + 'axes = "optical"\n'), "axes and mounting are for rates about three axes")
+    refused(with_options(one_axis + 'axes = "optical"\n'), "axes and mounting apply to rates about three axes")
 
 
 def test_a_reference_in_space_by_mapping(hall, with_options, one, refused):
@@ -90,10 +90,10 @@ file = "space.csv"
 columns = {{ {names} }}
 units = {{ t = "s" }}
 """
-    refused(with_options(options), "space.csv: poses rise by 4.0 m, expected a robot on a floor")
+    refused(with_options(options), "space.csv: the height of poses varies by 4.0 m, expected a robot on a floor")
     log = one(with_options(options + 'axes = "optical"\n'))
     np.testing.assert_allclose(log.reference.poses, [(0, 0, 0), (2, -1, 0), (4, -2, 0)], atol=1e-12)
-    assert any("poses rise by 8.00 m" in warning for warning in log.warnings)
+    assert any("poses vary in height by 8.00 m" in warning for warning in log.warnings)
 
 
 def test_other_sensors_by_mapping(hall, with_options, one):
@@ -185,8 +185,8 @@ def test_a_wrong_manifest(hall, refused, old, new, fragments):
 @pytest.mark.parametrize(
     ("file", "content", "fragments"),
     [
-        ("wheels.csv", "", ("wheels.csv: holds no rows",)),
-        ("wheels.csv", ODOMETRY.splitlines()[0] + "\n", ("wheels.csv: holds no rows",)),
+        ("wheels.csv", "", ("wheels.csv: contains no rows",)),
+        ("wheels.csv", ODOMETRY.splitlines()[0] + "\n", ("wheels.csv: contains no rows",)),
         ("wheels.csv", ODOMETRY + "9000;1", ("wheels.csv:5", "'9000,1'", "3 values")),
         ("wheels.csv", ODOMETRY + "yesterday;1;0\n", ("wheels.csv:5", "time_ms is 'yesterday'", "a number of ms")),
         ("wheels.csv", ODOMETRY + "2000;1;0\n", ("wheels.csv:5", "2000000000 ns", "not before")),

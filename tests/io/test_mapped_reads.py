@@ -19,7 +19,7 @@ def test_events_of_an_r700_as_json_lines(hall, with_options, one):
     np.testing.assert_allclose(rfid.t, (0.55, 1.3))  # after the gap
     np.testing.assert_allclose((rfid.rssi[0], rfid.phase[0], rfid.frequency[0]), (-52.34, np.pi / 2, 866.3e6))
     assert list(rfid.antenna) == ["1", "2"]
-    assert any("1 objects that are no reads are left out" in line for line in log.warnings)
+    assert any("1 objects that are not reads are skipped" in line for line in log.warnings)
 
 
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
@@ -101,7 +101,7 @@ def test_reads_in_several_files(hall, one, refused):
     (folder / "reads-c.csv").write_text(READS + "soon,e2001,,1,-60,866.3,r,1,0,\n")
     refused(hall, "reads-c.csv:6", "soon")
     hall.write_text(MANIFEST.replace("reads.csv", "log-*.csv"))
-    refused(hall, "log-*.csv", "files that are there")
+    refused(hall, "log-*.csv", "existing files")
     hall.write_text(MANIFEST.replace("reads.csv", "../*.csv"))
     refused(hall, "leaves its folder")
 

@@ -87,7 +87,7 @@ def test_plaza_ranges_are_put_in_order(read_plaza):
 def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
     log = read_plaza(DR=np.array([[10.1, 0.5, 0.0], [10.1, 0.25, 0.0]]))
     np.testing.assert_array_equal(log.streams["odometry"].dx, (0.0, 0.75))
-    assert ":DR: 1 increments have the stamp of the row before them" in log.warnings[0]
+    assert ":DR: 1 increments have the timestamp of the row before them" in log.warnings[0]
 
 
 PLAZA_BAD = {
@@ -116,7 +116,7 @@ def test_what_is_no_matlab_file(tmp_path, refused, content):
 def test_what_is_no_array_of_real_numbers(tmp_path, refused):
     for value in (np.array([[1j]]), "text", {"a": 1.0}, np.array([[1, "x"]], dtype=object)):
         savemat(tmp_path / "small.mat", plaza(DR=value))
-        refused(tmp_path / "small.mat", "DR is no array of real numbers", reader="plaza", options={"run": 1})
+        refused(tmp_path / "small.mat", "DR is not an array of real numbers", reader="plaza", options={"run": 1})
 
 
 @pytest.mark.parametrize("compressed", [False, True])

@@ -109,5 +109,5 @@ def test_headings_in_degrees_are_refused_unless_the_unit_says_so(hall):
 def test_a_log_that_was_recorded_twice_is_refused_at_the_row_where_it_begins_again(hall):
     columns = 'columns = { t = "t", v = "v", w = "w" }\nunits = { t = "s" }\n'
     rows = ["t,v,w", "0,1,0", "1,1,0", "0,1,0", "1,1,0"]
-    with pytest.raises(InputError, match=r"wheels.csv:4: time is .* expected a stamp not before"):
+    with pytest.raises(InputError, match=r"wheels.csv:4: time is .* expected a timestamp not before"):
         hall(columns, rows)

@@ -31,7 +31,7 @@ def test_what_is_read(mrclam, read):
     assert log.world.landmarks["6"].sigma == 0.0002
     np.testing.assert_array_equal(log.reference.t, (-0.056, 0.044))
     left_out, no_rig = log.warnings
-    assert "left out 1 sightings of other robots and 1 of unknown barcodes" in left_out
+    assert "skipped 1 sightings of other robots and 1 of unknown barcodes" in left_out
     assert "no rig is given" in no_rig
 
 
@@ -57,8 +57,8 @@ def test_files_without_rows(mrclam, read):
     log = read(mrclam)
     assert log.reference is None
     assert [w.rpartition("/")[2] for w in log.warnings[:2]] == [
-        "Robot1_Measurement.dat: holds no rows",
-        "Robot1_Groundtruth.dat: holds no rows",
+        "Robot1_Measurement.dat: contains no rows",
+        "Robot1_Groundtruth.dat: contains no rows",
     ]
 
 

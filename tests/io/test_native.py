@@ -124,7 +124,7 @@ def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native
     assert list(seen.landmark) == ["A", "B", "A"]
     np.testing.assert_array_equal(seen.range, (1.5, np.nan, 1.4))
     np.testing.assert_array_equal(seen.bearing, (0.0, 0.2, 0.1))
-    assert any("bearing_range.csv:3: range is 0: 2 ranges that are not above 0 are left out" in w for w in log.warnings)
+    assert any("bearing_range.csv:3: range is 0: 2 ranges that are not above 0 are skipped" in w for w in log.warnings)
 
 
 BAD_FILES = {
@@ -133,7 +133,7 @@ BAD_FILES = {
     "reference short": ("reference.tum", "# c\n1 0 0\n", "reference.tum:2: row is '1 0 0'", "8 values"),
     "reference not finite": ("reference.tum", "1 nan 0 0 0 0 0 1\n", "reference.tum:1:", "finite"),
     "reference without rotation": ("reference.tum", "1 0 0 0 0 0 0 0\n", "reference.tum:1: length", "unit quaternion"),
-    "reference empty": ("reference.tum", "", "holds no poses"),
+    "reference empty": ("reference.tum", "", "contains no poses"),
     "unknown key": ("run.toml", "[rig]\nsensor = ['odometry']\n", "unknown key sensor", "did you mean sensors?"),
     "noise in degrees": (
         "run.toml",
@@ -169,7 +169,7 @@ def test_duplicate_stamps_the_last_wins(native, one):
     (native / "odometry.csv").write_text("t_ns,v,w\n0,1,0\n0,2,0\n1,3,0\n1,4,0\n1,5,0\n")
     log = one(native)
     np.testing.assert_array_equal(log.streams["odometry"].v, (2.0, 5.0))
-    assert "odometry.csv: 3 rows have the stamp of the row after them" in log.warnings[0]
+    assert "odometry.csv: 3 rows have the timestamp of the row after them" in log.warnings[0]
 
 
 def test_increments_of_one_stamp_are_one_motion(native, one):
@@ -181,7 +181,10 @@ def test_increments_of_one_stamp_are_one_motion(native, one):
     assert len(odometry.t) == 3
     moves = np.column_stack((odometry.dx, odometry.dy, odometry.dtheta))
     np.testing.assert_allclose(moves, ((0, 0, 0), (2, 0, 0.5), (1, 1, -0.5)), atol=1e-12)
-    assert "odometry.csv: 3 increments have the stamp of the row before them and go on from it" in log.warnings[0]
+    assert (
+        "odometry.csv: 3 increments have the timestamp of the row before them and are composed with it"
+        in log.warnings[0]
+    )
 
 
 def test_duplicate_sightings_the_last_wins(native, one):
@@ -215,7 +218,7 @@ WARNED = {
         HEADER + "999999999,A,1,0\n",
         "1 rows come before the first odometry",
     ),
-    "no sightings": ("bearing_range.csv", HEADER, "bearing_range.csv: holds no rows"),
+    "no sightings": ("bearing_range.csv", HEADER, "bearing_range.csv: contains no rows"),
     "of a later version": ("sonar.csv", "x\n", "this version does not read sonar.csv"),
     "no rig": ("run.toml", "[world.landmarks]\nA = { x = 1, y = 1 }\nB = { x = 1, y = 1 }\n", "no rig is given"),
 }

@@ -105,7 +105,7 @@ def test_an_image_that_goes_before_it_is_written_is_an_error_and_leaves_nothing(
 def test_features_cannot_be_written(seen, one, tmp_path):
     log = one(seen)
     features = replace(log, streams=dict(log.streams) | {"camera": FeatureStream(np.empty(0), [])})
-    with pytest.raises(InputError, match="hall: camera holds features, expected the images in which they were found"):
+    with pytest.raises(InputError, match="hall: camera holds features, expected the images they were computed from"):
         write_native(features, tmp_path / "copy")
 
 
@@ -123,14 +123,14 @@ def test_missing_images_are_left_out_with_a_warning(seen, one):
     log = one(seen)
     assert [file.name for file in log.streams["camera"].file] == ["a.png", "c.png"]
     (warning,) = log.warnings
-    assert warning.endswith("camera.csv: 2 of 4 images are missing and left out, the first is b.png of row 3")
+    assert warning.endswith("camera.csv: 2 of 4 images are missing and skipped, the first is b.png of row 3")
 
 
 def test_of_two_images_at_one_stamp_the_last_is_kept(seen, one):
     (seen / "camera.csv").write_text(CAMERA.replace("1300000000", "1100000000"))
     log = one(seen)
     assert [file.name for file in log.streams["camera"].file] == ["b.png", "c.png"]
-    assert "1 rows have the stamp of a later row" in log.warnings[0]
+    assert "1 rows have the timestamp of a later row" in log.warnings[0]
 
 
 def test_late_images_are_kept_in_order_of_arrival(seen, one):

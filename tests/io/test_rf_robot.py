@@ -56,7 +56,7 @@ def test_what_is_read(aisle, read):
     np.testing.assert_allclose(reads.phase[:2], (math.pi / 2, math.pi))
     assert (reads.rssi[0], reads.frequency[0]) == (-60.5, 920.625e6)
     left_out, _ = log.warnings
-    assert "3 of 9 reads lie outside the reference" in left_out
+    assert "3 of 9 reads are outside of the reference" in left_out
     tag = log.world.tags["E-2"]
     assert (tag.x, tag.y, tag.z, tag.facing) == (3.0, -1.0, 0.5, -math.pi / 2)
     assert np.diff(log.reference.t).max() <= 0.1
@@ -75,7 +75,7 @@ def test_an_antenna_without_reads(aisle, read):
     (aisle / "run4" / "third.txt").write_text("")
     log = read(aisle)
     assert set(log.streams["rfid"].antenna) == {"first", "second"}
-    assert any("third.txt: holds no reads" in warning for warning in log.warnings)
+    assert any("third.txt: contains no reads" in warning for warning in log.warnings)
 
 
 def test_late_reads_are_put_in_order(aisle, read):
@@ -104,7 +104,7 @@ BAD = {
     "tag twice": ("tags.csv", TAGS + "E-1,A3,1,1,1,0\n", "tags.csv:4: epc is 'E-1'", "than in row 2"),
     "tag nowhere": ("tags.csv", TAGS + "E-3,A3,,1,1,0\n", "tags.csv:4: x_m is ''", "a finite number of m"),
     "facing beyond": ("tags.csv", TAGS + "E-3,A3,1,1,1,500\n", "tags.csv:4: facing_deg is 500.0"),
-    "no tags": ("tags.csv", TAGS[:33] + "\n", "holds no tags"),
+    "no tags": ("tags.csv", TAGS[:33] + "\n", "contains no tags"),
     "reference short": ("run4/reference_pose.txt", "0 0 0 1673511856.0\n", "less than 0.1 s of poses"),
     "a clock that jumps by months": (
         "run4/reference_pose.txt",

@@ -242,7 +242,9 @@ def test_an_unknown_compression(tmp_path, bag_maker, refuse):
 
 def test_no_bag_at_all(tmp_path, refuse):
     (tmp_path / "drive.txt").write_text("x")
-    refuse(tmp_path / "drive.txt", "is no ROS bag, expected a file .bag, .mcap, .db3, or a folder with metadata.yaml")
+    refuse(
+        tmp_path / "drive.txt", "is not a ROS bag, expected a file .bag, .mcap, .db3, or a folder with metadata.yaml"
+    )
 
 
 def test_names_and_units_of_the_messages_become_those_of_the_map(mcap, read, refuse):
@@ -346,7 +348,7 @@ def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refus
         fill(made)
     file = tmp_path / "drive" / "drive.mcap"
     file.write_bytes(file.read_bytes().replace(b"Quaternion orientation", b"Quaternion orientatiom"))
-    refuse(file, "/odom:1: nav_msgs/msg/Odometry is not defined in the bag as ROS does", rfid=None)
+    refuse(file, "/odom:1: nav_msgs/msg/Odometry is defined in the bag unlike in ROS", rfid=None)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,7 @@ def test_a_start_that_the_bag_defines_otherwise(definition, fragment, tmp_path, 
         told = made.make(kind, pose=made.pose(1.0, 2.0, 0.0), **{name: value})
         made.write("/initialpose", T0, f"{kind}Stamped", header=made.header(T0), pose=told)
     start = {"topic": "/initialpose"}
-    refuse(made.path, f"/initialpose:1: {kind}Stamped is not defined", fragment, start=start, rfid=None)
+    refuse(made.path, f"/initialpose:1: {kind}Stamped is defined", fragment, start=start, rfid=None)
 
 
 IDL = """\
@@ -395,5 +397,5 @@ def test_definitions_in_idl(tmp_path, bag_maker, read):
 
 def test_a_topic_whose_name_is_no_text():
     connection = SimpleNamespace(topic=b"/odom", msgtype="nav_msgs/msg/Odometry", msgcount=1)
-    with pytest.raises(InputError, match=r"^log\.db3: the name or the type of a topic is no text$"):
+    with pytest.raises(InputError, match=r"^log\.db3: the name or the type of a topic is not text$"):
         bag_file.Bag(Path("log.db3"), SimpleNamespace(connections=[connection]))

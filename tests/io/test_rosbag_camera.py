@@ -164,8 +164,8 @@ def test_a_lens_with_more_terms_and_a_camera_without_a_place(maker, read_drive):
     add_info(maker, **{"d": np.array((0.1, 0.0, 0.0, 0.0, 0.7))})
     add_image(maker, T0, np.zeros((480, 640)), "mono8")
     told = read_drive(maker, camera=CAMERA).metadata["robot"]
-    assert "tf_static does not tell where lens sits on base_link" in told
-    assert "only k1, k2, p1, p2 are taken, not [0.7]" in told
+    assert "tf_static has no mounting of lens on base_link" in told
+    assert "only k1, k2, p1, p2 are used, not [0.7]" in told
 
 
 def test_a_lens_that_is_none(maker, refuse_drive):
@@ -200,5 +200,5 @@ def test_a_camera_that_the_bag_defines_otherwise(tmp_path, bag_maker, refused):
     assert b"float64[9] k" in file.read_bytes()
     file.write_bytes(file.read_bytes().replace(b"float64[9] k", b"float64[9] q"))
     options = {"odometry": {"topic": "/odom"}, "camera": CAMERA}
-    says = "/camera/camera_info:1: sensor_msgs/msg/CameraInfo is not defined"
+    says = "/camera/camera_info:1: sensor_msgs/msg/CameraInfo is defined"
     refused(file, says, "'K'", reader="rosbag", options=options)

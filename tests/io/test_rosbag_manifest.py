@@ -52,7 +52,7 @@ def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):
 
     found, _, text = proposal(fill)
     assert found.options["reference"] == {"topic": "/robot_pose"}
-    assert "# /robot_pose is taken as the reference: leave it out if it is an estimate, not the truth" in text
+    assert "# /robot_pose is used as the reference: remove it if it is an estimate, not the truth" in text
 
 
 def test_commands_are_taken_last(proposal):
@@ -62,7 +62,7 @@ def test_commands_are_taken_last(proposal):
 
     found, manifest, text = proposal(fill)
     assert manifest["options"] == {"clock": "receive", "odometry": {"topic": "/cmd_vel"}}
-    assert "/cmd_vel holds what the robot was told to do" in text
+    assert "/cmd_vel contains commanded velocities" in text
     assert "no rig is given" in text
     assert found.uses == {"/cmd_vel": "odometry"}
 

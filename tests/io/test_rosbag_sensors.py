@@ -151,9 +151,9 @@ def test_a_gyro_that_is_mounted_otherwise(maker, read_drive, options, axis):
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        ({"axes": "x y"}, ("imu.axes is 'x y'", "the three axes that point ahead, left and up")),
+        ({"axes": "x y"}, ("imu.axes is 'x y'", "the three axes that point forward, left and up")),
         ({"axes": "y x z"}, ("right-handed",)),
-        ({"frame": "imu_link"}, ("tf_static does not say where imu_link sits on base_link",)),
+        ({"frame": "imu_link"}, ("tf_static has no pose of imu_link on base_link",)),
         ({"frame": "imu_link", "axes": "body"}, ("expected no axes or mounting",)),
         ({"mounting": {"roll": 90.0}}, ("imu.mounting.roll is 90.0",)),
     ],
@@ -179,9 +179,9 @@ def add_poses(maker, poses):
     ("rise", "tilt", "told"),
     [
         (0.2, 0.1, None),
-        (0.5, 0.1, "poses rise by 0.50 m, which is left out"),
-        (0.0, 0.5, "poses tilt by up to 29 degrees, which is left out"),
-        (2.0, 0.5, "poses rise by 2.00 m and tilt by up to 29 degrees"),
+        (0.5, 0.1, "poses vary in height by 0.50 m, which is ignored"),
+        (0.0, 0.5, "poses tilt by up to 29 degrees, which is ignored"),
+        (2.0, 0.5, "poses vary in height by 2.00 m and tilt by up to 29 degrees"),
         (92.0, 0.0, None),
     ],
 )
@@ -189,7 +189,11 @@ def test_poses_that_leave_the_floor(maker, read_drive, refuse_drive, rise, tilt,
     q = (math.sin(tilt / 2.0), 0.0, 0.0, math.cos(tilt / 2.0))
     add_poses(maker, [(0.1 * i, 0.0, 5.0 + rise * i / (COUNT - 1), *q) for i in range(COUNT)])
     if rise > 3.0:
-        refuse_drive(maker, "/truth: poses rise by 92.0 m, expected a robot on a floor", reference={"topic": "/truth"})
+        refuse_drive(
+            maker,
+            "/truth: the height of poses varies by 92.0 m, expected a robot on a floor",
+            reference={"topic": "/truth"},
+        )
         return
     log = read_drive(maker, reference={"topic": "/truth"})
     warnings = [w for w in log.warnings if "/truth" in w and "poses" in w]
@@ -240,7 +244,7 @@ def test_transforms_that_lead_nowhere(maker, refuse_drive, refused):
         t = T0 + i * MS
         add_frames(maker, "/tf", t, transform(maker, t, "odom", "base_link", (0.0, 0.0, 0.0)))
     tf = {"topic": "/tf", "parent": "map", "child": "base_link"}
-    refuse_drive(maker, "no transforms lead from base_link to map: there is no frame 'map'", reference=tf)
+    refuse_drive(maker, "no transforms connect base_link to map: there is no frame 'map'", reference=tf)
     options = {"odometry": {"topic": "/odom"}, "reference": {"topic": "/tf"}}
     refused(maker.path, "reference.parent and reference.child are missing", reader="rosbag", options=options)
 
@@ -276,7 +280,7 @@ def test_markers_in_the_robots_frame(maker, read_drive):
 def test_a_frame_of_markers_that_is_not_told(maker, refuse_drive):
     add_markers(maker, (0.0, 0.0, 2.0))
     options = {"topic": "/markers", "frame": "lens"}
-    refuse_drive(maker, "tf_static does not say where lens sits on base_link; frames: none", bearing_range=options)
+    refuse_drive(maker, "tf_static has no pose of lens on base_link; frames: none", bearing_range=options)
 
 
 def test_landmarks_of_a_type_that_is_not_known(maker, refuse_drive, refused):

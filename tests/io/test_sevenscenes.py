@@ -59,7 +59,7 @@ def test_poses_that_are_none(scene, refuse):
     path = scene / "frame-000002.pose.txt"
     rows = path.read_text().splitlines()
     path.write_text("\n".join(rows[:3]))
-    refuse(scene, "frame-000002.pose.txt: holds 3 rows")
+    refuse(scene, "frame-000002.pose.txt: has 3 rows")
     path.write_text("\n".join([rows[0], rows[1].rsplit(maxsplit=1)[0], *rows[2:]]))
     refuse(scene, "frame-000002.pose.txt:2", "4 numbers")
     path.write_text("\n".join([rows[0].replace(rows[0].split()[1], "x"), *rows[1:]]))
@@ -77,7 +77,7 @@ def test_a_rotation_that_is_none(scene, refuse, change):
     pose = np.eye(4)
     pose[:3, :3] = change
     write_pose(scene / "frame-000010.pose.txt", pose)
-    refuse(scene, "frame-000010.pose.txt", "no rotation")
+    refuse(scene, "frame-000010.pose.txt", "not a rotation")
 
 
 def test_images_that_are_none(scene, refuse):
@@ -93,7 +93,7 @@ def test_images_that_are_none(scene, refuse):
 
 def test_a_folder_without_frames(tmp_path, refuse):
     (tmp_path / "empty").mkdir()
-    refuse(tmp_path / "empty", "holds no images")
+    refuse(tmp_path / "empty", "contains no images")
 
 
 def test_the_recording(data_root):

@@ -100,7 +100,7 @@ BAD = {
     "time going back": ({"t": np.array([[0.0, 0.2, 0.1]])}, ":3: time"),
     "outside of the image": (with_value("y_k_j", (1, 1, 0), 999.0), ":2: y_k_j of point 1 is 999.0"),
     "half seen": (with_value("y_k_j", (3, 1, 0), -1.0), ":2: y_k_j of point 1"),
-    "no rotation": ({"C_c_v": 2.0 * C_C_V}, "C_c_v is no rotation"),
+    "no rotation": ({"C_c_v": 2.0 * C_C_V}, "C_c_v is not a rotation"),
     "no focal length": ({"fu": 0.0}, "expected more than 0"),
     "a focal length that no lens has": ({"fu": 1e-6}, "fx is 1e-06"),
     "noise of velocities that is no noise": ({"w_var": np.full((3, 1), 1e12)}, "turn"),

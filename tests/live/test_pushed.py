@@ -51,7 +51,7 @@ BAD = [
     (PixelSightings(1.0, ("a",), np.array(((math.nan, 1.0),))), r"pixels is nan, expected a finite number"),
     (
         RfidScan(1.0, ("a",), np.array([1]), ("e",), ONE, ONE, ONE, ONE),
-        r"antenna is \[1\], expected places in its 1 ant",
+        r"antenna is \[1\], expected indices of its 1 ant",
     ),
     (
         RfidScan(1.0, ("a",), np.array([0]), ("e",), -ONE, ONE, ONE, ONE),
@@ -66,8 +66,8 @@ BAD = [
         CameraFrame(1.0, "orb", np.zeros((1, 2)), ONE, np.zeros((2, 3)), np.arange(1)),
         r"descriptors has shape \(2, 3\)",
     ),
-    (Tick(1.0), r"^Tick is no measurement, expected one of VelocityOdometry, "),
-    (None, r"^NoneType is no measurement"),
+    (Tick(1.0), r"^Tick is not a measurement, expected one of VelocityOdometry, "),
+    (None, r"^NoneType is not a measurement"),
 ]
 
 
@@ -136,7 +136,7 @@ def test_settings_that_cannot_be_are_refused(options, message):
 
 def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):
     localizer = started(log)
-    with pytest.raises(InputError, match="antenna is 'left', expected one that listened: front, back"):
+    with pytest.raises(InputError, match="antenna is 'left', expected one of the active antennas: front, back"):
         localizer.push_reads(1.0, ["front", "back"], [RfidRead("left", "e1")])
 
 

@@ -81,7 +81,7 @@ def test_tilted_poses_and_comments(tmp_path):
 
 
 BAD = {
-    "empty": ("", "holds no poses"),
+    "empty": ("", "contains no poses"),
     "short": ("# c\n1 0 0 0\n", ":2: row is '1 0 0 0'"),
     "word": ("1 0 0 0 0 0 zero 1\n", ":1: row"),
     "nan": ("1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", ":2: row"),

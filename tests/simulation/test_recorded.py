@@ -56,7 +56,7 @@ def test_a_virtual_world_unlike_the_recorded_one_is_told(looks):
     high = preset("office", {"world": {"tag_height": 4.0}, "drive": {"duration": 30.0}})
     assert FAR * SCALES[2] < 4.0 - 1.2
     (warning,) = simulate(high, 0, looks).warnings
-    assert "100% of the looks in reach have no recorded one" in warning
+    assert "100% of the rounds in range have no similar recorded one" in warning
     assert simulate(preset("office", {"drive": {"duration": 30.0}}), 0, looks).warnings == ()
 
 

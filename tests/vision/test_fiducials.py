@@ -171,7 +171,7 @@ def test_images_that_are_no_images_and_those_without_markers(hall):
     (other,) = load(str(broken))
     assert "sightings" not in other.streams
     assert any("1 images cannot be used" in line and "truth.csv" in line for line in other.warnings)
-    assert any("none of 5x5_50 is found in 2 images" in line for line in other.warnings)
+    assert any("no marker of 5x5_50 was found in 2 images" in line for line in other.warnings)
 
 
 @pytest.mark.parametrize(
@@ -194,5 +194,5 @@ def test_markers_need_images(hall):
     wrong = hall.parent / "wrong.toml"
     head, rest = MANIFEST.split("[options.camera]")
     wrong.write_text(head + rest[rest.index("[options.reference]") :])
-    with pytest.raises(InputError, match="has no images to look for markers in"):
+    with pytest.raises(InputError, match="has no images to detect markers in"):
         load(str(wrong))

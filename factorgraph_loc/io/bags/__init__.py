@@ -1,3 +1,3 @@
-"""ROS 1 and ROS 2 bags, read and written."""
+"""Reading and writing of ROS 1 and ROS 2 bags."""
 
 __all__ = ["export", "file", "manifest", "rosbag"]

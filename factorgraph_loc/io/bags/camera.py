@@ -1,6 +1,6 @@
-"""Images in a bag: written to the user's cache folder when the bag is first read, one at a time, for a log names files.
+"""Images in a bag, which are extracted to the user's cache folder, as a log refers to files.
 
-Compressed images are written as they are, others as PGM or PPM, whose pixels are those of the message.
+Compressed images are written unchanged, others as PGM or PPM without loss.
 """
 
 import csv
@@ -32,12 +32,12 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 INDEX = "images.csv"
-LOCK = ".lock"  # held by who puts a folder of images into its place
+LOCK = ".lock"  # held while a folder of images is moved into place
 COLUMNS = ("row", "header", "received", "file")
 Pixels = NDArray[Any]
-_Row = tuple[int, int, int, str]  # number, stamp of the header [ns], receipt [ns], file
+_Row = tuple[int, int, int, str]  # number, timestamp of the header [ns], time of receipt [ns], file
 
-# to channels in the order red, green, blue
+# conversion of channels to red, green, blue
 ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
     "mono8": (np.uint8, 1, lambda p: p),
     "8UC1": (np.uint8, 1, lambda p: p),
@@ -56,7 +56,7 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
 
 
 class CameraTopic(FileModel):
-    """A topic of images, and that of its ``info``: lens, size and the frame it sits in."""
+    """A topic of images, and the ``info`` topic with lens, size and frame of the camera."""
 
     topic: str
     info: str | None = None
@@ -64,7 +64,7 @@ class CameraTopic(FileModel):
 
 
 class Images:
-    """Gathers the images of a topic. ``known``: they lie in the cache folder already, so that their messages need not be read."""
+    """Collects the images of a topic. ``known``: whether they are in the cache folder, so that messages need not be read."""
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper) -> None:
         topic = bag.topic(name)
@@ -75,7 +75,7 @@ class Images:
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
         self._stamper = stamper
         self._t_ns: list[int] = []
-        self._written: Path | None = None  # the folder that those which are read now are written to
+        self._written: Path | None = None  # folder of newly extracted images
         self._held = ExitStack()
         sweep(self._folder.parent)
         self._rows = _read_whole(self._folder)
@@ -101,12 +101,12 @@ class Images:
         self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
-        """The images by their stamps; those that were written now take their place in the cache folder."""
+        """The images; newly extracted ones are moved to the cache folder."""
         if self._written is not None:
             with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerows([COLUMNS, *self._rows])
             with locked(self._folder.parent / LOCK):
-                if not _read_whole(self._folder):  # else another process was faster, and may be using what it wrote
+                if not _read_whole(self._folder):  # otherwise another process was faster, and may be using its files
                     if self._folder.exists():
                         self._folder.rename(self._written.with_name("damaged"))
                     self._written.rename(self._folder)
@@ -116,13 +116,13 @@ class Images:
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
 
     def discard(self) -> None:
-        """Leave nothing half-written behind."""
+        """Remove partly extracted images."""
         self._held.close()
         self._written = None
 
 
 class Info:
-    """Gathers the first message that tells of a camera."""
+    """Collects the first message that describes a camera."""
 
     def __init__(self, bag: Bag, name: str) -> None:
         topic = bag.topic(name)
@@ -143,7 +143,7 @@ class Info:
         lens[: min(4, len(d))] = d[:4]
         if np.any(d[4:]):
             left = f"not {d[4:].tolist()}"
-            self._notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are taken, {left}")
+            self._notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are used, {left}")
         self.frame = str(info.header.frame_id)
         self._content = {
             "width": int(info.width),
@@ -156,13 +156,13 @@ class Info:
         }
 
     def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
-        """The camera, sitting where ``mounting`` says; ``notes`` gets what of its lens is not taken."""
+        """The camera at ``mounting``; ignored lens parameters are added to ``notes``."""
         notes += self._notes
         return parse_model(CameraSettings, self._content | mounting, self._source)
 
 
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:
-    """A raw image as the content of a file, and its suffix. InputError for an encoding that is not read, and missing pixels."""
+    """A raw image as file content and suffix. InputError for an unsupported encoding or missing pixels."""
     if image.encoding not in ENCODINGS:
         raise InputError(f"{where}: encoding is {quoted(image.encoding)}, expected one of {', '.join(ENCODINGS)}")
     kind, channels, convert = ENCODINGS[image.encoding]
@@ -182,19 +182,19 @@ def netpbm(image: Any, where: str) -> tuple[bytes, str]:
 
 
 def _last_of_each(source: str, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
-    """Indices of the images in order of arrival, of several at one stamp the last."""
+    """Indices of the images in order of arrival, the last one of equal timestamps."""
     return checks.sightings_in_order(source, rows, t_ns, ["image"] * len(rows), warnings)
 
 
 def _key(path: Path, topic: str) -> str:
-    """A name for the images of a topic, another one if the bag changes."""
+    """A key for the images of a topic, which changes with the bag."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     facts = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
 
 
 def _read_whole(folder: Path) -> list[_Row]:
-    """What the index says; nothing if it is damaged, or if an image is not there."""
+    """The rows of the index; empty if it is damaged or an image is missing."""
     try:
         with (folder / INDEX).open(newline="", encoding="utf-8") as file:
             rows = [

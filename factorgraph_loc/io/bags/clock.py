@@ -1,4 +1,4 @@
-"""Which clock stamps the messages of a bag: that of their headers, set where they were measured, or that of the recorder."""
+"""The choice between timestamps in message headers (time of measurement) and those of the recorder (time of receipt)."""
 
 from array import array
 from typing import Any, Literal
@@ -11,13 +11,12 @@ from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
 
 Clock = Literal["header", "receive"]
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
-APART = 0.5  # s: offsets of topics that differ by more come from different clocks, no longer from delays
+APART = 0.5  # s; larger differences between topics are clock offsets, not delays
 
 
 class Stamper:
-    """Stamps of the messages of one topic [ns], by a ``clock``; messages without a header are stamped as they were received.
-
-    Those of tf have headers within, which :meth:`choose` is for."""
+    """Timestamps of the messages of one topic [ns], by a ``clock``; the time of receipt for messages without a header. For tf,
+    whose headers are nested, use :meth:`choose`."""
 
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
         self.topic = topic
@@ -34,29 +33,29 @@ class Stamper:
         return self.choose(item.message.header.stamp, item.received)
 
     def choose(self, stamp: Any, received: int) -> int:
-        """The one of a header's stamp and the time of receipt that counts."""
+        """The timestamp of a header or the time of receipt, by the clock."""
         return self.heard(as_nanoseconds(stamp, 1), received)
 
     def heard(self, in_header: int, received: int) -> int:
-        """The same of a stamp in nanoseconds."""
+        """As :meth:`choose`, with a header timestamp in nanoseconds."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received
 
     def check(self) -> None:
-        """InputError if the headers should have told the time, but all say 0."""
+        """InputError if headers are used but all their timestamps are 0."""
         if self.uses_header and len(self._delays) > 1 and not self._any_set:
             raise InputError(f'{self._where}: the stamps of all headers are 0: set clock = "receive" in the manifest')
 
     def delay(self) -> float | None:
-        """Median of receipt after header [s]; None where there are no headers that are set."""
+        """Median delay of receipt after the header's timestamp [s]; None without valid headers."""
         if not self._any_set:
             return None
         return float(np.median(np.frombuffer(self._delays, dtype=np.int64))) / 1e9
 
 
 def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
-    """A line on the clock that was used and the delays that were found, and warnings."""
+    """A line on the clock used and the delays found, and warnings."""
     delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
     line = "header stamps" if clock == "header" else "time of receipt"
     if bare := sorted({s.topic.name for s in stampers if not s.has_header}):
@@ -65,7 +64,7 @@ def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
         line += "; received after the header's stamp (median): "
         line += ", ".join(f"{name} {delay:.3f} s" for name, delay in sorted(delays.items()))
     warnings = []
-    # of a recorder that stamps everything the delay is 0
+    # the delay is 0 if the recorder sets both timestamps
     compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
     known = {name: delay for name, delay in compared.items() if delay is not None}
     if known and max(known.values()) - min(known.values()) > APART:

@@ -1,5 +1,5 @@
-"""A log as a ROS bag: ``.bag`` of version 1, ``.mcap`` or ``.db3`` of version 2. What ``fgloc manifest`` proposes for it gives the
-log back; rig and map are no messages and go into files beside it."""
+"""Export of a log as a ROS bag: ``.bag`` of version 1, ``.mcap`` or ``.db3`` of version 2. The manifest that ``fgloc manifest``
+proposes for it reads the same log; rig and map are written to files next to the bag."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 MAP, ODOM, BASE, CAMERA = "map", "odom", "base_link", "camera"
-FRAMES = {"sightings": CAMERA}  # of tables that are not in the robot's
+FRAMES = {"sightings": CAMERA}  # frames of tables, if not the robot frame
 PNG_OR_JPEG = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-LATEST = 2**31 * 10**9  # ns: what the 32 bits of a stamp's seconds hold
+LATEST = 2**31 * 10**9  # ns; maximum of 32-bit seconds
 
-Message = tuple[int, str, str, Any]  # when it is received [ns], topic, type, content
+Message = tuple[int, str, str, Any]  # time of receipt [ns], topic, type, content
 
 
 def write_bag(log: Log, path: Path) -> list[Path]:
-    """Write a log as a bag, at once or not at all, and its rig and map beside it; the files that were written.
+    """Write a log as a bag atomically, with its rig and map next to it; returns the files.
 
-    InputError if one of them exists, and for what a bag cannot hold: stamps before 1970, and streams of features or of motion in
-    space. Of a reference the covariances are not written.
+    InputError if a file exists, and for what a bag cannot hold: timestamps before 1970, features, and motion in space. Covariances
+    of a reference are not written.
     """
     require_rosbags()
     if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: is no name of a bag, expected one that ends with {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: is not the name of a bag, expected one that ends with {', '.join(SUFFIXES)}")
     rig, world = path.with_suffix(".rig.toml"), path.with_suffix(".world.toml")
     sweep(path.parent)
     for file in (path, rig, world):
@@ -66,7 +66,7 @@ def write_bag(log: Log, path: Path) -> list[Path]:
 
 
 def _write(log: Log, folder: Path, suffix: str) -> Path:
-    """The file of the bag, in ``folder``."""
+    """Write the bag's file in ``folder``."""
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an optional library
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
 
@@ -94,7 +94,7 @@ def _write(log: Log, folder: Path, suffix: str) -> Path:
 
 
 def _sources(log: Log, build: _Builder) -> list[Iterator[Message]]:
-    """The messages of each stream, in the order in which they arrived."""
+    """The messages of each stream in order of arrival."""
     sources = [_arriving(_of_stream(name, stream, log, build)) for name, stream in log.streams.items()]
     if log.reference is not None:
         sources.append(_arriving(_of_reference(log.reference, log.t0_ns, build)))
@@ -104,17 +104,17 @@ def _sources(log: Log, build: _Builder) -> list[Iterator[Message]]:
 
 
 def _arriving(messages: Iterator[Message]) -> Iterator[Message]:
-    """A late message is received after those that came before it."""
+    """Messages with times of receipt that do not decrease."""
     latest = 0
     for t_ns, topic, kind, message in messages:
         if not 0 <= t_ns < LATEST:
-            raise InputError(f"{topic}: a stamp is {t_ns} ns, expected one from 1970 to 2038, as a bag has them")
+            raise InputError(f"{topic}: a timestamp is {t_ns} ns, expected one from 1970 to 2038, as a bag requires")
         latest = max(latest, t_ns)
         yield latest, topic, kind, message
 
 
 class _Builder:
-    """Makes messages: fields by their names."""
+    """Creates messages from fields by name."""
 
     def __init__(self, store: Typestore, is_ros1: bool) -> None:
         self._types = store.types
@@ -181,7 +181,7 @@ def _stamped(
 
 
 def _odometry(stream: IncrementStream, build: _Builder) -> Iterator[dict[str, Any]]:
-    """The increments as the way that they add up to, which begins at the first row."""
+    """The increments, integrated to a path that starts at the first row."""
     heading = np.cumsum(stream.dtheta) - stream.dtheta[0]
     before = np.concatenate(([0.0], heading[:-1]))
     moves = np.column_stack((stream.dx, stream.dy))
@@ -200,7 +200,7 @@ def _odometry(stream: IncrementStream, build: _Builder) -> Iterator[dict[str, An
 
 
 def _imu(stream: YawRateStream, build: _Builder) -> Iterator[dict[str, Any]]:
-    unknown = np.array([-1.0, *[0.0] * 8])  # as ROS says that there is no such measurement
+    unknown = np.array([-1.0, *[0.0] * 8])  # ROS convention for a missing measurement
     for w in stream.w.tolist():
         yield {
             "orientation": build.turn(0.0),
@@ -245,7 +245,7 @@ def _of_reference(reference: Trajectory, t0_ns: int, build: _Builder) -> Iterato
 
 def _of_start(start: StartPose, t0_ns: int, build: _Builder) -> Iterator[Message]:
     topic, kind = INITIAL_POSE
-    covariance = np.zeros((6, 6))  # of x, y, z and the turns about these axes
+    covariance = np.zeros((6, 6))  # of x, y, z and rotations about these axes
     covariance[[0, 1, 5], [0, 1, 5]] = start.sigmas**2
     row = {"pose": build.uncertain_pose(start.pose.tolist(), covariance.ravel())}
     return _stamped(topic, kind, [t0_ns + round(start.t * 1e9)], iter([row]), MAP, build)

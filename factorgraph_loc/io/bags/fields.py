@@ -1,6 +1,6 @@
-"""Fields of ROS messages by their paths: ``tag.epc``, or ``reads[].tag.epc`` where one message holds a list of reads.
+"""Access to fields of ROS messages by path: ``tag.epc``, or ``reads[].tag.epc`` for a list in a message.
 
-A path is checked against the message type before anything is read, so that a wrong one is told at once, with the fields there are.
+Paths are checked against the message type before messages are read; errors list the available fields.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 LIST = "[]"
-BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, as an EPC is
+BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, such as an EPC
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
-DEPTH = 6  # of messages within messages
+DEPTH = 6  # nesting levels of messages
 
 Row = tuple[Any, ...]
 
 
 class Fields:
-    """Some fields of the messages of a topic. ``rows``: one tuple of their values, in the order of ``names``, for each element of
-    the lists that the paths go through; one where they go through none."""
+    """Some fields of the messages of a topic. ``rows``: tuples of their values, in the order of ``names``, one for each element of
+    the lists in the paths, or one per message without lists."""
 
     def __init__(self, bag: Bag, topic: Topic, paths: Mapping[Any, str]) -> None:
         self.names = tuple(paths)
@@ -49,7 +49,7 @@ class Fields:
         self.has_list = bool(self._lists)
 
     def rows(self, message: Any, row: int) -> list[Row]:
-        """The values in a message, the ``row``-th of its topic; InputError if its lists are of different lengths."""
+        """The rows of message number ``row``; InputError if its lists have different lengths."""
         single = [get(message) for get in self._single]
         if not self._lists:
             return [tuple(single[i] for i in self._places)]
@@ -63,7 +63,7 @@ class Fields:
 
 
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
-    """InputError with the fields that the topic's messages have, if ``path`` is none of them."""
+    """InputError with the available fields if the messages lack ``path``."""
     known = leaves(store, topic.type)
     if path not in known and path + LIST not in known:
         raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
@@ -72,7 +72,7 @@ def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
 
 
 def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:
-    """The paths of all numbers, texts, bytes and stamps in a message type."""
+    """The paths of all numbers, texts, bytes and timestamps in a message type."""
     out: list[str] = []
     definition: Any = store.fielddefs[kind][1]
     for name, (form, detail) in definition:
@@ -89,26 +89,26 @@ def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) ->
 
 
 def has_header(bag: Bag, topic: Topic) -> bool:
-    """Whether the messages of a topic begin with a header, which has a stamp."""
+    """Whether the messages of a topic begin with a header."""
     fields: Any = bag.store(topic.name).fielddefs[topic.type][1]
     return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == HEADER
 
 
 def as_text(value: Any) -> str:
-    """A name: a text as it is, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
+    """A name: text unchanged, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
     if isinstance(value, str):
         return value.strip()
     if isinstance(value, np.ndarray) and value.dtype == np.uint8:
         return value.tobytes().hex().upper()
     if isinstance(value, (bytes, bytearray)):
         return value.hex().upper()
-    if isinstance(value, (np.ndarray, list)):  # the numbers of the markers of a bundle
+    if isinstance(value, (np.ndarray, list)):  # marker numbers of a bundle
         return "-".join(str(part) for part in value)
     return str(value)
 
 
 def as_number(value: Any) -> float:
-    """A number; NaN for what is none."""
+    """A number, or NaN for another value."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -116,7 +116,7 @@ def as_number(value: Any) -> float:
 
 
 def as_nanoseconds(value: Any, unit: int) -> int:
-    """A stamp: a ROS time, or a number of ``unit`` nanoseconds each. ValueError if it is neither."""
+    """A timestamp: a ROS time, or a number in units of ``unit`` nanoseconds. ValueError for another value."""
     if hasattr(value, "nanosec"):
         return int(value.sec) * 10**9 + int(value.nanosec)
     if isinstance(value, int):
@@ -129,7 +129,7 @@ def _getter(path: str) -> Callable[[Any], Any]:
 
 
 def _list_getters(path: str) -> tuple[Callable[[Any], Sequence[Any]], Callable[[Any], Any]]:
-    """How to get the list, and a field of each of its elements."""
+    """Getters of the list, and of a field of its elements."""
     outer, _, inner = path.partition(LIST)
     return attrgetter(outer), _getter(inner.lstrip("."))
 

@@ -1,6 +1,7 @@
-"""ROS bags through the library ``rosbags``, without ROS: version 1 (``.bag``), version 2 (a folder, or its ``.mcap`` or ``.db3``).
+"""Access to ROS bags with the library ``rosbags``, without ROS: version 1 (``.bag``), version 2 (a folder, or its ``.mcap`` or
+``.db3``).
 
-Messages are read one after the other; in memory are the index of the bag and the chunk that is being read.
+Messages are read one by one; only the index and the current chunk of a bag are kept in memory.
 """
 
 from __future__ import annotations
@@ -24,21 +25,21 @@ if TYPE_CHECKING:
 
 ROS1 = ".bag"
 SUFFIXES = (ROS1, ".mcap", ".db3")
-METADATA = "metadata.yaml"  # in the folder of a bag of version 2
-NO_FILE = 2**63 - 1  # what rosbags says is the start of a bag without messages
+METADATA = "metadata.yaml"  # in the folder of a version 2 bag
+NO_FILE = 2**63 - 1  # the start time of a bag without messages in rosbags
 
-# what rosbags says, and what to do about it
+# messages of rosbags, and advice
 HINTS = {
-    "not indexed": "its recording was cut off: `rosbag reindex` mends it",
-    "index looks damaged": "it is truncated: `rosbag reindex` mends it",
-    "end magic": "it is truncated: `mcap recover` mends it",
-    "missing tables": "it is truncated, or no bag",
+    "not indexed": "its recording was cut off: `rosbag reindex` repairs it",
+    "index looks damaged": "it is truncated: `rosbag reindex` repairs it",
+    "end magic": "it is truncated: `mcap recover` repairs it",
+    "missing tables": "it is truncated, or not a bag",
 }
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its message type as ROS 2 writes it (``nav_msgs/msg/Odometry``), and how many messages it has."""
+    """A topic of a bag: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``), and its number of messages."""
 
     name: str
     type: str
@@ -47,7 +48,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Stamped:
-    """A message, the ``row``-th of its topic from 1, and when it was received [ns]."""
+    """A message, its number ``row`` in its topic from 1, and its time of receipt [ns]."""
 
     topic: str
     row: int
@@ -64,9 +65,9 @@ class Bag:
         self._stores: dict[str, Typestore] = {}
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
-            # SQLite has bytes and numbers in columns of text, too
+            # SQLite may store bytes and numbers in text columns
             if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
-                raise InputError(f"{path}: the name or the type of a topic is no text")
+                raise InputError(f"{path}: the name or the type of a topic is not text")
             self._connections.setdefault(connection.topic, []).append(connection)
         self.topics = {
             name: Topic(name, connections[0].msgtype, sum(c.msgcount for c in connections))
@@ -75,7 +76,7 @@ class Bag:
         self.duration = 0.0 if reader.start_time == NO_FILE else max(reader.end_time - 1 - reader.start_time, 0) / 1e9
 
     def topic(self, name: str) -> Topic:
-        """A topic that has messages; InputError if the bag lacks it, or it has none."""
+        """A topic with messages; InputError if the bag lacks it or it is empty."""
         if name not in self.topics:
             raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")
         topic = self.topics[name]
@@ -89,7 +90,7 @@ class Bag:
         return topic
 
     def store(self, name: str) -> Typestore:
-        """The message types of a topic, from the definitions in the bag; in one without, those that ship with ROS 2."""
+        """The message types of a topic, from the definitions in the bag, or those of ROS 2 if it has none."""
         if name not in self._stores:
             connection = self._connections[name][0]
             definition = connection.msgdef
@@ -106,7 +107,7 @@ class Bag:
         return self._stores[name]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Stamped]:
-        """The messages of ``topics`` in the order in which they were received."""
+        """The messages of ``topics`` in order of receipt."""
         if not topics:
             return
         chosen = [connection for name in topics for connection in self._connections[name]]
@@ -129,24 +130,24 @@ class Bag:
                 message = call(raw, kind)
             yield Stamped(name, rows[name], received, message)
         if missing := [name for name in topics if not rows[name]]:
-            raise InputError(f"{self.path}: topic {missing[0]} has no messages, though the bag's index says so")
+            raise InputError(f"{self.path}: topic {missing[0]} has no messages, although the bag's index lists some")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like that of a bag."""
+    """Whether a path looks like a bag."""
     return (path / METADATA).is_file() if path.is_dir() else path.suffix in SUFFIXES
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """The bag at ``path``; InputError if it cannot be read, and where ``rosbags`` is not installed."""
+    """Open the bag at ``path``; InputError if it cannot be read, or ``rosbags`` is not installed."""
     if not path.exists():
         raise InputError(f"{path}: does not exist")
     if not is_bag(path):
         expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
-        raise InputError(f"{path}: is no ROS bag, expected {expected}")
+        raise InputError(f"{path}: is not a ROS bag, expected {expected}")
     for file in path.iterdir() if path.is_dir() else ():
-        inside(path, file.name, path)  # a link could lead elsewhere, and a FIFO would wait for ever
+        inside(path, file.name, path)  # rejects links to the outside, and FIFOs, which would block
     require_rosbags()
     bag_unpacking.bound()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
@@ -162,7 +163,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def require_rosbags() -> None:
-    """InputError that names the extra to install, where ``rosbags`` is missing."""
+    """InputError that names the extra to install if ``rosbags`` is missing."""
     try:
         import rosbags.interfaces  # noqa: F401, PLC0415
     except ImportError as error:
@@ -171,8 +172,8 @@ def require_rosbags() -> None:
 
 @lru_cache(maxsize=64)
 def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
-    """The types that a definition tells of. They become compiled functions, which takes a hundred times as long as to read a
-    message; topics of one type share them, and so do bags that are read one after the other."""
+    """The types of a definition. They are compiled, which takes a hundred times as long as reading a message, so they are cached
+    for all topics and bags."""
     from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore  # noqa: PLC0415
 
@@ -193,7 +194,7 @@ def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Whatever a bag makes ``rosbags`` raise becomes an InputError: damaged files raise nearly anything there."""
+    """Convert exceptions of ``rosbags``, which raises nearly anything on damaged files, to InputError."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""The frames of a bag (tf): where sensors sit on the robot, and a reference that is a chain of transforms."""
+"""Coordinate frames of a bag (tf): mounting of sensors, and a reference from a chain of transforms."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STATIC = "/tf_static"
 
 
 class StaticFrames:
-    """Gathers transforms that do not change: of each frame its parent, and where it lies in that."""
+    """Collects static transforms: parent and pose of each frame."""
 
     def __init__(self) -> None:
         self.parents: dict[str, tuple[str, Array]] = {}
@@ -37,21 +37,21 @@ class StaticFrames:
             self.parents[plain(transform.child_frame_id)] = (parent, matrices(values[None])[0])
 
     def pose(self, frame: str, base: str) -> Array | None:
-        """The pose (4, 4) of ``frame`` in ``base``; None where transforms do not join them."""
+        """The pose (4, 4) of ``frame`` in ``base``; None if no transforms connect them."""
         ours, theirs = self._up(plain(frame)), self._up(plain(base))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
     def known(self, source: str, frame: str, base: str) -> Array:
-        """The same; InputError where transforms do not join them."""
+        """As :meth:`pose`; InputError if no transforms connect the frames."""
         pose = self.pose(frame, base)
         if pose is None:
             there = listed(sorted(self.parents)) or "none"
-            raise InputError(f"{source}: tf_static does not say where {frame} sits on {base}; frames: {there}")
+            raise InputError(f"{source}: tf_static has no pose of {frame} on {base}; frames: {there}")
         return pose
 
     def _up(self, frame: str) -> dict[str, Array]:
-        """The poses of ``frame`` in itself and in all frames above it, from near to far."""
+        """The poses of ``frame`` in itself and in all frames above it, nearest first."""
         out = {frame: np.eye(4)}
         while frame in self.parents and self.parents[frame][0] not in out:
             parent, pose = self.parents[frame]
@@ -62,7 +62,7 @@ class StaticFrames:
 
 @dataclass
 class _Edge:
-    """The transforms from one frame to its parent: stamps and poses as they come."""
+    """The transforms from a frame to its parent: timestamps and poses in order of arrival."""
 
     parent: str
     rows: array[int] = field(default_factory=lambda: array("q"))
@@ -71,7 +71,7 @@ class _Edge:
 
 
 class FrameReference:
-    """Gathers transforms, and makes of them the way of the topic's ``child`` through its ``parent``."""
+    """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``."""
 
     def __init__(self, bag: Bag, topic: ReferenceTopic, stamper: Stamper) -> None:
         self._source, self._turned = f"{bag.path} {topic.topic}", topic
@@ -89,7 +89,7 @@ class FrameReference:
             edge.values.extend(seven(transform.transform, "translation", "rotation"))
 
     def trajectory(self, static: StaticFrames, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
-        """Poses at the stamps of the transform that comes most often, where all are known; the others are interpolated."""
+        """Poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
         moving: list[Trajectory3] = []
         steps: list[tuple[int, Array]] = []
         before: Array = np.eye(4)
@@ -117,7 +117,7 @@ class FrameReference:
         return Trajectory(t, flat, has_heading=has_heading)
 
     def _chain(self, static: StaticFrames) -> list[str]:
-        """The frames from the child up to, but without, the parent."""
+        """The frames from the child up to the parent, without the parent."""
         chain: list[str] = []
         frame = self._child
         parents = {name: parent for name, (parent, _) in static.parents.items()}
@@ -131,7 +131,7 @@ class FrameReference:
                     if wrong
                     else f"it ends at {quoted(frame)}"
                 )
-                raise InputError(f"{self._source}: no transforms lead from {self._child} to {self._parent}: {hint}")
+                raise InputError(f"{self._source}: no transforms connect {self._child} to {self._parent}: {hint}")
             chain.append(frame)
             frame = parents[frame]
         return chain
@@ -148,12 +148,12 @@ class FrameReference:
 
 
 def plain(frame: str) -> str:
-    """A frame's name as ROS 2 has it, without the slash that some bags put before it."""
+    """A frame's name in ROS 2 notation, without the leading slash of some bags."""
     return frame.lstrip("/")
 
 
 def matrices(table: Array) -> Array:
-    """Poses (N, 4, 4) of positions and quaternions x, y, z, w (N, 7)."""
+    """Poses (N, 4, 4) from positions and quaternions x, y, z, w (N, 7)."""
     out = np.tile(np.eye(4), (len(table), 1, 1))
     out[:, :3, 3] = table[:, :3]
     out[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix()

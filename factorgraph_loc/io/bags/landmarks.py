@@ -1,4 +1,4 @@
-"""Identified landmarks in a bag: markers that a detector found with their poses or their corners, or any message by a mapping."""
+"""Identified landmarks in a bag: poses or corners of detected markers, or any message by a mapping of fields."""
 
 from dataclasses import replace
 from typing import Any, Literal
@@ -30,7 +30,7 @@ CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: ce
 CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
 
 _POSE = "pose.position"
-# what detectors of markers say: the marker's name, and where it is in the camera's optical frame
+# messages of marker detectors: the marker's name, and its position in the camera's optical frame
 DETECTIONS: dict[str, tuple[str, str]] = {
     "apriltag_ros/msg/AprilTagDetectionArray": ("detections[].id", f"detections[].pose.pose.{_POSE}"),
     "aruco_msgs/msg/MarkerArray": ("markers[].id", f"markers[].pose.{_POSE}"),
@@ -40,14 +40,13 @@ DETECTIONS: dict[str, tuple[str, str]] = {
 }
 
 
-PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor's frame
+PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor frame
 
 
 class LandmarkTopic(Turned):
-    """``fields``: where a message has the landmark's name, and its range and bearing, or its place x, y, z in the sensor's frame;
-    they are known for the usual detectors of markers. ``frame``: the sensor's, for tf_static to say where it sits; without it
-    ``axes`` tell how its axes stand: z forward (``optical``), x forward (``body``), or a list of them; and ``mounting`` how it is
-    turned on the robot."""
+    """``fields``: paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known
+    for common marker detectors. ``frame``: the sensor's, whose pose is in tf_static; without it use ``axes`` of the sensor
+    (``optical``, ``body``, or a list) and its ``mounting`` on the robot."""
 
     topic: str
     fields: dict[LandmarkField, str] | None = None
@@ -57,8 +56,8 @@ class LandmarkTopic(Turned):
 
 
 class PixelTopic(FileModel):
-    """Identified points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, as
-    :func:`factorgraph_loc.maps.markers.corner_names` says."""
+    """Named points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, see
+    :func:`factorgraph_loc.maps.markers.corner_names`."""
 
     topic: str
     fields: dict[PixelField, str] | None = None
@@ -66,7 +65,7 @@ class PixelTopic(FileModel):
 
 
 class Landmarks(RowsOfTopic):
-    """Gathers ranges and bearings of a topic, or the places that they are computed from."""
+    """Collects ranges and bearings of a topic, or the positions from which they are computed."""
 
     def __init__(self, bag: Bag, options: LandmarkTopic) -> None:
         topic = bag.topic(options.topic)
@@ -89,7 +88,7 @@ class Landmarks(RowsOfTopic):
         super().__init__(bag, options.topic, fields, columns, {})
 
     def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> Stream:
-        """Ranges along the floor and bearings, in the robot's frame where ``frames`` say where the sensor sits there."""
+        """Ranges along the floor and bearings, in the robot frame if ``frames`` contain the sensor's pose."""
         rows = self.rows_of(self._polar(frames, base) if self._places else None)
         return stream_of(BEARING_RANGE, rows, t0_ns, warnings)
 
@@ -107,7 +106,7 @@ class Landmarks(RowsOfTopic):
 
 
 class PixelsOfPoints(RowsOfTopic):
-    """Gathers identified pixels of a topic."""
+    """Collects the pixels of named points of a topic."""
 
     def __init__(self, bag: Bag, options: PixelTopic) -> None:
         topic = bag.topic(options.topic)
@@ -126,17 +125,17 @@ class PixelsOfPoints(RowsOfTopic):
         super().__init__(bag, options.topic, fields, SIGHTINGS.columns[1:], {})
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Take the pixels of a message."""
+        """Add the pixels of a message."""
         if not self._corners:
             super().add(item, t_ns)
             return
         for found in item.message.detections:
             names = corner_names(f"{found.family}-{found.id}")
-            # apriltag begins at the lower left one and goes on to the lower right one
+            # apriltag starts at the lower left corner and continues with the lower right one
             for name, corner in zip(reversed(names), found.corners, strict=True):
                 self._names["landmark"].append(name)
                 self._rows.append(item, t_ns, (corner.x, corner.y))
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
-        """The pixels as a stream; what is wrong with them is an InputError or a warning."""
+        """The pixels as a stream; problems are an InputError or a warning."""
         return stream_of(SIGHTINGS, self.rows_of(), t0_ns, warnings)

@@ -1,4 +1,4 @@
-"""A manifest for a bag, proposed from its topics: which of them is which sensor, by the type of messages and by usual names."""
+"""A proposed manifest for a bag: the sensor of each topic, by message types and common names."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ TRUTH = re.compile(
 )
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
 
-# the last part of a field's path, without underscores, as people name it
+# common names of the last part of a field's path, without underscores
 NAMES: dict[str, tuple[str, ...]] = {
     "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag"),
     "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
@@ -51,7 +51,7 @@ NAMES: dict[str, tuple[str, ...]] = {
         "timestamp",
     ),
 }
-# the end of a field's name tells its unit, the first that fits
+# suffixes of field names that imply a unit; the first match is used
 UNITS = {
     "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
     "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
@@ -61,7 +61,7 @@ UNITS = {
 
 @dataclass
 class Proposal:
-    """``options`` of the reader; ``uses``: what a topic is taken as, by its name; ``notes``: what a person has to look at."""
+    """``options`` of the reader; ``uses``: use of each topic, by name; ``notes``: remarks for the user."""
 
     options: dict[str, Any] = field(default_factory=dict)
     uses: dict[str, str] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class Proposal:
 
 
 def propose(bag: Bag) -> Proposal:
-    """What a bag seems to hold. Where several topics could be one sensor the likeliest is taken, and a note tells of the others."""
+    """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a note lists the others."""
     out = Proposal()
     topics = [topic for topic in bag.topics.values() if topic.count]
     _motion(out, topics)
@@ -83,16 +83,16 @@ def propose(bag: Bag) -> Proposal:
     _tables(out, topics)
     _rfid(out, bag, topics)
     if STATIC in bag.topics:
-        out.uses[STATIC] = "where sensors sit"
+        out.uses[STATIC] = "sensor mounting"
     if not any(has_header(bag, bag.topics[used["topic"]]) for used in out.options.values()):
         out.options["clock"] = "receive"
     return out
 
 
 def manifest_of(proposal: Proposal, path: str, beside: Mapping[str, str]) -> dict[str, Any]:
-    """The manifest, which names the bag as ``path``; ``beside``: names of rig and world that exist."""
+    """The manifest of the bag ``path``; ``beside``: names of existing rig and world files."""
     return {
-        "title": f"What the bag {Path(path).name} holds",
+        "title": f"The bag {Path(path).name}",
         "reader": "rosbag",
         "path": path,
         **beside,
@@ -103,26 +103,26 @@ def manifest_of(proposal: Proposal, path: str, beside: Mapping[str, str]) -> dic
 
 
 def remarks(bag: Bag, proposal: Proposal, beside: Mapping[str, str]) -> list[str]:
-    """What a person has to look at in a proposed manifest, and the topics that it does not use."""
+    """Remarks on a proposed manifest for the user, and the unused topics."""
     out = list(proposal.notes)
     if "rig" not in beside:
-        out.append('no rig is given: rig = "NAME.rig.toml", beside this file, says what the robot is like')
+        out.append('no rig is given: set rig = "NAME.rig.toml" to a file next to this one that describes the robot')
     if "world" not in beside:
-        out.append('no map is given: world = "NAME.world.toml", beside this file, says where tags and landmarks are')
+        out.append('no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks')
     unused = [topic for topic in bag.topics.values() if topic.name not in proposal.uses]
     return out + [f"not used: {topic.name} ({topic.type}, {topic.count} messages)" for topic in unused]
 
 
 def manifest_text(manifest: Mapping[str, Any], told: Sequence[str]) -> str:
-    """A manifest as TOML, with what is ``told`` as comments."""
+    """A manifest as TOML, with the lines ``told`` as comments."""
     head = {key: value for key, value in manifest.items() if key != "options"}
-    options = dict(sorted(manifest["options"].items(), key=lambda item: isinstance(item[1], dict)))  # tables come last
+    options = dict(sorted(manifest["options"].items(), key=lambda item: isinstance(item[1], dict)))  # tables last
     comments = "".join(f"# {line}\n" for line in told)
     return f"{tomli_w.dumps(head)}{comments}\n{tomli_w.dumps({'options': options})}"
 
 
 def _motion(out: Proposal, topics: Sequence[Topic]) -> None:
-    """Odometry before measured velocities, these before wheels, and commands last."""
+    """Prefer odometry, then measured velocities, then wheels, then commands."""
     ranked = [
         topic
         for kinds, measured in (
@@ -142,7 +142,7 @@ def _motion(out: Proposal, topics: Sequence[Topic]) -> None:
         settings = {"wheels": {"left": "left_wheel_joint", "right": "right_wheel_joint", "radius": 0.1, "track": 0.5}}
         out.notes.append("wheels: name the joints of your robot, and measure radius and track [m]")
     elif NOT_MEASURED.search(ranked[0].name):
-        out.notes.append(f"{ranked[0].name} holds what the robot was told to do, not what it did")
+        out.notes.append(f"{ranked[0].name} contains commanded velocities, not measured ones")
     out.take("odometry", ranked[0], **settings)
     _others(out, "odometry", ranked[1:])
 
@@ -157,12 +157,10 @@ def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
     plain = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name)]
     if plain:
         out.take("reference", plain[0])
-        out.notes.append(f"{plain[0].name} is taken as the reference: leave it out if it is an estimate, not the truth")
+        out.notes.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
     for topic in topics:
         if topic.type in TF and topic.name != STATIC and not plain:
-            text = (
-                f'[options.reference] topic = "{topic.name}", parent = "map", child = "base_link" would take it from tf'
-            )
+            text = f'[options.reference] topic = "{topic.name}", parent = "map", child = "base_link" would use tf'
             out.notes.append(text)
 
 
@@ -173,14 +171,14 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
     infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
     chosen = images[0]
     place = chosen.name
-    while place and place not in infos:  # /camera/image_raw/compressed has its info at /camera/camera_info
+    while place and place not in infos:  # the info of /camera/image_raw/compressed is /camera/camera_info
         place = place.rpartition("/")[0]
     settings = {"info": infos[place].name} if place in infos else {}
     out.take("camera", chosen, **settings)
     if settings:
         out.uses[settings["info"]] = "camera: lens"
     else:
-        out.notes.append("no CameraInfo belongs to the images: the rig has to say what the camera is like")
+        out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
     _others(out, "camera", images[1:])
 
 
@@ -199,7 +197,7 @@ def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
 
 
 def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
-    """The topic whose messages have the field of an EPC, and most of what is told of a read beside it."""
+    """The topic with a field for the EPC, and most other fields of a read."""
     found = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -208,7 +206,7 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
             continue
         try:
             fields = read_fields(leaves(bag.store(topic.name), topic.type))
-        except InputError as error:  # of a topic that is perhaps of no interest
+        except InputError as error:  # the topic may be irrelevant
             out.notes.append(str(error))
             continue
         if "epc" in fields:
@@ -219,30 +217,30 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
     settings: dict[str, Any] = {"fields": fields}
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
-        out.notes.append(f"{topic.name} does not tell antennas apart: all reads are taken as of one, named antenna")
+        out.notes.append(f"{topic.name} does not distinguish antennas: all reads are assigned to one, set in antenna")
     if units := _units(fields):
         settings["units"] = units
     if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
         settings["rounds"] = "message"
         if topic.type != ROUND:
             out.notes.append(
-                "rfid: each message is taken as one inventory round of its antenna, an empty one as a silent round"
+                "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
             )
     out.take("rfid", topic, **settings)
     doubtful = [name for name in UNITS if name in fields and name not in units and topic.type != ROUND]
     if doubtful:
-        out.notes.append(f"rfid: {', '.join(doubtful)}: taken to be in rad, Hz and us, set units if not so")
+        out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
     _others(out, "rfid", [other for other, _ in found if other is not topic])
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """The fields of a read among the paths of a message type, by their usual names."""
+    """The fields of a read among the paths of a message type, by common names."""
     out = {}
     for name, known in NAMES.items():
         fitting = [p for p in paths if p.count(LIST) <= 1 and _plain(p) in known and not p.startswith("header.")]
         if fitting:
             out[name] = min(fitting, key=lambda p: (known.index(_plain(p)), len(p)))
-    if "stamp" not in out:  # the stamp of a read beside its EPC
+    if "stamp" not in out:  # the timestamp of a read in the message of its EPC
         stamps = [p for p in paths if p.endswith("stamp") and LIST in p]
         if stamps:
             out["stamp"] = stamps[0]
@@ -250,7 +248,7 @@ def read_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
-    """Units that the names of fields tell."""
+    """Units implied by field names."""
     out = {}
     for name, ends in UNITS.items():
         plain = _plain(fields.get(name, ""))

@@ -1,4 +1,4 @@
-"""How the robot moved, by what a bag holds of it: poses or velocities of odometry, angles of wheels, the gyro of an IMU."""
+"""Motion of the robot in a bag: poses or velocities of odometry, wheel angles, or the gyro of an IMU."""
 
 from typing import Annotated, Literal
 
@@ -27,7 +27,7 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 class WheelSettings(FileModel):
-    """A differential drive: the names of its two wheels' joints, their radius, and the track between them."""
+    """A differential drive: names of the two wheel joints, wheel radius, and track."""
 
     left: str
     right: str
@@ -36,8 +36,8 @@ class WheelSettings(FileModel):
 
 
 class OdometryTopic(Turned):
-    """``use``: of odometry its ``pose``, as the motion between messages, or its ``twist``; of wheels their position or velocity by
-    the same words. ``wheels`` are needed where the topic is of joints."""
+    """``use``: the ``pose`` of odometry (as motion between messages) or its ``twist``; for wheels, position or velocity.
+    ``wheels``: needed for a topic of joints."""
 
     topic: str
     use: Literal["pose", "twist"] = "pose"
@@ -46,8 +46,8 @@ class OdometryTopic(Turned):
 
 
 class ImuTopic(Turned):
-    """A topic of an IMU: its turn rate about the robot's z axis. ``frame``: the IMU's, for tf_static to say how it sits; without it
-    ``axes`` and ``mounting`` do, else its z axis points up."""
+    """A topic of an IMU: its turn rate about the robot's z axis. ``frame``: the IMU's, whose orientation is in tf_static; without
+    it use ``axes`` and ``mounting``; by default its z axis points up."""
 
     topic: str
     frame: str | None = None
@@ -58,20 +58,20 @@ Motion = IncrementStream | VelocityStream
 
 
 class PoseMotion:
-    """Odometry from poses of its own frame: the motion from one to the next."""
+    """Odometry from poses in its own frame: the motion between consecutive poses."""
 
     def __init__(self, bag: Bag, options: OdometryTopic) -> None:
         self._poses = Poses(bag, options.topic, options)
         self.add = self._poses.add
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        """Absolute stamps (N,) and the stream, whose own count from the first."""
+        """Absolute timestamps (N,) and the stream, whose timestamps start at 0."""
         t_ns, poses = self._poses.in_order(warnings)
         return t_ns, increments(t_ns, motions.between_poses(self._poses.rows.source, t_ns, poses, warnings))
 
 
 class TwistMotion:
-    """Odometry from velocities: each holds until the next."""
+    """Odometry from velocities, each held until the next."""
 
     def __init__(self, bag: Bag, options: OdometryTopic) -> None:
         kind = bag.topic(options.topic).type
@@ -93,7 +93,7 @@ class TwistMotion:
 
 
 class WheelMotion:
-    """Odometry from the angles of two wheels, or from how fast they turn."""
+    """Odometry from the angles or angular velocities of two wheels."""
 
     def __init__(self, bag: Bag, options: OdometryTopic) -> None:
         if options.wheels is None:
@@ -110,10 +110,10 @@ class WheelMotion:
             if self._wheels.left in names:
                 raise InputError(
                     f"{self._rows.source}:{item.row}: has {len(values)} numbers of {self._column} for {len(names)} joints, "
-                    "expected one for each; the other is chosen by odometry.use"
+                    "expected one for each; select the other with odometry.use"
                 )
             return
-        if self._wheels.left in names and self._wheels.right in names:  # other messages tell of other joints
+        if self._wheels.left in names and self._wheels.right in names:  # other messages contain other joints
             wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
             self._rows.append(item, t_ns, (float(wheels[0]), float(wheels[1])))
 
@@ -142,7 +142,7 @@ class YawRates:
         if topic.type != IMU:
             raise InputError(f"{bag.path}: topic {topic.name} is of type {topic.type}, expected {IMU}")
         if options.frame is not None and options.is_given():
-            raise InputError(f"{bag.path} {topic.name}: tf_static tells of the frame, expected no axes or mounting")
+            raise InputError(f"{bag.path} {topic.name}: tf_static has the frame, expected no axes or mounting")
         self._options = options
         self._rows = Rows(f"{bag.path} {options.topic}", 3)
 
@@ -151,7 +151,7 @@ class YawRates:
         self._rows.append(item, t_ns, (rate.x, rate.y, rate.z))
 
     def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> YawRateStream:
-        """Turn rates about the robot's z axis; of the IMU's axes only those that are turned about then need be numbers."""
+        """Turn rates about the robot's z axis; only the axes of the IMU that contribute must be finite."""
         turned = self._options.turned()
         if self._options.frame is not None:
             turned = frames.known(self._rows.source, self._options.frame, base)[:3, :3]
@@ -165,7 +165,7 @@ OdometryRows = PoseMotion | TwistMotion | WheelMotion
 
 
 def odometry(bag: Bag, options: OdometryTopic) -> OdometryRows:
-    """What gathers the odometry of a topic, by the type of its messages."""
+    """The collector for an odometry topic, by message type."""
     kind = bag.topic(options.topic).type
     poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
     if options.is_given() and not poses:
@@ -181,13 +181,13 @@ def odometry(bag: Bag, options: OdometryTopic) -> OdometryRows:
 
 
 def increments(t_ns: Integers, moves: Array) -> IncrementStream:
-    """The motions (N - 1, 3) between N stamps; the first row only says when the motion begins."""
+    """The motions (N - 1, 3) between N timestamps as increments; the first row only defines the start."""
     dx, dy, dtheta = np.vstack((np.zeros((1, 3)), moves)).T
     return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), dx, dy, dtheta)
 
 
 def finite_columns(rows: Rows, names: tuple[str, ...], warnings: list[str]) -> tuple[Integers, list[Array]]:
-    """Stamps and columns of rows in order of time, all numbers finite; InputError names the message of what is not so."""
+    """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
     number, t_ns, values = rows.rows, rows.t_ns, rows.values
     for i, name in enumerate(names):
         checks.require_finite(rows.source, number, name, values[:, i])

@@ -1,4 +1,4 @@
-"""Poses in a bag: those of odometry, and the reference that estimates are scored against."""
+"""Poses in a bag: odometry, and the reference for scoring."""
 
 from collections.abc import Callable
 from operator import attrgetter
@@ -27,8 +27,8 @@ POSES: dict[str, Callable[[Any], Any]] = {
 
 
 class ReferenceTopic(Turned):
-    """A topic of poses, or of tf, and then the frames: the robot is ``child`` in the world ``parent``. ``has_heading``: whether the
-    heading means something."""
+    """A topic of poses, or of tf with frames: the robot ``child`` in the world ``parent``. ``has_heading``: False if the heading is
+    meaningless."""
 
     topic: str
     parent: str | None = None
@@ -38,14 +38,14 @@ class ReferenceTopic(Turned):
 
 
 class StartTopic(Turned):
-    """A topic whose first pose is a known start, with its covariance."""
+    """A topic whose first pose with covariance is the known start."""
 
     topic: str
     clock: Clock | None = None
 
 
 class Poses:
-    """Gathers the poses of a topic; points are poses whose heading means nothing."""
+    """Collects the poses of a topic; points are poses without heading."""
 
     def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
         topic = bag.topic(name)
@@ -55,7 +55,7 @@ class Poses:
             known = ", ".join(sorted({*POSES, POINT}))
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected one of {known}")
         self._pose = POSES.get(topic.type, attrgetter("point"))
-        # a transform says translation and rotation where a pose says position and orientation
+        # transforms have translation and rotation, poses position and orientation
         self._parts = (
             ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
         )
@@ -69,7 +69,7 @@ class Poses:
             self.rows.append(item, t_ns, seven(pose, *self._parts))
 
     def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
-        """Stamps (N,) and planar poses (N, 3), of equal stamps the last; InputError names the message of what is wrong."""
+        """Timestamps (N,) and planar poses (N, 3), the last one of equal timestamps; InputError names the invalid message."""
         rows, t_ns = self.rows.rows, self.rows.t_ns
         values, turns = self.rows.values, None
         check_rotations(self.rows.source, rows, values)
@@ -85,7 +85,7 @@ class Poses:
 
 
 class Start:
-    """Gathers the first pose with covariance of a topic: where the robot is known to start."""
+    """Collects the first pose with covariance of a topic, the known start."""
 
     def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
         topic = bag.topic(name)
@@ -93,7 +93,7 @@ class Start:
         if topic.type != WITH_COVARIANCE:
             raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
         self._source = f"{bag.path} {name}"
-        self._found: tuple[int, Array, Array] | None = None  # stamp [ns], pose (1, 7), variances (3,)
+        self._found: tuple[int, Array, Array] | None = None  # timestamp [ns], pose (1, 7), variances (3,)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._found is None:
@@ -102,7 +102,7 @@ class Start:
             self._found = (t_ns, np.array([seven(told.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
-        """InputError if a variance of x, y or heading is not above zero."""
+        """The start; InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
         first = np.ones(1, dtype=np.int64)
@@ -116,13 +116,13 @@ class Start:
 
 
 def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
-    """x, y, z [m] and the quaternion x, y, z, w of a pose, or of a transform."""
+    """x, y, z [m] and the quaternion x, y, z, w of a pose or transform."""
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def check_rotations(source: str, rows: Integers, table: Array) -> None:
-    """InputError for a number of positions and quaternions (N, 7) that is not finite, and a quaternion that is no unit one."""
+    """InputError if positions and quaternions (N, 7) are not finite, or a quaternion is not a unit quaternion."""
     for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
         checks.require_finite(source, rows, name, table[:, i])
     require_unit(source, rows, table[:, 3:])

@@ -1,4 +1,4 @@
-"""Reads of RFID tags in a bag, from messages of any type by a mapping of fields."""
+"""RFID reads in a bag, from messages of any type by a mapping of fields."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,11 +23,11 @@ SIGNALS = {name: RFID[name].units for name in ("rssi", "phase", "frequency")}
 
 
 class RfidTopic(FileModel):
-    """``fields``: where a message has the EPC, the antenna, and what else it tells, and their ``units`` where these are not dBm,
-    rad, Hz and us. ``antenna``: the name of the only one, where messages do not tell it. ``antennas``: names in the rig of those of
-    the messages; ``frames``: their frames in tf_static, where these have other names. ``epc_case``: in which letters EPCs are
-    compared with the map. ``rounds``: ``message`` where each message holds the reads of one inventory round, none if it read
-    nothing; ``gaps`` where rounds are found from pauses of ``round_gap`` seconds between reads."""
+    """``fields``: paths of the EPC, the antenna, and other values, with ``units`` if these are not dBm, rad, Hz and us.
+    ``antenna``: name of the only antenna, if messages do not name it. ``antennas``: names in the rig of those in messages;
+    ``frames``: their frames in tf_static, if named differently. ``epc_case``: letter case in which EPCs are compared with the
+    map. ``rounds``: ``message`` if a message holds the reads of one inventory round; ``gaps`` if rounds are separated by
+    ``round_gap`` seconds without reads."""
 
     topic: str
     fields: dict[ReadField, str]
@@ -42,7 +42,7 @@ class RfidTopic(FileModel):
 
 
 class Reads:
-    """Gathers the reads of a topic."""
+    """Collects the reads of a topic."""
 
     def __init__(self, bag: Bag, options: RfidTopic) -> None:
         self._options = options
@@ -55,7 +55,7 @@ class Reads:
         self._scale = np.array([self._factor(name, units) for name, units in SIGNALS.items()])
         self._stamp_unit = round(self._factor("stamp", {"us": 1e3} | {k: 10.0**n for k, n in SECONDS.items()}))
         self._fields = Fields(bag, topic, options.fields)
-        # the antenna of a message that holds no reads
+        # the antenna of a message without reads
         self._listening = None
         if options.antenna is None and LIST not in options.fields["antenna"]:
             self._listening = Fields(bag, topic, {"antenna": options.fields["antenna"]})
@@ -81,7 +81,7 @@ class Reads:
             self._end_rounds(item, t_ns, first)
 
     def _end_rounds(self, item: Stamped, t_ns: int, first: int) -> None:
-        """The rounds that a message tells of: one of each antenna in it, and one of its own antenna if it holds no reads."""
+        """Add the rounds of a message: one for each antenna in it, or one of its own antenna if it has no reads."""
         antennas = list(dict.fromkeys(self._antenna[first:]))
         if not antennas and self._options.antenna:
             antennas = [self._options.antenna]
@@ -93,7 +93,7 @@ class Reads:
         self._round_antenna += antennas
 
     def rounds(self, warnings: list[str]) -> native_rfid.Rounds:
-        """All reads in their rounds. InputError names the message of what is wrong."""
+        """All reads in their rounds. InputError names the invalid message."""
         table = self._table()
         native_rfid.check_reads(table)
         if self._options.rounds == "gaps":
@@ -105,7 +105,7 @@ class Reads:
     def _table(self) -> TableRows:
         signals = np.array(self._signals, dtype=float).reshape(-1, len(SIGNALS))
         return TableRows(
-            path=Path(self._source),  # only named in messages
+            path=Path(self._source),  # used in messages only
             rows=np.array(self._rows, dtype=np.int64),
             t_ns=np.array(self._t_ns, dtype=np.int64),
             numbers=dict(zip(SIGNALS, (signals * self._scale).T, strict=True)),
@@ -122,7 +122,7 @@ class Reads:
             raise bad_field(self._source, "stamp", value, "a time, or a number", row=row) from None
 
     def _factor(self, field: Any, units: Mapping[str, float]) -> float:
-        """What a field is to be multiplied with, by the first of ``units`` if none is named."""
+        """The unit factor of a field, by default that of the first of ``units``."""
         unit = self._options.units.get(field, next(iter(units)))
         if not isinstance(unit, str):
             return float(unit)

@@ -1,4 +1,4 @@
-"""What a bag itself tells of the robot: its camera, and where camera and antennas sit. The rest is as of a robot not known."""
+"""The part of the rig that a bag contains: the camera, and the mounting of camera and antennas."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,12 +18,12 @@ from factors.se2 import Array
 
 
 def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> CameraSettings:
-    """The camera of a ``CameraInfo``, looking ahead from the robot's origin where tf_static does not say where it sits."""
+    """The camera of a ``CameraInfo``; it looks forward from the robot's origin if tf_static has no mounting."""
     pose = frames.pose(info.frame, base)
     if pose is None:
-        notes.append(f"tf_static does not tell where {info.frame} sits on {base}")
+        notes.append(f"tf_static has no mounting of {info.frame} on {base}")
         return info.settings({}, notes)
-    notes.append(f"tf_static tells where {info.frame} sits on {base}")
+    notes.append(f"tf_static has the mounting of {info.frame} on {base}")
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
     return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
@@ -32,18 +32,18 @@ def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> 
 def antennas_of(
     names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, notes: list[str]
 ) -> RfidSettings:
-    """Antennas whose frames are ``given``, or have their names; x of such a frame is the boresight. Others are at the origin."""
+    """Antennas with frames ``given``, or frames of their names; the frame's x axis is the boresight. Others are at the origin."""
     poses = {name: frames.pose(given.get(name, name), base) for name in sorted(names)}
-    for verb, told in (("tells", True), ("does not tell", False)):
+    for verb, told in (("has the", True), ("has no", False)):
         if which := [name for name, pose in poses.items() if (pose is not None) == told]:
-            notes.append(f"tf_static {verb} where antennas {', '.join(which)} sit on {base}")
+            notes.append(f"tf_static {verb} mounting of antennas {', '.join(which)} on {base}")
     return RfidSettings(
         antennas={name: AntennaSettings() if p is None else _antenna(name, p) for name, p in poses.items()}
     )
 
 
 def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
-    """A rig with what is known; the noise of a robot of which nothing is."""
+    """A rig with the known settings and the default noise."""
     return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
 
 

@@ -1,6 +1,6 @@
-"""ROS bags by a mapping of topics: ``fgloc manifest BAG`` proposes one.
+"""The reader of ROS bags by a mapping of topics, which ``fgloc manifest BAG`` proposes.
 
-The bag is read once, as a stream; of its messages only the numbers that a log needs are kept, and images go to files.
+The bag is read once; only the needed numbers of its messages are kept, and images are written to files.
 """
 
 from contextlib import ExitStack
@@ -32,8 +32,8 @@ from factorgraph_loc.text import told
 
 
 class Options(FileModel):
-    """Which topic is which sensor. ``clock``: which stamps count, those of the messages' headers or those of their receipt; a topic
-    may have its own. ``base_frame``: the robot's, of which tf_static says where sensors sit."""
+    """The sensor of each topic. ``clock``: whether timestamps are those of message headers or of receipt; a topic may override it.
+    ``base_frame``: the robot's, for mountings in tf_static."""
 
     odometry: OdometryTopic
     imu: ImuTopic | None = None
@@ -52,13 +52,13 @@ add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS},
 
 
 class Gatherer(Protocol):
-    """Takes out of the messages of one topic what a log needs; messages are not kept, so that what they lack is found here."""
+    """Collects the needed data from the messages of one topic; messages are not kept, so they are validated here."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
 
 class TimedTopic(Protocol):
-    """What the options of any topic have."""
+    """The common options of all topics."""
 
     @property
     def topic(self) -> str: ...
@@ -70,7 +70,7 @@ G = TypeVar("G", bound=Gatherer)
 
 
 class Listeners:
-    """Who takes the messages of which topic, and by which clock."""
+    """The collectors of each topic, with their clocks."""
 
     def __init__(self, bag: Bag, clock: Clock) -> None:
         self.bag, self.clock = bag, clock
@@ -78,17 +78,17 @@ class Listeners:
         self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
 
     def stamper(self, topic: str, clock: Clock | None) -> Stamper:
-        """By the topic's own clock, or by that of the bag."""
+        """The timestamps of a topic, by its own clock or that of the bag."""
         return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
 
     def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
-        """``timed``: whether stamps of the topic mean something."""
+        """Register a collector. ``timed``: whether timestamps of the topic are meaningful."""
         self._of.setdefault(topic, []).append((stamper, gatherer))
         if timed:
             self.stampers.append(stamper)
 
     def listen(self, options: TimedTopic, gatherer: G) -> G:
-        """Have a gatherer take the messages of a topic; the same."""
+        """Register a collector for a topic and return it."""
         self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
         return gatherer
 
@@ -101,14 +101,14 @@ class Listeners:
                 except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
-                    raise InputError(f"{where}: {kind} is not defined in the bag as ROS does: {told(error)}") from error
+                    raise InputError(f"{where}: {kind} is defined in the bag unlike in ROS: {told(error)}") from error
         for stamper in self.stampers:
             stamper.check()
 
 
 @dataclass
 class Gathered:
-    """What takes the messages of each sensor that the manifest names."""
+    """The collectors of all sensors in the manifest."""
 
     imu: YawRates | None = None
     rfid: Reads | None = None
@@ -122,7 +122,7 @@ class Gathered:
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of what is wrong."""
+    """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of an invalid value."""
     if path is None:
         raise InputError("rosbag: the path of the bag is missing")
     with open_bag(path) as bag, ExitStack() as stack:
@@ -156,7 +156,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
     streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
-    notes: list[str] = []  # of the bag's own rig, which one of the manifest replaces
+    notes: list[str] = []  # on the bag's own rig, which one in the manifest replaces
     rig = _rig(streams, gathered, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
@@ -173,7 +173,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
 
 
 def _listen(listeners: Listeners, options: Options) -> Gathered:
-    """All that the manifest names beside odometry."""
+    """Register collectors for the manifest's topics except odometry."""
     bag, out = listeners.bag, Gathered()
     if options.imu:
         out.imu = listeners.listen(options.imu, YawRates(bag, options.imu))
@@ -231,7 +231,7 @@ def _reference(
 def _rig(
     streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, notes: list[str]
 ) -> Rig:
-    """What the bag tells of the robot; a rig of the manifest replaces it."""
+    """The rig from the bag; a rig in the manifest replaces it."""
     base = options.base_frame
     camera = bag_rig.camera_of(gathered.info, frames, base, notes) if gathered.info else None
     reads = streams.get("rfid")

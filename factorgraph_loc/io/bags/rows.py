@@ -1,4 +1,4 @@
-"""What is gathered of a topic while its bag is read: stamps and numbers, eight bytes each, not messages."""
+"""Compact storage of timestamps and numbers from the messages of a topic."""
 
 from array import array
 
@@ -9,7 +9,7 @@ from factors.se2 import Array, Integers
 
 
 class Rows:
-    """N rows of ``width`` numbers with their stamps, and the messages that they are from, counted from 1 within their topic."""
+    """N rows of ``width`` numbers with timestamps, and the numbers of their messages, counted from 1 within the topic."""
 
     def __init__(self, source: str, width: int) -> None:
         self.source = source

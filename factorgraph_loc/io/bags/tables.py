@@ -1,4 +1,4 @@
-"""Tables of sensors in a bag whose rows are messages, or parts of them, by a mapping of fields."""
+"""Sensor tables in a bag whose rows are messages or list elements, by a mapping of fields."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,8 +22,8 @@ from factors.se2 import Array
 
 
 class TableTopic(FileModel):
-    """``fields``: where a message has each column of the table, by default in fields of the same names. ``units``: by column, what
-    to multiply with to have ours."""
+    """``fields``: path of each column of the table, by default a field with the column's name. ``units``: factors to our units, by
+    column."""
 
     topic: str
     fields: dict[str, str] = Field(default_factory=dict)
@@ -32,8 +32,8 @@ class TableTopic(FileModel):
 
 
 class RowsOfTopic:
-    """Gathers rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; a number that no field has
-    is NaN. ``units``: by column, what to multiply with."""
+    """Collects rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; missing numbers are NaN.
+    ``units``: factors by column."""
 
     def __init__(
         self, bag: Bag, topic: str, fields: Mapping[Any, str], columns: Sequence[Column], units: Mapping[str, float]
@@ -46,7 +46,7 @@ class RowsOfTopic:
         self._rows = Rows(f"{bag.path} {topic}", len(self._numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Take the rows of a message."""
+        """Add the rows of a message."""
         for values in self._fields.rows(item.message, item.row):
             told = dict(zip(self._fields.names, values, strict=True))
             for column in self._named:
@@ -56,14 +56,14 @@ class RowsOfTopic:
             self._rows.append(item, t_ns, tuple(as_number(told.get(name, math.nan)) for name in self._numbered))
 
     def rows_of(self, numbers: Mapping[str, Array] | None = None) -> TableRows:
-        """What was gathered, or other ``numbers`` (N,) that were made of it."""
+        """The collected rows, or the rows with other ``numbers`` (N,) computed from them."""
         if numbers is None:
             numbers = dict(zip(self._numbered, (self._rows.values * self._units).T, strict=True))
         return TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, dict(numbers), self._names)
 
 
 class DescribedRows(RowsOfTopic):
-    """Gathers the rows of a table that is no more than its description."""
+    """Collects the rows of a table that needs only its description."""
 
     def __init__(self, bag: Bag, options: TableTopic, table: Table) -> None:
         columns = {column.name: column for column in table.columns[1:]}
@@ -75,5 +75,5 @@ class DescribedRows(RowsOfTopic):
         self._table = table
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
-        """The rows as a stream; what is wrong with them is an InputError or a warning."""
+        """The rows as a stream; problems are an InputError or a warning."""
         return stream_of(self._table, self.rows_of(), t0_ns, warnings)

@@ -1,4 +1,4 @@
-"""Compressed bags, of which a few bytes may stand for gigabytes: ``rosbags`` unpacks them here, within limits.
+"""Limits on the decompression of bags in ``rosbags``, because a few bytes may expand to gigabytes.
 
 A bag is compressed by chunks (``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2).
 """
@@ -14,15 +14,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO
 
-SMALL, LARGE = 2**24, 2**27  # bytes of a chunk that are unpacked always, and at most
-FILE = 2**30  # bytes of a file that are unpacked always, if the disk has room
-CHUNK_RATIO, FILE_RATIO = 1000, 50  # bytes that one stands for at most, beyond that
+SMALL, LARGE = 2**24, 2**27  # bytes of a chunk that are always unpacked, and the maximum
+FILE = 2**30  # bytes of a file that are always unpacked, if the disk has room
+CHUNK_RATIO, FILE_RATIO = 1000, 50  # maximum compression ratios beyond that
 STEP = 2**22
 
 
 @cache
 def bound() -> None:
-    """Put the functions below in the place of those that ``rosbags`` unpacks with, in all its readers."""
+    """Replace the decompression functions in all readers of ``rosbags`` by those below."""
     import lz4.frame  # type: ignore[import-untyped] # noqa: PLC0415 - optional libraries
     from rosbags.rosbag1 import reader as reader1  # noqa: PLC0415
     from rosbags.rosbag2 import reader as reader2  # noqa: PLC0415
@@ -38,7 +38,7 @@ def bound() -> None:
 
 
 def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
-    """What ``data`` unpack to, frame by frame, with decompressors that ``make`` makes; ValueError if it is too much, or cut off."""
+    """Decompress ``data`` frame by frame with decompressors from ``make``; ValueError if it is too large or truncated."""
     limit = max(SMALL, min(LARGE, CHUNK_RATIO * len(data)))
     parts: list[bytes] = []
     count = 0
@@ -58,7 +58,7 @@ def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
 
 
 class _File:
-    """A compressed file for reading; ValueError when it has given more than it may. ``content``: unpacks ``file``."""
+    """A compressed file for reading, which raises ValueError beyond its limit. ``content``: decompresses ``file``."""
 
     def __init__(self, content: BinaryIO, file: BinaryIO) -> None:
         self._content = content

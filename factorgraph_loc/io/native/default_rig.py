@@ -1,9 +1,9 @@
-"""The rig of a log that brings none."""
+"""The rig of a log without one."""
 
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 
-# what a reader gives where the format says nothing of the robot
+# for formats that do not describe the robot
 DEFAULT_RIG = Rig(
     name="default",
     bearing_range=BearingRangeSettings(range_sigma=0.2, range_sigma_relative=0.1, bearing_sigma=0.05),

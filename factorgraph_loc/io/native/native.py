@@ -1,4 +1,4 @@
-"""Our own format: a folder with ``run.toml``, a CSV or Parquet table per sensor, and ``reference.tum``."""
+"""The native format: a folder with ``run.toml``, a CSV or Parquet table per sensor, and ``reference.tum``."""
 
 import re
 from collections.abc import Mapping
@@ -39,10 +39,8 @@ class Options(FileModel):
 
 
 class RunFile(FileModel):
-    """``run.toml``. ``rig`` and ``world``: a table, or the name of a file below the folder.
-
-    ``has_heading``: whether the heading of the reference means something.
-    """
+    """``run.toml``. ``rig`` and ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the
+    reference's headings are meaningless."""
 
     name: str | None = None
     rig: dict[str, Any] | str | None = None
@@ -53,7 +51,7 @@ class RunFile(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
-    """The log in the folder ``path``; t = 0 at the first stamp of its tables. InputError names file, row and field."""
+    """The log in the folder ``path``; t = 0 at the first timestamp of its tables. InputError names file, row and field."""
     if path is None or not (path / RUN_FILE).is_file():
         raise InputError(f"{path}: has no {RUN_FILE}, expected a folder in the native format")
     run_path = path / RUN_FILE
@@ -95,7 +93,7 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
-    """The tables that hold rows, by name. A table of a sensor that this version does not read is a warning."""
+    """The non-empty tables by name. A table of an unknown sensor gives a warning."""
     tables = {}
     for name, (_, descriptions) in native_tables().items():
         files = [folder / f"{name}{suffix}" for suffix in SUFFIXES if (folder / f"{name}{suffix}").is_file()]
@@ -106,7 +104,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
             if len(rows.rows):
                 tables[name] = rows
             else:
-                warnings.append(f"{file}: holds no rows")
+                warnings.append(f"{file}: contains no rows")
     suffixes = (POINTS_SUFFIX, *(layer.suffix for layer in layers().values() if layer.suffix))
     unread = sorted(
         file.name
@@ -119,7 +117,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
 
 
 def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, Stream]:
-    """The streams of the channels that have tables."""
+    """The streams of all channels with tables."""
     rows: dict[Channel, dict[str, TableRows]] = {}
     for name, found in tables.items():
         rows.setdefault(native_tables()[name][0], {})[name] = found
@@ -136,24 +134,24 @@ def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str
 
 
 def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv") -> None:
-    """Write a log as a new folder, at once or not at all; InputError if ``folder`` holds something.
+    """Write a log as a new folder atomically; InputError if ``folder`` is not empty.
 
-    Stamps are exact to the nanosecond, the numbers of the tables to the last digit. Covariances of the reference are not
-    written, and of a start's deviations in x and y only the larger one. Images are copied; features that were found in images,
-    motion in space and a second camera cannot be written: InputError.
+    Timestamps are exact to the nanosecond, numbers to the last digit. Not written: covariances of the reference, and the smaller
+    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, motion in space and a
+    second camera.
     """
     folder = Path(folder)
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as temporary:
-        content = temporary / "log"  # its mode is that of any new folder, the other's is private
+        content = temporary / "log"  # with the permissions of a new folder; the temporary one is private
         content.mkdir()
         write_files(log, content, format)
         content.replace(folder)
 
 
 def require_new(folder: Path) -> None:
-    """InputError if ``folder`` holds something; what earlier attempts to write it have left beside it is removed."""
+    """InputError if ``folder`` is not empty; removes remains of earlier attempts to write it."""
     sweep(folder.parent)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")

@@ -1,4 +1,4 @@
-"""Reading and writing ``NAME.world.toml``, with the tables beside it."""
+"""Reading and writing of ``NAME.world.toml`` with its tables."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,15 +20,15 @@ class _Markers(FileModel):
 
 
 def read_world(path: str | Path) -> World:
-    """Read ``NAME.world.toml``; InputError names file, key and what is expected."""
+    """Read ``NAME.world.toml``; InputError names file, key and expected value."""
     path = Path(path)
     return parse_world(read_toml(path), path, path.parent)
 
 
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
-    """A map as it stands in a file ``source``; tables that it names lie below ``folder``. InputError as of :func:`read_world`.
+    """A map from the content of a file ``source``, with tables in ``folder``. InputError as in :func:`read_world`.
 
-    ``walls`` may name an occupancy map, a layer a table of its own; the corners of ``markers`` become points.
+    ``walls`` may name an occupancy map, a layer a table; corners of ``markers`` become points.
     """
     for name, layer in layers().items():
         if layer.read and name in content:
@@ -52,8 +52,7 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
 
 
 def write_world(world: World, path: str | Path) -> None:
-    """Write ``NAME.world.toml``, layers that have tables beside it, such as ``NAME.tags.csv``, and the points as
-    ``NAME.points.parquet``."""
+    """Write ``NAME.world.toml``, tables of layers such as ``NAME.tags.csv``, and points as ``NAME.points.parquet``."""
     path = Path(path)
     content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
     base = path.name.removesuffix(".toml").removesuffix(".world")

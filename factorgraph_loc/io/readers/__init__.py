@@ -1,4 +1,4 @@
-"""Readers: one module per log format, and ``load``, which finds the right one."""
+"""Readers of log formats, one module each, and ``load``, which selects the reader."""
 
 from factorgraph_loc.io.readers.load import load, read_log
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify

@@ -1,6 +1,6 @@
-"""What every log must keep to, wherever it comes from: the bounds of its tables' columns, and of its span.
+"""Bounds of columns and time span that every log must satisfy.
 
-Readers name the file and the row of what they can tell; what comes out of several rows, or of a format of others, is found here.
+Readers check what they can attribute to a file and row; values computed from several rows or foreign formats are checked here.
 """
 
 from dataclasses import replace
@@ -15,11 +15,11 @@ from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
 from factors.se2 import Array
 
-ROUNDING = 1e-9  # as a share: of a value that was multiplied with its unit
+ROUNDING = 1e-9  # relative tolerance for converted values
 
 
 def require_bounds(log: Log) -> None:
-    """InputError at the first value of a log that lies outside its column's bounds, with the time."""
+    """InputError at the first value of a log that is outside of its column's bounds, with its time."""
     for name, stream in log.streams.items():
         for column in columns_of(channels()[name], stream) if name in channels() else ():
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
@@ -36,7 +36,8 @@ def require_bounds(log: Log) -> None:
 
 
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
-    """InputError at the first row of ``values`` (N,) or (N, 3) that lies outside by more than rounding; ``t`` (N,): its time."""
+    """InputError at the first row of ``values`` (N,) or (N, 3) that is out of bounds by more than rounding; ``t`` (N,): its
+    time."""
     low, high = column.low - ROUNDING * abs(column.low), column.high + ROUNDING * abs(column.high)
     bad = replace(column, low=low, high=high).outside(values)
     if bad.any():
@@ -46,14 +47,14 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """InputError at a stamp of a log that is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from the others, the start's
-    included: sensors whose clocks do not agree, if each table was in order when it was read."""
+    """InputError at a timestamp of a log, or of its start, that is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from
+    the others, because the clocks of sensors disagree."""
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
         return
     for name, t in filled.items():
         if not np.all(np.isfinite(t)):
-            raise InputError(f"{log.name}: {name} has a stamp that is no finite number")
+            raise InputError(f"{log.name}: {name} has a timestamp that is not a finite number")
     first, last = log.span()
     expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log"
     if last - first > MAX_SPAN:
@@ -61,7 +62,9 @@ def require_one_span(log: Log) -> None:
         middle = float(stamps[len(stamps) // 2])
         name, t = max(filled.items(), key=lambda item: float(np.abs(item[1] - middle).max()))
         i = int(np.argmax(np.abs(t - middle)))
-        where = f"{log.name}: {name} has a stamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
+        where = f"{log.name}: {name} has a timestamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
         raise InputError(f"{where}, expected {expected}: do their clocks agree?")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
-        raise InputError(f"{log.name}: the start is at {log.start.t:.0f} s after the first stamp, expected {expected}")
+        raise InputError(
+            f"{log.name}: the start is at {log.start.t:.0f} s after the first timestamp, expected {expected}"
+        )

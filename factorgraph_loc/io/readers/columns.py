@@ -1,4 +1,4 @@
-"""Text files of numbers in columns between blanks, with lines of comment."""
+"""Text files of numbers in whitespace-separated columns with comments."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +12,10 @@ from factors.se2 import Array, Integers
 
 
 def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
-    """The finite numbers (N, K) of a file with K ``fields``, and their rows (N,) as an editor counts lines.
+    """The finite numbers (N, K) of a file with K ``fields``, and line numbers (N,).
 
-    Lines that are blank or begin with ``#`` are passed over. InputError names file, row and field of what is wrong; a file
-    without anything in it, not even a comment, is wrong.
+    Blank lines and lines that begin with ``#`` are skipped. InputError names file, row and field of an invalid value; an empty file
+    is invalid.
     """
     text = read_text(path)
     if not text.strip():
@@ -40,7 +40,7 @@ def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
 
 
 def first_fault(path: Path, fields: Sequence[str], numbered: Sequence[tuple[int, str]]) -> InputError:
-    """The error for the first line that is not one number a field."""
+    """The error for the first line that does not consist of one number per field."""
     for row, line in numbered:
         parts = line.split()
         if len(parts) != len(fields):

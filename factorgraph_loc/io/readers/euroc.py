@@ -1,9 +1,9 @@
-"""EuRoC and other folders in the ASL format: images of a camera on a flying robot, and its true pose (Burri et al., "The EuRoC
-micro aerial vehicle datasets", International Journal of Robotics Research 2016).
+"""The EuRoC (ASL) format: images of a camera on a flying robot with ground-truth poses (Burri et al., "The EuRoC micro aerial
+vehicle datasets", International Journal of Robotics Research 2016).
 
-``mav0/cam0/data.csv`` lists the images in ``mav0/cam0/data``, ``sensor.yaml`` beside it says what the camera is like and where it
-sits on the body, whose pose is in ``mav0/state_groundtruth_estimate0/data.csv``. Its gyro turns about axes of the body that need
-not stand upright, so that it is no turn rate of a robot on a floor, and is not read.
+``mav0/cam0/data.csv`` lists the images in ``mav0/cam0/data``; ``sensor.yaml`` next to it has the camera's calibration and mounting
+on the body, whose poses are in ``mav0/state_groundtruth_estimate0/data.csv``. The gyro is not read, because its rates are not those
+of a robot on a floor.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ from factors.camera.model import angles_of_camera
 from factors.se2 import Array
 
 TRUTHS = ("state_groundtruth_estimate0", "state_groundtruth0")
-# stamp, position and orientation of the body; what follows, velocities and biases, is not used
+# timestamp, position and orientation of the body; velocities and biases are not used
 STATE = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 UNDISTORTED = ("none", "pinhole", "")
 
@@ -38,7 +38,7 @@ class Options(FileModel):
 
 
 class _Sensor(FileModel):
-    """What ``sensor.yaml`` says, as far as it is used."""
+    """The used part of ``sensor.yaml``."""
 
     intrinsics: tuple[float, float, float, float]
     distortion: tuple[float, float, float, float]
@@ -47,9 +47,7 @@ class _Sensor(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The images with the true body poses as ``reference3``; t = 0 at the first image.
-
-    InputError names the file and what is wrong."""
+    """The images with the true body poses as ``reference3``; t = 0 at the first image. InputError names the invalid file."""
     if path is None:
         raise InputError("euroc: the path of the folder with mav0 is missing")
     folder = inside(path, "mav0", path) if (path / "mav0").is_dir() else path

@@ -1,7 +1,8 @@
-"""KITTI odometry: images of a car, and its true poses (Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012).
+"""KITTI odometry: images of a car with ground-truth poses (Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR
+2012).
 
-The folder holds ``sequences/NN`` with ``times.txt``, ``calib.txt`` and ``image_0`` to ``image_3``, and ``poses/NN.txt``. The robot
-is camera 0, x ahead: the poses are its own.
+The folder contains ``sequences/NN`` with ``times.txt``, ``calib.txt`` and ``image_0`` to ``image_3``, and ``poses/NN.txt``. The
+robot frame is that of camera 0, with x forward.
 """
 
 from pathlib import Path
@@ -23,14 +24,14 @@ from factorgraph_loc.sensors.camera.tables import make_images
 
 
 class Options(FileModel):
-    """``sequence``: its number; those from 11 on have no poses. ``camera``: 0 and 1 are grey, 2 and 3 in colour."""
+    """``sequence``: its number; those from 11 have no poses. ``camera``: 0 and 1 are grey, 2 and 3 colour."""
 
     sequence: Annotated[int, Field(ge=0, le=21)] = 0
     camera: Annotated[int, Field(ge=0, le=3)] = 0
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The images with the true poses as ``reference3``; t = 0 at the first image. InputError names the file and what is wrong."""
+    """The images with the true poses as ``reference3``; t = 0 at the first image. InputError names the invalid file."""
     if path is None:
         raise InputError("kitti_odometry: the path of the folder with sequences is missing")
     name = f"{options.sequence:02d}"
@@ -62,7 +63,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def _camera(path: Path, number: int, size: tuple[int, int]) -> CameraSettings:
-    """A rectified camera by its projection matrix, in the frame of camera 0."""
+    """A rectified camera from its projection matrix, in the frame of camera 0."""
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         key, _, text = line.partition(":")
         if key.strip() != f"P{number}":
@@ -80,7 +81,7 @@ def _camera(path: Path, number: int, size: tuple[int, int]) -> CameraSettings:
         rectified = np.array(((focal[0], 0.0, matrix[0, 2]), (0.0, focal[1], matrix[1, 2]), (0.0, 0.0, 1.0)))
         if np.any(matrix[:, :3] != rectified):
             raise bad_field(path, f"P{number}", text.strip(), "fx 0 cx, 0 fy cy, 0 0 1, each before a fourth", row=row)
-        # the fourth column is minus the camera's place times the matrix before it
+        # the fourth column is the matrix times the negative camera position
         right, down, ahead = (-np.linalg.solve(matrix[:, :3], matrix[:, 3])).tolist()
         content = {"width": size[0], "height": size[1], "fx": focal[0], "fy": focal[1]}
         content |= {"cx": matrix[0, 2], "cy": matrix[1, 2], "x": ahead, "y": -right, "z": -down}

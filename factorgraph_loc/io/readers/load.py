@@ -1,4 +1,4 @@
-"""From what a user names to logs: a manifest, a folder in our own format, a shipped name, or any path with its reader."""
+"""Loading of logs by manifest, native folder, shipped name, or path and reader."""
 
 import itertools
 import math
@@ -27,17 +27,17 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.text import listed, one_line
 
 RUN_FILE = "run.toml"
-MOST = 1000  # logs that lists of options stand for
+MOST = 1000  # maximum number of logs from lists of options
 TABLES = (".csv", *JSON_SUFFIXES)
 
 
 @dataclass(frozen=True)
 class _Source:
-    """What to read, and what to put into the log that the reader makes."""
+    """What to read, and what to add to the reader's log."""
 
     reader: str
     path: Path | None
-    name: str | None = None  # None: the reader's
+    name: str | None = None  # None for the reader's name
     options: Mapping[str, Any] = field(default_factory=dict)
     rig: Rig | None = None
     world: World | None = None
@@ -55,23 +55,23 @@ def load(
     rig: str | Path | None = None,
     world: str | Path | None = None,
 ) -> list[Log]:
-    """The logs that ``log`` names.
+    """The logs that ``log`` refers to.
 
-    ``log`` is a manifest, a folder in the native format or its ``run.toml``, a name that ``manifests()`` lists, or, with
-    ``reader``, any path. ``options`` are the reader's and go before a manifest's; a list, or text with commas, makes a log of
-    each value. ``rig`` and ``world`` replace those of the log. ``data_root``: where the files of manifests are that are not
-    below the manifest's own folder, by default the environment's FGLOC_DATA. InputError names what is wrong in one line.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, or any path with ``reader``.
+    ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
+    ``world`` replace those of the log. ``data_root``: folder of data files outside of the manifest's folder, by default the
+    environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
     given = dict(options or {})
     source = _find(str(log), data_root, reader)
     choices = {key: _choices(value) for key, value in source.options.items()}
-    # the command line gives a list as text with commas
+    # lists are given as text with commas on the command line
     choices |= {
         key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
         for key, value in given.items()
     }
     if (count := math.prod(map(len, choices.values()))) > MOST:
-        raise InputError(f"{log}: its options stand for {count:,} logs, expected at most {MOST:,}")
+        raise InputError(f"{log}: its options give {count:,} logs, expected at most {MOST:,}")
     if empty := [key for key, values in choices.items() if not values]:
         raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
     naming = [
@@ -99,22 +99,22 @@ def read_log(
     rig: str | Path | None = None,
     world: str | Path | None = None,
 ) -> Log:
-    """The one log that ``log`` names, which is what :func:`load` takes; InputError if it names several."""
+    """The log that ``log`` refers to, as in :func:`load`; InputError if there are several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
-        raise InputError(f"{log} stands for {len(logs)} logs, expected one: {listed(found.name for found in logs)}")
+        raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(found.name for found in logs)}")
     return logs[0]
 
 
 def _choices(value: Any) -> list[Any]:
-    """The values of an option, of which there may be a list."""
+    """The values of an option, which may be a list."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
 def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source:
     path = Path(log)
     if reader is not None:
-        readers.reader(reader)  # a wrong name of a reader is told before a wrong path
+        readers.reader(reader)  # report a wrong reader before a wrong path
     if kind(path) not in ("", "a file", "a folder"):
         raise InputError(f"{log}: is {kind(path)}, expected a file or a folder")
     if reader is not None:
@@ -126,12 +126,12 @@ def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source
     if path.exists() and is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have that name too
+        if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have this name too
             return _Source("native", path.parent)
         if path.suffix == ".toml":
             return _from_manifest(path, data_root)
         if path.suffix.lower() in TABLES:
-            raise InputError(f"{log}: is a table: a manifest with the reader mapped says what its columns are")
+            raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
         raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
     known = manifests()
     if log in known:
@@ -149,7 +149,7 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
-        path = inside(file.parent, manifest.path, file)  # one's own manifest, beside its log
+        path = inside(file.parent, manifest.path, file)  # the user's own manifest, next to its log
         if not path.exists():
             missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
             path = inside(find_data_root(data_root, missing), manifest.path, file)
@@ -169,7 +169,7 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 
 
 def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
-    """One log; ``naming``: the options that become part of its name, for they tell it from others of its source."""
+    """One log; ``naming``: options that are appended to its name to make it unique."""
     chosen = readers.reader(source.reader)
     log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
     name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
@@ -183,7 +183,7 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
     )
     require_bounds(log)
     if source.markers is not None:
-        from factorgraph_loc.sensors.camera.markers import with_markers  # noqa: PLC0415 - few logs need OpenCV to be read
+        from factorgraph_loc.sensors.camera.markers import with_markers  # noqa: PLC0415 - most logs do not need OpenCV
 
         log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)
@@ -191,7 +191,7 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         if log.rig is default_rig.DEFAULT_RIG:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
-            warnings.append("the gyro is used only where sensors name imu: those of the rig do not")
+            warnings.append("the gyro is not used, because the rig's sensors do not include imu")
     if log.rig.name == default_rig.DEFAULT_RIG.name:
-        warnings.append("no rig is given: the default one knows nothing of this robot's noise and mounting")
+        warnings.append("no rig is given: the default rig does not have this robot's noise and mounting")
     return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over.look_over(log)))))

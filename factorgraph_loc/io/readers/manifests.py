@@ -1,4 +1,4 @@
-"""The data sets that ship with the project, each described by a manifest ``NAME.toml``."""
+"""The shipped data sets, each described by a manifest ``NAME.toml``."""
 
 import hashlib
 import os
@@ -21,7 +21,7 @@ DATA_ROOT = "FGLOC_DATA"
 
 
 class StartSettings(FileModel):
-    """A known start: pose, standard deviations, and absolute time (without it, t = 0 of the log)."""
+    """A known start: pose, standard deviations, and absolute time (by default t = 0 of the log)."""
 
     x: Coordinate
     y: Coordinate
@@ -31,16 +31,16 @@ class StartSettings(FileModel):
     t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST, description="ns")] | None = None
 
     def pose(self, t0_ns: int) -> StartPose:
-        """As a start in a log whose t = 0 is at ``t0_ns``."""
+        """The start of a log whose t = 0 is at ``t0_ns``."""
         t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) / 1e9
         sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
         return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)
 
 
 class Manifest(FileModel):
-    """What a manifest says. ``path`` and the files of ``checksums`` (sha256) are below the data root, ``rig`` and ``world``
-    below the manifest's folder. ``options`` go to the reader; one whose value is a list makes several logs. ``markers`` are
-    looked for in the log's images."""
+    """A manifest. ``path`` and the files of ``checksums`` (sha256) are relative to the data root, ``rig`` and ``world`` to the
+    manifest's folder. ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the log's
+    images."""
 
     title: str
     reader: str
@@ -57,7 +57,7 @@ class Manifest(FileModel):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A shipped data set; ``present``: whether the files that it needs are there."""
+    """A shipped data set; ``present``: whether its files exist."""
 
     name: str
     title: str
@@ -68,12 +68,12 @@ class Dataset:
 
 
 def read_manifest(file: Path) -> Manifest:
-    """Read a manifest; InputError names file, key and what is expected."""
+    """Read a manifest; InputError names file, key and expected value."""
     return parse_model(Manifest, read_toml(file), file)
 
 
 def describe(data_root: str | Path | None = None) -> list[Dataset]:
-    """What ships with the project, by name; InputError if a data root is named that does not exist."""
+    """The shipped data sets, sorted by name; InputError if a given data root does not exist."""
     datasets = []
     for name, file in manifests().items():
         m = read_manifest(file)
@@ -92,7 +92,7 @@ def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> 
 
 
 def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
-    """What is wrong with the files of a manifest, a line each: missing, or another content than the checksum says."""
+    """Missing or modified files of a manifest, one line each."""
     if not manifest.checksums:
         return []
     root = find_data_root(data_root, manifest.title)
@@ -109,7 +109,7 @@ def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]
 
 
 def find_data_root(data_root: str | Path | None, source: object) -> Path:
-    """The folder that holds the data: the argument, else the environment's; InputError if there is none."""
+    """The data folder: the argument, else that of the environment; InputError if there is none."""
     if data_root is None:
         named = os.environ.get(DATA_ROOT)
         if not named:

@@ -1,4 +1,4 @@
-"""A folder of tables that other programs wrote, each by a mapping of its columns: what a manifest says in place of a program."""
+"""The reader of folders of foreign tables, described by column mappings in a manifest."""
 
 import itertools
 from dataclasses import replace
@@ -34,33 +34,33 @@ from factorgraph_loc.sensors.tables import Reading, native_tables
 from factors.se2 import Array
 
 RATES = ("wx", "wy", "wz")
-RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which not all are needed
+RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which some may be missing
 
 
 class SensorFile(ColumnMapping):
-    """``clock_offset`` [s]: added to all stamps."""
+    """``clock_offset`` [s]: added to all timestamps."""
 
     clock_offset: Offset = 0.0
 
 
 class ImuFile(SensorFile, Turned):
-    """``columns``: t and w, the turn rate about an axis that points up; or wx, wy and wz, about axes of which ``axes`` and
-    ``mounting`` say how they stand on the robot."""
+    """``columns``: t and w, the turn rate about the vertical axis; or wx, wy and wz, about axes whose orientation is given by
+    ``axes`` and ``mounting``."""
 
 
 class ImageFile(SensorFile):
-    """``folder``: where the images lie, by default that of the log."""
+    """``folder``: of the images, by default that of the log."""
 
     folder: str = "."
 
 
 class InventoryFile(SensorFile):
-    """``columns``: t (the end of a round), antenna, duration. The antennas' names are those of ``rfid``."""
+    """``columns``: t (the end of a round), antenna, duration. Antenna names are those of ``rfid``."""
 
 
 class Options(FileModel):
-    """Which file below the folder is which table of a sensor, by its name, and which is the reference. The folder is the
-    manifest's ``path``. ``readers``: files of several RFID readers by any names, in place of ``rfid``."""
+    """The file of each sensor table, and of the reference, relative to the manifest's ``path``. ``readers``: files of several RFID
+    readers by any names, instead of ``rfid``."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None
@@ -71,16 +71,14 @@ class Options(FileModel):
     reference: ReferenceFile | None = None
 
 
-OTHERS = [
-    name for name in native_tables() if name not in Options.model_fields
-]  # whose columns need no more than a mapping
+OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables that need a mapping only
 add_fields(Options, dict.fromkeys(OTHERS, (SensorFile | None, None)), after="camera")
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The log in the folder ``path``; t = 0 at its first stamp. InputError names file, row and column of what is wrong."""
+    """The log in the folder ``path``; t = 0 at its first timestamp. InputError names file, row and column."""
     if path is None or not path.is_dir():
-        raise InputError(f"{path}: is no folder: path in the manifest names the folder of the log's files")
+        raise InputError(f"{path}: is not a folder: path in the manifest names the folder of the log's files")
     if options.odometry is None:
         raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
     warnings: list[str] = []
@@ -108,7 +106,7 @@ def read(path: Path | None, options: Options) -> Log:
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
                 f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
-                f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; look at units.t and clock_offset"
+                f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; check units.t and clock_offset"
             )
     name = path.resolve().name
     return Log(
@@ -129,7 +127,7 @@ def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str]) -
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
     mapped = read_mapped(path, mapping, shapes)
     if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects without the columns of {table.name} are left out")
+        warnings.append(f"{path}: {mapped.passed} objects without the columns of {table.name} are skipped")
     known = [columns[name] for name in mapped.fields if name != "t"]
     names = {column.name: mapped.names(column) for column in known if column.kind in NAMES}
     unknown = {column.name: np.full(len(mapped.rows), np.nan) for column in table.columns if column.may_lack}
@@ -140,7 +138,7 @@ def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str]) -
 
 
 def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:
-    """The fields that may be mapped: all columns, of those that may lack one or several."""
+    """The sets of fields that may be mapped: all columns, with or without the optional ones."""
     needed = ("t", *(column.name for column in table.columns[1:] if not column.may_lack))
     others = [column.name for column in table.columns if column.may_lack]
     some = (names for count in range(1, len(others) + 1) for names in itertools.combinations(others, count))
@@ -152,7 +150,7 @@ def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Arr
         return about_z(mapped.path, mapped.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
     if mapping.is_given():
         raise InputError(
-            f"{mapped.path}: axes and mounting are for rates about three axes, expected columns wx, wy, wz"
+            f"{mapped.path}: axes and mounting apply to rates about three axes, expected columns wx, wy, wz"
         )
     return numbers["w"]
 
@@ -171,7 +169,7 @@ def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | Non
     inventories = None
     if (mapping := options.inventories) is not None:
         if gaps:
-            raise InputError(f"{folder}: round_gap means nothing beside inventories, which tell the rounds")
+            raise InputError(f"{folder}: round_gap has no effect with inventories, which define the rounds")
         antennas = {name: given for told in files for name, given in told.antennas.items()}
         path = inside(folder, mapping.file, folder)
         inventories = read_inventories(path, mapping, mapping.clock_offset, antennas)

@@ -1,4 +1,4 @@
-"""Odometry and references by a mapping of columns: velocities, motions, poses or the ways of two wheels."""
+"""Odometry and references from mapped columns: velocities, motions, poses or distances of two wheels."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,21 +25,21 @@ Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
 ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
-LEAST_AROUND = 300.0  # no robot turns by so many radians from one row to the next
+LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
 COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) for c in table.columns}
 
 
 class OdometryFile(ColumnMapping, Turned):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
-    quaternion (poses, of which only the motion between them counts); left, right (ways of the wheels, with their ``track``).
-    ``clock_offset`` [s]: added to all stamps."""
+    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``).
+    ``clock_offset`` [s]: added to all timestamps."""
 
     track: Annotated[float, Field(gt=0.0, le=10.0, description="m between the wheels")] | None = None
     clock_offset: Offset = 0.0
 
 
 class ReferenceFile(ColumnMapping, Turned):
-    """Where the robot really was. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
+    """The reference. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
 
     format: Literal["columns", "tum", "kitti"] = "columns"
     columns: dict[str, str] = Field(default_factory=dict)
@@ -49,7 +49,7 @@ class ReferenceFile(ColumnMapping, Turned):
 
 
 def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tuple[Integers, Array, bool]:
-    """Stamps (N,), and velocities (N, 2) or increments (N, 3) with whether they are the latter. InputError names file and row."""
+    """Timestamps (N,), velocities (N, 2) or increments (N, 3), and whether these are increments. InputError names file and row."""
     mapped = read_mapped(path, options, ODOMETRY)
     if ("left" in mapped.fields) != (options.track is not None):
         raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
@@ -80,7 +80,7 @@ def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int)
 def read_reference(
     path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str]
 ) -> Trajectory:
-    """The reference in seconds after ``t0_ns``; InputError names file and row of what is wrong."""
+    """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     if options.format != "columns" and (options.columns or options.units):
         raise InputError(f"{path}: format {options.format} has no columns or units to map")
     if (options.format == "kitti") != (times is not None):
@@ -94,7 +94,7 @@ def read_reference(
         rows, t_ns, space = read_kitti(path, times)
         known = (
             options if options.axes else Turned(axes="body", mounting=options.mounting)
-        )  # the format says how they stand
+        )  # the format defines the axes
         t_ns, poses = t_ns + shift, on_floor(path, space.positions, space.rotations, warnings, known)
     else:
         mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
@@ -112,7 +112,7 @@ def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]
 
 
 def _scale(options: OdometryFile, field: str) -> float:
-    """Metres per unit of a column: per tick, where it is what an encoder counts."""
+    """Metres per unit of a column, or per tick of an encoder."""
     unit = options.units.get(field, 1.0)
     return LENGTH.get(unit, 1.0) if isinstance(unit, str) else float(unit)
 
@@ -123,16 +123,16 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
         places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))
         return on_floor(path, places, rotations, warnings, turned)
     if turned.is_given():
-        raise InputError(f"{path}: axes and mounting are for poses with a quaternion, expected columns qx, qy, qz, qw")
+        raise InputError(f"{path}: axes and mounting apply to poses with a quaternion, expected columns qx, qy, qz, qw")
     heading = columns.get("heading", np.zeros(len(rows)))
     around = np.abs(np.diff(heading, prepend=heading[0]))
     if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
         i = degrees[0]
-        expected = 'radians; it seems to go around at 360: units.heading = "deg"'
+        expected = 'radians; it seems to wrap at 360: units.heading = "deg"'
         raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
 
 
 def _after_rest(moves: Array) -> Array:
-    """Motions (N - 1, 3) as increments (N, 3): the first row only says when the motion begins."""
+    """Motions (N - 1, 3) as increments (N, 3): the first row only defines the start."""
     return np.vstack((np.zeros((1, 3)), moves))

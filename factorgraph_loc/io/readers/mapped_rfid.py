@@ -1,4 +1,4 @@
-"""Reads of RFID tags as readers and their tools log them: CSV or JSON lines by a mapping of columns, with presets."""
+"""RFID reads from mapped CSV or JSON lines of readers and their tools, with presets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,11 +22,11 @@ from factors.se2 import Array
 SIGNALS = ("rssi", "phase", "frequency")
 OPTIONAL = (*SIGNALS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
-COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "how many reads the row stands for")
+COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "number of reads in the row")
 REQUIRED = (("t", "epc", "antenna"), ("t", "epc"))
 
-# What tools write. ``impinj_itemtest``: the CSV of ItemTest; ``impinj_iot``: the stream of events of an R700; ``sllurp_log``: what
-# ``sllurp log`` writes; ``sllurp_reports``: its tag reports as JSON, whose stamps and phases are those of LLRP.
+# Formats of tools. ``impinj_itemtest``: CSV of ItemTest; ``impinj_iot``: event stream of an R700; ``sllurp_log``: output of
+# ``sllurp log``; ``sllurp_reports``: its tag reports as JSON, with timestamps and phases of LLRP.
 PRESETS: dict[str, dict[str, dict[str, str]]] = {
     "impinj_itemtest": {
         "columns": {
@@ -71,17 +71,18 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
 
 
 class Channels(FileModel):
-    """Channels at even distances: the frequency of channel 1, and the step to the next."""
+    """Evenly spaced channels: the frequency of channel 1, and the step."""
 
     first: Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")]
     step: Annotated[float, Field(gt=0.0, lt=100.0, description="MHz")]
 
 
 class RfidFile(ColumnMapping):
-    """``columns``: t (or the first of several reads), epc, antenna, rssi, phase, frequency or channel, and, where a row stands for
-    several reads, ``last`` and ``count``. ``preset``: columns and units of a known tool, which those given here replace.
-    ``antenna``: the name of the only one. ``antennas``: names in the rig of those of the file. ``channels`` [MHz]: frequencies of
-    channels 1, 2, ... ``epc_case``: in which letters EPCs are compared with the map. ``clock_offset`` [s]: added to all stamps."""
+    """``columns``: t (or the first of several reads), epc, antenna, rssi, phase, frequency or channel, and, if a row summarizes
+    several reads, ``last`` and ``count``. ``preset``: columns and units of a known tool, which those given here override.
+    ``antenna``: name of the only one. ``antennas``: names in the rig of those in the file. ``channels`` [MHz]: frequencies of
+    channels 1, 2, ... ``epc_case``: letter case in which EPCs are compared with the map. ``clock_offset`` [s]: added to all
+    timestamps."""
 
     columns: dict[str, str] = Field(default_factory=dict)
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
@@ -95,7 +96,7 @@ class RfidFile(ColumnMapping):
     @model_validator(mode="before")
     @classmethod
     def _of_preset(cls, content: Any) -> Any:
-        """The mapping of the preset, with what is given in place of it."""
+        """Merge the preset with the given mapping, which has precedence."""
         name = content.get("preset") if isinstance(content, dict) else None
         preset = PRESETS.get(name) if isinstance(name, str) else None
         if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
@@ -110,14 +111,14 @@ class RfidFile(ColumnMapping):
 
 
 def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> TableRows:
-    """The reads of the file below ``folder``, or of all files whose names fit where it holds ``*``, as readers begin new ones."""
+    """The reads of the file in ``folder``, or of all files that match a name with ``*``."""
     if "*" not in options.file:
         return read_reads(inside(folder, options.file, folder), options, warnings)
     inside(folder, options.file.replace("*", "x"), folder)
-    with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns of which pathlib makes nothing
+    with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns that pathlib rejects
         files = sorted(file for file in folder.glob(options.file) if file.is_file())
     if not files:
-        raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of files that are there")
+        raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of existing files")
     return joined(
         folder / options.file,
         [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files],
@@ -125,7 +126,7 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """All reads of several tables in the order of time, as of ``path``: readers report in batches, in any order."""
+    """The reads of several tables, named ``path``, sorted by time, because readers report in batches in any order."""
     together = _together(path, tables)
     return together.rows_at(np.argsort(together.t_ns, kind="stable"))
 
@@ -141,9 +142,9 @@ def _together(path: Path, tables: Sequence[TableRows]) -> TableRows:
 
 
 def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
-    """The reads as the table ``rfid`` of the native format. InputError names file, row and column of what is wrong.
+    """The reads as the table ``rfid`` of the native format. InputError names file, row and column.
 
-    A row that stands for several reads gives two, the first with what was measured: when the others came is not told.
+    A row that summarizes several reads gives two, the first one with the measured values; the times of the others are unknown.
     """
     if ("antenna" in options.columns) == (options.antenna is not None):
         raise InputError(f"{path}: expected either columns.antenna, or antenna, the name of the only one")
@@ -154,7 +155,7 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
     shape = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     mapped = read_mapped(path, options, (shape,), OPTIONAL)
     if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects that are no reads are left out")
+        warnings.append(f"{path}: {mapped.passed} objects that are not reads are skipped")
     t_ns = mapped.stamps("t", options.clock_offset)
     antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names(RFID["antenna"])
     numbers = {name: _signal(mapped, name) for name in SIGNALS}
@@ -172,7 +173,7 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
 
 
 def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> TableRows:
-    """The rounds as the table ``inventories`` of the native format; ``antennas`` as of the reads."""
+    """The rounds as the table ``inventories`` of the native format; ``antennas`` as for the reads."""
     mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
     names = [antennas.get(name, name) for name in mapped.names(RFID["antenna"])]
     duration = mapped.numbers("duration", INVENTORIES["duration"])
@@ -184,13 +185,13 @@ def _signal(mapped: Mapped, name: str) -> Array:
 
 
 def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
-    """EPCs as the map writes them: without the marks of Python's bytes, which some versions of sllurp leave."""
+    """EPCs in the notation of the map: without the Python bytes marks of some sllurp versions."""
     plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in mapped.names(RFID["epc"])]
     return in_case(plain, case)
 
 
 def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
-    """The frequencies (N,) [Hz] of channels, which count from 1."""
+    """The frequencies (N,) [Hz] of channels, which are numbered from 1."""
     number = mapped.numbers("channel", CHANNEL)
     last = len(channels) if isinstance(channels, tuple) else 1000
     with np.errstate(invalid="ignore"):
@@ -206,10 +207,12 @@ def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) 
 
 
 def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: list[str]) -> TableRows:
-    """With a second read, of which only the time is known, for each row that stands for more than one."""
+    """Add a second read, of which only the time is known, for each row that summarizes several."""
     if "last" not in mapped.fields:
         if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
-            warnings.append(f"{table.path}: {many} rows stand for several reads, of which one time is known: one each")
+            warnings.append(
+                f"{table.path}: {many} rows summarize several reads with one timestamp, which count as one read each"
+            )
         return table
     last_ns = mapped.stamps("last", options.clock_offset)
     wrong = np.flatnonzero(last_ns < table.t_ns)
@@ -224,7 +227,7 @@ def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: li
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
-            warnings.append(f"{table.path}: {more} reads between the first and the last of their row are left out")
+            warnings.append(f"{table.path}: {more} reads between the first and the last of their row are skipped")
     repeated = table.rows_at(np.flatnonzero(several))
     unknown = {name: np.full(len(repeated.rows), np.nan) for name in repeated.numbers}
     return _together(table.path, (table, replace(repeated, t_ns=last_ns[several], numbers=unknown)))

@@ -1,7 +1,7 @@
 """MATLAB files of versions 5 to 7: named arrays of real numbers.
 
-The format is that of "MAT-File Format" (The MathWorks, 2019), level 5. It is read here and not by scipy, whose compiled reader ends
-the process at some damaged files.
+The format is that of "MAT-File Format" (The MathWorks, 2019), level 5. scipy is not used, because its compiled reader crashes on
+some damaged files.
 """
 
 import math
@@ -17,27 +17,27 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
 from factors.se2 import Array
 
-HEADER = 128  # bytes, which end with the version and the order of bytes
+HEADER = 128  # bytes, ending with version and byte order
 VERSION = 0x0100
 ORDERS = {b"IM": "<", b"MI": ">"}
 WHAT = "is not a MATLAB file (of version 5 to 7)"
 MATRIX, COMPRESSED = 14, 15  # types of elements
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-NUMERIC = range(6, 16)  # classes of arrays: double to uint64; others are texts, cells, structures
+NUMERIC = range(6, 16)  # array classes double to uint64; others are texts, cells, structures
 COMPLEX = 0x0800
 
 
 def read_matlab(path: Path, fields: Mapping[str, int]) -> dict[str, Array]:
-    """The arrays (N, K) of ``fields`` (name -> K); InputError names file and field of what is missing or shaped otherwise."""
+    """The arrays (N, K) of ``fields`` (name -> K); InputError names file and field of a missing or invalid array."""
     arrays = read_arrays(path, {name: (None, width) for name, width in fields.items()})
     for name, array in arrays.items():
         if len(array) == 0:
-            raise InputError(f"{path}: {name} holds no rows")
+            raise InputError(f"{path}: {name} contains no rows")
     return arrays
 
 
 def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dict[str, Array]:
-    """The arrays of ``shapes`` (name -> size along each axis, None for any); InputError as of :func:`read_matlab`."""
+    """The arrays of ``shapes`` (name -> size along each axis, None for any); InputError as in :func:`read_matlab`."""
     content = bounded.read_bytes(path, bounded.DATA)
     found: dict[str, Array | None] = {}
     with bounded.foreign(path, WHAT):
@@ -50,7 +50,7 @@ def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dic
             raise InputError(f"{path}: {name} is missing")
         array = found[name]
         if array is None:
-            raise InputError(f"{path}: {name} is no array of real numbers, expected {_described(shape)}")
+            raise InputError(f"{path}: {name} is not an array of real numbers, expected {_described(shape)}")
         if array.ndim != len(shape) or not all(n in (None, m) for n, m in zip(shape, array.shape, strict=True)):
             raise InputError(f"{path}: {name} has shape {array.shape}, expected numbers in {_described(shape)}")
         arrays[name] = array
@@ -59,7 +59,7 @@ def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dic
 
 @dataclass(frozen=True)
 class _Matrix:
-    """A variable whose values were not looked at: they are the element that ``values`` yields next."""
+    """A variable whose values are still unread: the next element of ``values``."""
 
     order: str
     flags: int
@@ -67,7 +67,7 @@ class _Matrix:
     values: Iterator[tuple[int, memoryview]]
 
     def numbers(self) -> Array | None:
-        """Its values; None if they are no real numbers. ValueError if there are not as many as its shape says."""
+        """Its values; None if they are not real numbers. ValueError if their number contradicts the shape."""
         if self.flags & 0xFF not in NUMERIC or self.flags & COMPLEX:
             return None
         kind, content = next(self.values)
@@ -98,12 +98,12 @@ def _matrices(content: bytes, path: Path) -> Iterator[tuple[str, _Matrix]]:
 
 
 def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Type and content of one element after the other. ValueError if one is longer than what is there."""
+    """Type and content of consecutive elements. ValueError if one is truncated."""
     at = 0
     while at < len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
         begin = at + 8
-        if kind >> 16:  # up to four bytes stand in place of the size
+        if kind >> 16:  # up to four bytes are stored instead of the size
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += 8
         else:

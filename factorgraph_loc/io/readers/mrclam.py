@@ -1,6 +1,6 @@
 """UTIAS MRCLAM (Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011): one robot of a folder of ``.dat`` files.
 
-Landmarks are named by their subject number, which the sightings give as a barcode number.
+Landmarks are named by their subject number, to which the barcode numbers of sightings are mapped.
 """
 
 from pathlib import Path
@@ -23,8 +23,8 @@ from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
 
-MICROSECONDS = 1e6  # in a second: the files give milliseconds, and a double near 10^9 s holds no nanoseconds
-ROBOTS = range(1, 6)  # subjects; those after them are landmarks
+MICROSECONDS = 1e6  # per second: files have milliseconds, and doubles near 10^9 s do not resolve nanoseconds
+ROBOTS = range(1, 6)  # subject numbers; higher ones are landmarks
 
 
 class Options(FileModel):
@@ -34,7 +34,7 @@ class Options(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run of one robot; t = 0 at its first odometry. InputError names file and row of what is wrong."""
+    """The run of one robot; t = 0 at its first odometry. InputError names file and row."""
     if path is None or not path.is_dir():
         raise InputError(f"{path}: is not a folder, expected that of the .dat files")
     warnings: list[str] = []
@@ -42,7 +42,7 @@ def read(path: Path | None, options: Options) -> Log:
     file = inside(path, f"{prefix}_Odometry.dat", path)
     table, rows = read_columns(file, ("time", "forward velocity", "angular velocity"))
     if len(rows) == 0:
-        raise InputError(f"{file}: holds no rows: has no odometry, which every estimator needs")
+        raise InputError(f"{file}: contains no rows: the log has no odometry, which every estimator needs")
     t_ns = checks.stamps(file, rows, table[:, 0], per_second=MICROSECONDS)
     keep = checks.in_order(file, rows, t_ns, warnings)
     t0_ns = int(t_ns[0])
@@ -68,7 +68,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def read_landmarks(file: Path) -> World:
-    """The map: landmarks by subject number; their survey's deviation is the larger of those in x and y."""
+    """The map: landmarks by subject number, with the larger of the survey's standard deviations in x and y."""
     table, rows = read_columns(file, ("subject", "x", "y", "x std-dev", "y std-dev"))
     landmarks: dict[str, Landmark] = {}
     for row, (subject, x, y, sigma_x, sigma_y) in zip(rows, table, strict=True):
@@ -95,18 +95,18 @@ def read_barcodes(file: Path) -> dict[int, int]:
 
 
 def read_sightings(folder: Path, prefix: str, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
-    """The landmarks that the robot saw; other robots and unknown barcodes are counted and left out."""
+    """The landmarks that the robot saw; other robots and unknown barcodes are counted and skipped."""
     file = inside(folder, f"{prefix}_Measurement.dat", folder)
     table, rows = read_columns(file, ("time", "barcode", "range", "bearing"))
     if len(rows) == 0:
-        warnings.append(f"{file}: holds no rows")
+        warnings.append(f"{file}: contains no rows")
     subjects = read_barcodes(inside(folder, "Barcodes.dat", folder))
     checks.require_above_zero(file, rows, "range", table[:, 2])
     seen = [subjects.get(whole(file, r, "barcode", c)) for r, c in zip(rows, table[:, 1], strict=True)]
     robots = sum(subject in ROBOTS for subject in seen)
     strangers = sum(subject is None for subject in seen)
     if robots or strangers:
-        warnings.append(f"{file}: left out {robots} sightings of other robots and {strangers} of unknown barcodes")
+        warnings.append(f"{file}: skipped {robots} sightings of other robots and {strangers} of unknown barcodes")
     landmark = np.array([subject is not None and subject not in ROBOTS for subject in seen], dtype=bool)
     names = [str(subject) for subject, kept in zip(seen, landmark, strict=True) if kept]
     table, rows = table[landmark], rows[landmark]
@@ -118,10 +118,10 @@ def read_sightings(folder: Path, prefix: str, t0_ns: int, warnings: list[str]) -
 
 
 def read_reference(file: Path, t0_ns: int, warnings: list[str]) -> Trajectory | None:
-    """The motion capture's poses; its gaps stay gaps."""
+    """The poses of the motion capture; gaps are kept."""
     table, rows = read_columns(file, ("time", "x", "y", "orientation"))
     if len(rows) == 0:
-        warnings.append(f"{file}: holds no rows")
+        warnings.append(f"{file}: contains no rows")
         return None
     t_ns = checks.stamps(file, rows, table[:, 0], per_second=MICROSECONDS)
     keep = checks.in_order(file, rows, t_ns, warnings)
@@ -131,7 +131,7 @@ def read_reference(file: Path, t0_ns: int, warnings: list[str]) -> Trajectory | 
 
 
 def whole(file: Path, row: int, field: str, value: float) -> int:
-    """A number as an integer."""
+    """A number as an integer; InputError if it is not whole."""
     if not float(value).is_integer():
         raise bad_field(file, field, float(value), "a whole number", row=int(row))
     return int(value)

@@ -1,4 +1,4 @@
-"""The Plaza sets (Djugash, Hamner, Roth, JFR 26(9), 2009) as the gtsam wheel ships them: odometry and ranges to beacons."""
+"""The Plaza logs (Djugash, Hamner, Roth, JFR 26(9), 2009) from the gtsam wheel: odometry and ranges to beacons."""
 
 import math
 from pathlib import Path
@@ -23,9 +23,9 @@ from factors.se2 import Array, Integers
 
 FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}
 
-# what to add to the reference's heading so that a positive distance drives forward
+# added to the reference's heading, so that positive distances are forward
 HEADING_OFFSET = {1: 0.0, 2: math.pi}
-# the heading of the first run's truth is the sum of its odometry's rotations
+# the reference heading of the first run is integrated from its odometry
 HAS_HEADING = {1: False, 2: True}
 
 
@@ -36,10 +36,8 @@ class Options(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its truth.
-
-    InputError names file, field and row (counted from 1 within the field) of what is wrong.
-    """
+    """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its ground truth. InputError
+    names file, field and row (counted from 1 within the field)."""
     file = path or shipped(options.run)
     fields = read_matlab(file, FIELDS)
     warnings: list[str] = []
@@ -66,7 +64,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 def shipped(run: int) -> Path:
     """The file of a run in the gtsam wheel."""
-    import gtsam  # noqa: PLC0415 - heavy, and needed for this only
+    import gtsam  # noqa: PLC0415 - slow to import, and needed here only
 
     try:
         return Path(gtsam.findExampleDataFile(f"Plaza{run}_.mat"))  # type: ignore[no-untyped-call]
@@ -79,7 +77,7 @@ def rows_of(table: Array) -> Integers:
 
 
 def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Integers]:
-    """The rows of a table to keep, and their stamps [ns]."""
+    """The rows of a table to keep, and their timestamps [ns]."""
     t_ns = checks.stamps(source, rows_of(table), table[:, 0])
     keep = checks.in_order(source, rows_of(table), t_ns, warnings)
     return table[keep], t_ns[keep]
@@ -99,7 +97,7 @@ def beacon_name(number: float) -> str:
 
 
 def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> IncrementStream:
-    """The odometry, led by a row without motion at ``t0_ns``: without it the duration of the first one is not known."""
+    """The odometry, preceded by a row without motion at ``t0_ns``, which defines the duration of the first one."""
     moves = np.column_stack((table[:, 1], np.zeros(len(table)), table[:, 2]))
     rows = rows_of(table)
     t_ns, moves = checks.increments_in_order(source, rows, checks.stamps(source, rows, table[:, 0]), moves, warnings)
@@ -110,7 +108,7 @@ def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> In
 
 
 def ranges(source: str, table: Array, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
-    """The ranges by time: the file joins recordings that overlap, so its order is not that of arrival."""
+    """The ranges sorted by time: the file joins overlapping recordings, so its order is not that of arrival."""
     rows = rows_of(table)
     checks.require_above_zero(source, rows, "range", table[:, 3])
     t_ns = checks.stamps(source, rows, table[:, 0])

@@ -1,4 +1,4 @@
-"""The log formats by name: modules with a model of their ``Options``, and ``read(path, options)``, which makes the log."""
+"""The registry of readers: modules with a model of ``Options`` and a function ``read(path, options)``."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from factorgraph_loc.text import quoted
 
 @dataclass(frozen=True)
 class Reader:
-    """A format: the model of its options, and ``read(path, options)``, which makes the log."""
+    """A reader: the model of its options, and ``read(path, options)``, which returns the log."""
 
     options: type[FileModel]
     read: Callable[[Path | None, Any], Log]
 
 
 def reader(name: str) -> Reader:
-    """The reader of a format; InputError with the nearest name if there is none."""
+    """The reader of a format; InputError with the most similar name if it is unknown."""
     if name not in READERS:
         raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
     module = READERS[name]

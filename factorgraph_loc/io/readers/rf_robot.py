@@ -1,6 +1,6 @@
 """A robot with three UHF RFID antennas between shelves: a folder with ``tags.csv`` and a folder ``runN`` for each run.
 
-The poses of a run are a reference, not odometry, which is therefore simulated from them:
+The recording has reference poses but no odometry, which is simulated:
 :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`.
 """
 
@@ -37,19 +37,19 @@ TAG_COLUMNS = ("epc", "x_m", "y_m", "z_m", "facing_deg")
 TAG_FIELDS = {"x_m": TAGS["x"], "y_m": TAGS["y"], "z_m": TAGS["z"], "facing_deg": TAGS["facing"]}
 READ_FIELDS = ("number", "EPC", "port", "carrier MHz", "phase degrees", "RSSI dBm", "reader clock us", "host clock us")
 BOUNDS = {"carrier MHz": (840.0, 960.0), "phase degrees": (0.0, 360.0), "RSSI dBm": (-120.0, 20.0)}
-ROUND_GAP = 0.05  # s, between the inventory rounds of an antenna
+ROUND_GAP = 0.05  # s between inventory rounds of an antenna
 THINNING = 4  # the reference has 200 Hz
 
 
 class Options(FileModel):
-    """``run``: which of the recordings; ``odometry_seed``: of the simulated odometry's errors."""
+    """``run``: number of the recording; ``odometry_seed``: seed of the simulated odometry."""
 
     run: Annotated[int, Field(ge=0)] = 13
     odometry_seed: Annotated[int, Field(ge=0)] = 0
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run; t = 0 at the first pose of the reference. InputError names file, row and field of what is wrong."""
+    """The run; t = 0 at the first pose of the reference. InputError names file, row and field."""
     if path is None:
         raise InputError("rf_robot: the path of the folder with tags.csv is missing")
     folder = inside(path, f"run{options.run}", path)
@@ -90,19 +90,19 @@ def read_tags(path: Path) -> dict[str, Tag]:
         rows[epc] = row
         tags[epc] = parse_model(Tag, {"x": x, "y": y, "z": z, "facing": facing}, f"{path}:{row}")
     if not tags:
-        raise InputError(f"{path}: holds no tags, expected at least one row")
+        raise InputError(f"{path}: contains no tags, expected at least one row")
     return tags
 
 
 def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
-    """All poses, in seconds after the first, and the time of that."""
+    """All poses, in seconds after the first one, and the time of that."""
     table, rows = read_columns(path, ("x", "y", "heading", "time"))
-    t_ns = checks.stamps(path, rows, table[:, 3], per_second=1e6)  # a double holds no more digits of such a time
+    t_ns = checks.stamps(path, rows, table[:, 3], per_second=1e6)  # the resolution of a double at such times
     if len(rows):
         require_span([(path, rows, t_ns)])
     keep = checks.in_order(path, rows, t_ns, warnings)
     if len(keep) < 2 or t_ns[keep[-1]] - t_ns[keep[0]] < 1e9 / simulated_odometry.RATE:
-        raise InputError(f"{path}: holds less than 0.1 s of poses, expected a run of them")
+        raise InputError(f"{path}: contains less than 0.1 s of poses, expected a run")
     t0_ns = int(t_ns[keep[0]])
     poses = np.column_stack((table[keep, :2], se2.wrap(table[keep, 2])))
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses), t0_ns
@@ -110,7 +110,7 @@ def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
 
 @dataclass(frozen=True)
 class _Reads:
-    """The N reads of one antenna: host stamps [ns], EPCs, and RSSI [dBm], phase [rad], frequency [Hz], each (N,)."""
+    """The N reads of one antenna: host timestamps [ns], EPCs, and RSSI [dBm], phase [rad], frequency [Hz], each (N,)."""
 
     t_ns: Integers
     epc: list[str]
@@ -139,7 +139,7 @@ def read_reads(path: Path, warnings: list[str]) -> _Reads:
         epc.append(parts[1])
         rows.append(row)
     if not rows:
-        warnings.append(f"{path}: holds no reads")
+        warnings.append(f"{path}: contains no reads")
     table = np.array(values).reshape(-1, 3)
     for (field, (low, high)), column in zip(BOUNDS.items(), table.T, strict=True):
         bad = np.flatnonzero((column < low) | (column > high))
@@ -151,7 +151,7 @@ def read_reads(path: Path, warnings: list[str]) -> _Reads:
 
 
 def make_stream(reads: list[_Reads], t0_ns: int, end: float, source: Path, warnings: list[str]) -> RfidStream:
-    """The rounds of all antennas that lie within the odometry, 0 to ``end`` seconds."""
+    """The rounds of all antennas within the odometry, 0 to ``end`` seconds."""
     t_ns = np.concatenate([r.t_ns for r in reads])
     order = np.argsort(t_ns, kind="stable")
     t_ns = t_ns[order]
@@ -166,7 +166,7 @@ def make_stream(reads: list[_Reads], t0_ns: int, end: float, source: Path, warni
     whole = (t_ns[first] >= t0_ns) & ((end_ns - t0_ns) / 1e9 <= end)
     keep = whole[number]
     if left := int(np.count_nonzero(~keep)):
-        warnings.append(f"{source}: {left} of {len(t_ns)} reads lie outside the reference and are left out")
+        warnings.append(f"{source}: {left} of {len(t_ns)} reads are outside of the reference and skipped")
     renumbered = np.cumsum(whole) - 1
     return make_rfid_stream(
         t_ns[keep],

@@ -1,10 +1,9 @@
-"""Microsoft 7-Scenes: colour images of a hand-held camera in a room, and its pose at each (Shotton et al., "Scene coordinate
-regression forests for camera relocalization in RGB-D images", CVPR 2013).
+"""Microsoft 7-Scenes: colour images of a hand-held camera with ground-truth poses (Shotton et al., "Scene coordinate regression
+forests for camera relocalization in RGB-D images", CVPR 2013).
 
-A folder holds ``frame-NUMBER.color.jpg`` (or ``.png``) and ``frame-NUMBER.pose.txt``, 4x4 from camera to world, axes z forward, x
-right, y down, as KinectFusion found it. Frames count from 0 in the order of their names, whatever the numbers there: stamps
-are missing, so they get a nominal rate. The ``camera-intrinsics.txt`` that lies beside some copies is of the depth camera and
-is not read.
+A folder contains ``frame-NUMBER.color.jpg`` (or ``.png``) and ``frame-NUMBER.pose.txt``, 4x4 from camera to world, axes z forward,
+x right, y down, from KinectFusion. Frames are sorted by name and get timestamps with a nominal rate, as the recording has none. The
+``camera-intrinsics.txt`` in some copies is that of the depth camera and is not read.
 """
 
 import math
@@ -28,8 +27,8 @@ from factors.se2 import Array
 
 IMAGES = ("color.jpg", "color.png")
 POSE = "pose.txt"
-ORTHONORMAL = 2e-3  # what a rotation in the files may be off: they are written from single precision
-# the robot's frame is the camera's, and its focal length the nominal one; 585 is that of the depth camera
+ORTHONORMAL = 2e-3  # tolerance of rotation matrices, which are in single precision
+# the robot frame is the camera frame; the focal length is the nominal one, as 585 is that of the depth camera
 RIG = Rig(
     name="kinect",
     sensors=("camera",),
@@ -38,14 +37,13 @@ RIG = Rig(
 
 
 class Options(FileModel):
-    """``rate`` [Hz]: nominal, of the frames in the folder."""
+    """``rate`` [Hz]: nominal frame rate."""
 
     rate: Annotated[float, Field(gt=0.0, le=1000.0, description="Hz")] = 15.0
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The images with their true camera poses as ``reference3``, the camera itself being the robot. InputError names the file and
-    what is wrong."""
+    """The images with the true camera poses as ``reference3``; the robot is the camera. InputError names the invalid file."""
     if path is None:
         raise InputError("sevenscenes: the path of the folder with frame-*.color.jpg is missing")
     images = _frames(path)
@@ -66,7 +64,7 @@ def read(path: Path | None, options: Options) -> Log:
 def _frames(folder: Path) -> list[Path]:
     images = sorted(file for kind in IMAGES for file in folder.glob(f"frame-*.{kind}"))
     if not images:
-        raise InputError(f"{folder}: holds no images frame-*.color.jpg or frame-*.color.png")
+        raise InputError(f"{folder}: contains no images frame-*.color.jpg or frame-*.color.png")
     return [inside(folder, image.name, folder) for image in images]
 
 
@@ -75,7 +73,7 @@ def _pose_file(image: Path) -> Path:
 
 
 def _pose(path: Path) -> Array:
-    """A pose (4, 4), its rotation made orthonormal to the last digit."""
+    """A pose (4, 4), with its rotation orthonormalized."""
     values = []
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         try:
@@ -86,7 +84,7 @@ def _pose(path: Path) -> Array:
             raise bad_field(path, "row", line.strip(), "4 numbers", row=row)
         values += [numbers] if numbers else []
     if len(values) != 4:
-        raise InputError(f"{path}: holds {len(values)} rows, expected a pose of 4 rows with 4 numbers")
+        raise InputError(f"{path}: has {len(values)} rows, expected a pose of 4 rows with 4 numbers")
     pose = np.array(values)
     if not np.isfinite(pose).all():
         row, column = np.argwhere(~np.isfinite(pose))[0].tolist()
@@ -97,7 +95,7 @@ def _pose(path: Path) -> Array:
     off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if off > ORTHONORMAL or np.linalg.det(rotation) < 0.0:
         raise InputError(
-            f"{path}: its upper left 3x3 is no rotation (off by {off:.3g}), expected camera axes in the world"
+            f"{path}: its upper left 3x3 is not a rotation (off by {off:.3g}), expected camera axes in the world"
         )
     u, _, vt = np.linalg.svd(rotation)
     pose[:3, :3] = u @ vt
@@ -105,7 +103,7 @@ def _pose(path: Path) -> Array:
 
 
 def _check_image(path: Path) -> None:
-    """InputError for an image of another size than the camera's, or that ends too early; its pixels are not decoded."""
+    """InputError for a truncated image, or one of another size than the camera's, without decoding it."""
     camera = RIG.camera
     assert camera is not None
     size = size_of_file(path)

@@ -1,4 +1,4 @@
-"""Poses in space as data sets write them: quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's; and lists of images."""
+"""Three-dimensional poses in data sets: quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's; and lists of images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,19 +18,19 @@ from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.camera import model as reprojection
 from factors.se2 import Integers
 
-ORTHONORMAL = 2e-3  # and a rotation matrix: KITTI's have seven digits
+ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 
 
 def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:
-    """Rows (N,), stamps (N,) [ns] and poses of a KITTI odometry file, whose stamps are the lines of ``times``.
+    """Rows (N,), timestamps (N,) [ns] and poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
 
-    The file's poses are of a camera that looks along z, with y down, in the frame of the first of them (Geiger, Lenz, Urtasun, "Are
-    we ready for autonomous driving?", CVPR 2012). Here z is up and x ahead, in world and robot. InputError names file and row.
+    The file's poses are those of a camera with z forward and y down, in the frame of the first one (Geiger, Lenz, Urtasun, "Are we
+    ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
     """
     table, rows = read_columns(path, MATRIX)
     if not len(table):
-        raise InputError(f"{path}: holds no poses")
+        raise InputError(f"{path}: contains no poses")
     stamps = read_times(times)
     if len(stamps) < len(table):
         raise bad_field(
@@ -50,14 +50,14 @@ def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3
 
 
 def read_times(path: Path) -> Integers:
-    """The stamps (N,) [ns] of a file with one in each line, in seconds; InputError at one that is not after the one before."""
+    """The timestamps (N,) [ns] of a file with one per line, in seconds; InputError if they do not increase."""
     columns = ColumnMapping(file=path.name, columns={"t": "1"}, units={"t": "s"}, separator=" ", header=False)
     mapped = read_mapped(path, columns, (("t",),))
     t_ns = mapped.stamps("t")
     stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
     if len(stuck):
         i = int(stuck[0])
-        expected = f"a stamp after that of the row before, {int(t_ns[i - 1])} ns"
+        expected = f"a timestamp after that of the row before, {int(t_ns[i - 1])} ns"
         raise bad_field(path, "time", f"{int(t_ns[i])} ns", expected, row=int(mapped.rows[i]))
     return t_ns
 
@@ -65,8 +65,8 @@ def read_times(path: Path) -> Integers:
 def read_poses(
     path: Path, columns: Sequence[str], *, unit: str, separator: Literal[",", " "], warnings: list[str]
 ) -> tuple[Integers, Trajectory3]:
-    """Stamps (N,) [ns] and poses, in seconds after the first, of a file whose ``columns`` are named in their order by t, x, y, z,
-    qx, qy, qz, qw; of equal stamps the last. InputError names file and row of what is wrong."""
+    """Timestamps (N,) [ns] and poses, in seconds after the first, of a file with ``columns`` t, x, y, z, qx, qy, qz, qw in any
+    order; the last one of equal timestamps. InputError names file and row."""
     named = {name: str(i) for i, name in enumerate(columns, start=1)}
     told = ColumnMapping(file=path.name, columns=named, units={"t": unit}, separator=separator, header=False)
     mapped = read_mapped(path, told, (tuple(columns),))
@@ -80,7 +80,7 @@ def read_poses(
 
 
 def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> TableRows:
-    """The stamps and names of images, as the table ``camera`` of the native format."""
+    """The timestamps and names of images, as the table ``camera`` of the native format."""
     columns = {"t": "1", "file": "2"}
     told = ColumnMapping(file=path.name, columns=columns, units={"t": unit}, separator=separator, header=False)
     mapped = read_mapped(path, told, (("t", "file"),))
@@ -88,5 +88,5 @@ def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> T
 
 
 def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:
-    """The same with seconds after ``t0_ns``; its stamps are ``t_ns`` (N,)."""
+    """The trajectory with timestamps ``t_ns`` (N,), in seconds after ``t0_ns``."""
     return replace(trajectory, t=checks.seconds(t_ns, t0_ns))

@@ -1,11 +1,11 @@
-"""The University of Toronto's "Starry Night" (``starry_night_dataset.mat``): a stereo camera and an inertial unit carried by hand
-among 20 known points.
+"""The University of Toronto's "Starry Night" (``starry_night_dataset.mat``): a hand-held stereo camera and inertial unit among 20
+known points.
 
-The file's axes: ``theta_vk_i`` (3, N) is the turn, as angle times axis, that takes vectors of the vehicle's frame to the world's
-(the transpose of the file's C_vk_i), ``r_i_vk_i`` (3, N) [m] where the vehicle is; ``rho_i_pj_i`` (3, 20) [m] are the points.
-``C_c_v`` takes vectors of the vehicle to the left camera, which is at ``rho_v_c_v`` of the vehicle; the right camera is ``b`` to
-the right of it. ``y_k_j`` (4, N, 20) [px] are u and v in the left and in the right image, -1 where a point was not seen.
-``v_vk_vk_i``, ``w_vk_vk_i`` (3, N) are velocity and turn rate in the vehicle's frame.
+Fields of the file: ``theta_vk_i`` (3, N) is the rotation, as angle times axis, from the vehicle frame to the world (the transpose
+of the file's C_vk_i), ``r_i_vk_i`` (3, N) [m] the vehicle's position; ``rho_i_pj_i`` (3, 20) [m] are the points. ``C_c_v`` rotates
+from the vehicle frame to the left camera, which is at ``rho_v_c_v`` in the vehicle frame; the right camera is ``b`` to the right of
+it. ``y_k_j`` (4, N, 20) [px] are u and v in the left and in the right image, -1 if a point was not seen. ``v_vk_vk_i``,
+``w_vk_vk_i`` (3, N) are velocity and turn rate in the vehicle frame.
 """
 
 from pathlib import Path
@@ -44,18 +44,17 @@ SHAPES: dict[str, tuple[int | None, ...]] = {
     **dict.fromkeys(SCALARS, (1, 1)),
 }
 NOT_SEEN = -1.0
-ORTHONORMAL = 1e-3  # what the rotation of the camera may be off
-SIZE = (680, 480)  # px, of the rectified images, as the pixels that were seen tell: the file does not
-ROBUST = 2.0  # half of the pixel errors are below 0.6, and one in a hundred is above 2.4 of the stated deviations
+ORTHONORMAL = 1e-3  # tolerance of the camera's rotation matrix
+SIZE = (680, 480)  # px of the rectified images, inferred from the pixels
+ROBUST = 2.0  # half of the pixel errors are below 0.6, and 1 % above 2.4 of the stated standard deviations
 
 
 class Options(FileModel):
-    """There is nothing to choose."""
+    """The format has no options."""
 
 
 def read(path: Path | None, _: Options) -> Log:
-    """The run, with points named 1 to 20 and a vehicle in space. InputError names file, field and column (from 1) of what is
-    wrong."""
+    """The run, with points named 1 to 20 and a vehicle in space. InputError names file, field and column (from 1)."""
     if path is None:
         raise InputError("starry_night: the path of starry_night_dataset.mat is missing")
     fields = read_arrays(path, SHAPES)
@@ -99,7 +98,7 @@ def read(path: Path | None, _: Options) -> Log:
 
 
 def _check_pixels(path: Path, pixels: Array, numbers: Integers) -> None:
-    """Pixels (4, N, 20) are in an image, or all four coordinates of a point say that it was not seen."""
+    """InputError unless pixels (4, N, 20) are in the image, or all four coordinates of a point are -1."""
     width, height = SIZE
     limits = np.array((width, height, width, height))[:, None, None]
     unseen = pixels == NOT_SEEN
@@ -111,8 +110,8 @@ def _check_pixels(path: Path, pixels: Array, numbers: Integers) -> None:
 
 
 def _rig(path: Path, fields: dict[str, Array], t: Array) -> Rig:
-    """Both cameras and the noise as the file states them. Velocities are wrong by the file's variances, each from one row to the
-    next: that grows with the root of time. One deviation stands for u and v."""
+    """Both cameras and the noise of the file. Variances of velocities are per row, which gives a random walk. One standard
+    deviation is used for u and v."""
     fu, fv, cu, cv, b = (float(fields[name][0, 0]) for name in ("fu", "fv", "cu", "cv", "b"))
     if min(fu, fv, b) <= 0.0:
         raise InputError(f"{path}: fu, fv, b are {fu:g}, {fv:g}, {b:g}, expected more than 0")
@@ -122,7 +121,7 @@ def _rig(path: Path, fields: dict[str, Array], t: Array) -> Rig:
     turn = fields["C_c_v"]
     off = float(np.abs(turn @ turn.T - np.eye(3)).max())
     if off > ORTHONORMAL or np.linalg.det(turn) < 0.0:
-        raise InputError(f"{path}: C_c_v is no rotation (off by {off:.3g})")
+        raise InputError(f"{path}: C_c_v is not a rotation (off by {off:.3g})")
     yaw, pitch, roll = Rotation.from_matrix(turn.T @ FORWARD.T).as_euler("ZYX").tolist()
     step = float(np.mean(np.diff(t)))
     shift, turns = (np.sqrt(fields[name][:, 0] * step).tolist() for name in ("v_var", "w_var"))

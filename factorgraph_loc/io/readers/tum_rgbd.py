@@ -1,4 +1,4 @@
-"""TUM RGB-D: colour images of a camera in the hand, listed in ``rgb.txt``, and its true poses in ``groundtruth.txt`` (Sturm et
+"""TUM RGB-D: colour images of a hand-held camera, listed in ``rgb.txt``, with ground-truth poses in ``groundtruth.txt`` (Sturm et
 al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). Depth images and the accelerometer are not read."""
 
 import math
@@ -14,7 +14,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.tables import make_images
 
 POSES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-# the robot's frame is the camera's, and its lens the nominal one that the benchmark names for all of its sensors
+# the robot frame is the camera frame; the lens is the nominal one of the benchmark
 RIG = Rig(
     name="kinect-tum",
     sensors=("camera",),
@@ -29,9 +29,7 @@ class Options(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
-    """The images with the true camera poses as ``reference3``; t = 0 at the first image.
-
-    InputError names the file and what is wrong."""
+    """The images with the true camera poses as ``reference3``; t = 0 at the first image. InputError names the invalid file."""
     if path is None:
         raise InputError("tum_rgbd: the path of the folder with rgb.txt is missing")
     warnings: list[str] = []

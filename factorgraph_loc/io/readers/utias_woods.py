@@ -1,4 +1,4 @@
-"""The University of Toronto's "Lost in the Woods" (``dataset2.mat``): wheel odometry and a laser that sees known trunks."""
+"""The University of Toronto's "Lost in the Woods" (``dataset2.mat``): wheel odometry and a laser that detects known trunks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,13 +27,13 @@ FIELDS = {**dict.fromkeys(SERIES, 1), "r": LANDMARKS, "b": LANDMARKS, "l": 2}
 
 
 class Options(FileModel):
-    """``max_range`` [m]: only landmarks nearer than this are kept."""
+    """``max_range`` [m]: landmarks farther away are ignored."""
 
     max_range: Annotated[float, Field(gt=0.0, description="m")] = 5.0
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run, with landmarks named 1 to 17. InputError names file, field and row (from 1) of what is wrong."""
+    """The run, with landmarks named 1 to 17. InputError names file, field and row (from 1)."""
     if path is None:
         raise InputError("utias_woods: the path of dataset2.mat is missing")
     fields = read_matlab(path, FIELDS)
@@ -78,7 +78,7 @@ def read_landmarks(path: Path, table: Array) -> World:
 
 
 def read_sightings(path: Path, r: Array, b: Array, t: Array, rows: Integers, max_range: float) -> BearingRangeStream:
-    """The landmarks nearer than ``max_range``; ranges ``r`` and bearings ``b`` are (N, 17), and r = 0 is not seen."""
+    """The landmarks within ``max_range``; ranges ``r`` and bearings ``b`` are (N, 17), and r = 0 means not seen."""
     for name, table in (("r", r), ("b", b)):
         checks.require_finite(path, np.repeat(rows, LANDMARKS), name, table.ravel())
     if np.any(r < 0.0):
@@ -90,7 +90,7 @@ def read_sightings(path: Path, r: Array, b: Array, t: Array, rows: Integers, max
 
 
 def read_reference(path: Path, series: dict[str, Array], t: Array, rows: Integers, keep: Integers) -> Trajectory | None:
-    """The motion capture's poses where it saw the robot: gaps stay gaps."""
+    """The poses of the motion capture; gaps are kept."""
     valid = keep[series["true_valid"][keep] > 0]
     if len(valid) == 0:
         return None

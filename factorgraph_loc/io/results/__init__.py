@@ -1,3 +1,3 @@
-"""The files of a result folder."""
+"""Files of a result folder."""
 
 __all__ = ["estimates", "layout"]

@@ -1,4 +1,4 @@
-"""The files of a result folder."""
+"""File names in a result folder."""
 
 FILES = (
     "final.tum",
@@ -8,7 +8,7 @@ FILES = (
     "events.csv",
     "config.toml",
     "metrics.json",
-)  # the last says that all are there
+)  # the last one is written last
 COVARIANCES = {
     "cov_xx": (0, 0),
     "cov_xy": (0, 1),

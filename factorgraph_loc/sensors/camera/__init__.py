@@ -1,4 +1,4 @@
-"""Cameras: features of images, and points by name."""
+"""Cameras: image features and named points."""
 
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

@@ -1,4 +1,4 @@
-"""A camera as a sensor of a run: points of the map, by name or found by what they look like."""
+"""The camera sensor of a run: points of the map, by name or matched by appearance."""
 
 from __future__ import annotations
 
@@ -27,16 +27,13 @@ from factors.camera.model import TIME_OFFSET
 from factors.se2 import Array
 from factors.update import Correction
 
-SOLVE_EVERY = 0.45  # s: until then images update the newest pose, as a filter would
+SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
 
 
 @dataclass(frozen=True)
 class PixelObservation(ResidualObservation):
-    """Points that were seen in one image.
-
-    ``expected`` (3,): the pose that they were looked for at. ``held``: the camera's constants (P,) with their covariance (P, P), of
-    an observation on the pose alone.
-    """
+    """Points seen in one image. ``expected`` (3,): the predicted pose used to match them. ``held``: the camera's constants (P,)
+    with their covariance (P, P), if the observation depends on the pose only."""
 
     iterations: ClassVar[int] = ITERATIONS
     settled: ClassVar[float] = SETTLED
@@ -45,7 +42,7 @@ class PixelObservation(ResidualObservation):
 
     @property
     def factor(self) -> ReprojectionFactor:
-        """All of them."""
+        """One factor for all points."""
         return cast(ReprojectionFactor, self.terms[0].factor)
 
     def correct(
@@ -74,13 +71,13 @@ class PixelObservation(ResidualObservation):
                 if factor.twist is not None:
                     by_constants[..., TIME_OFFSET] = by_pose @ factor.twist
                 by_constants = by_constants[..., list(factor.estimated)]
-                # all pixels have this error in common: together they must not seem to be rid of it
+                # the error of the constants is common to all pixels, so it must not average out
                 common = by_constants @ self.held[1] @ by_constants.transpose(0, 2, 1)
                 spreads = spreads + len(common) * common
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, spreads)
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """The same on the pose alone: what is not known of the camera's constants widens the noise."""
+        """The observation on the pose only; the uncertainty of the camera's constants is added to the noise."""
         if not self.blocks:
             return self
         (name,) = self.blocks
@@ -89,11 +86,11 @@ class PixelObservation(ResidualObservation):
 
 
 class CameraSensor(Sensor):
-    """What a camera sees of known points, as all estimators take it in. ``points``: which are seen, and what cannot be right."""
+    """A camera that sees points of the map. ``points``: matching and outlier rejection."""
 
     modality = "camera"
     lost = MISSED
-    follows_constants = True  # where points are looked for depends on them
+    follows_constants = True  # matching depends on them
 
     def __init__(self, binding: Binding, constants: Estimated) -> None:
         setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.points
@@ -103,8 +100,9 @@ class CameraSensor(Sensor):
         self._shared = (self.modality,) if constants.names else ()
         if self.points.known:
             self.finder = PixelFinder(self.points, motion)
-            # pixels of known points place the robot so well that a graph need not be solved for each image, unless it is to learn
-            # from them how the camera is mounted
+            # pixels of known points determine the pose so well that the graph need not be solved for each image, unless the
+            # camera's
+            # mounting is estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation]:
@@ -127,7 +125,7 @@ class CameraSensor(Sensor):
 
 
 def bind(binding: Binding) -> CameraSensor | None:
-    """The sensor of a run, None where it is not used. Its constants do not travel with particles: there they widen the noise."""
+    """The sensor of a run, or None if it is not used. With particles, its constants are not estimated but widen the noise."""
     setup = binding.setup
     if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
         return None

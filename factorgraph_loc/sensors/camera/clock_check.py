@@ -1,10 +1,10 @@
-"""Whether a camera's images were taken when their stamps say.
+"""Detects a time offset of the camera.
 
-A robot that turns faster than at the image before is seen to have turned farther than the odometry says, if images are taken later
-than they are stamped: the estimate before was corrected by what was seen then, so that the innovation is the offset of time
-multiplied by the change of the turn rate. A line through both tells the offset. Noise in what the odometry reports is in both, with
-opposite signs: what it adds to their moments is taken off (errors in variables: Fuller, "Measurement Error Models", 1987,
-section 1.2). Where the reported rates vary less than that noise, it is the robot that slips, and they have none.
+If images are taken later than their timestamps say, then a robot that turns faster than at the previous image appears to have
+turned farther than the odometry says: the innovation is the time offset multiplied by the change of the turn rate. The offset is
+the slope of a regression line. Noise of the odometry appears in both variables with opposite signs, so its contribution is
+subtracted from the moments (errors in variables: Fuller, "Measurement Error Models", 1987, section 1.2). If the reported rates
+vary less than that noise, wheel slip is the cause, and the rates are noise-free.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import math
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.motion import Motion
 
-TIME = 0.1  # s over which a turn rate is taken
+TIME = 0.1  # s over which a turn rate is averaged
 LONGEST = 2.0  # s between images
 FEWEST = 40  # images
-SIGNIFICANT, LARGE = 5.0, 0.03  # standard deviations, and s: of an offset that is told
-CLEAR = 0.3  # share of the changes' square, at least, that is no noise
-SLIPS = 1.5  # of noise to the changes' square: beyond it the noise is not in what is reported
+SIGNIFICANT, LARGE = 5.0, 0.03  # standard deviations, and s: lower limits of a reported offset
+CLEAR = 0.3  # minimum share of the variance of the rate changes that is not noise
+SLIPS = 1.5  # ratio of noise to that variance above which the noise is not in the reported rates
 
 
 class ClockCheck:
-    """Tells by an event, once, if images are off; see the module."""
+    """Reports a time offset once, as an event; see the module."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -32,7 +32,7 @@ class ClockCheck:
         self._xx = self._xy = self._yy = self._noise = 0.0
 
     def add(self, t: float, turned: float) -> None:
-        """Take an image that shows the robot ``turned`` farther to the left [rad] than was predicted."""
+        """Add an image; ``turned`` [rad]: innovation of the heading, left is positive."""
         moved = self._motion.relative(self._motion.state(t - TIME), self._motion.state(t))
         rate, noise = float(moved.delta[2]) / TIME, float(moved.covariance[2, 2])
         last, self._last = self._last, (t, rate)

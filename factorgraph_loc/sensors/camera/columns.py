@@ -10,7 +10,7 @@ SIGHTINGS = Table(
     (
         STAMP,
         named("landmark", "the name of a landmark", field="point"),
-        within("u", PIXELS, LARGEST_PIXEL, "to the right; beside the image too"),
+        within("u", PIXELS, LARGEST_PIXEL, "to the right; may lie outside of the image"),
         within("v", PIXELS, LARGEST_PIXEL, "down"),
     ),
     "one measurement",
@@ -19,15 +19,15 @@ SIGHTINGS = Table(
 SIGHTINGS_RIGHT = replace(
     SIGHTINGS, name="sightings_right", stream="factorgraph_loc.sensors.camera.stream:RightSightingStream"
 )
-# of images, as a program hands them over
+# features of images, as pushed by a program
 FEATURES = Table(
     "features",
     (
         STAMP,
-        within("pixels", PIXELS, LARGEST_PIXEL, "where it was found"),
-        number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "how large it is"),
-        within("descriptors", PURE, 1e6, "what it looks like"),
-        Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number that stays with what is followed"),
+        within("pixels", PIXELS, LARGEST_PIXEL, "position of the feature"),
+        number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "size of the feature"),
+        within("descriptors", PURE, 1e6, "descriptor of the feature"),
+        Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number of the track that the feature belongs to"),
     ),
     "one measurement",
 )

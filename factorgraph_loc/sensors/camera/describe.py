@@ -1,4 +1,4 @@
-"""What a run can do with a camera, in words."""
+"""Descriptions of what a run can do with a camera."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,19 +11,19 @@ NAMES = ("camera", "sightings")
 
 
 def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
-    """What ``sensors`` could find in the map, and the words for that nothing of it was."""
+    """The kind of map elements that ``sensors`` could detect, and the message if none were detected."""
     if log.world.points is not None and any(name in sensors for name in NAMES):
         return "points", "no point of the map was found in an image"
     return None
 
 
 def mappable(log: Log) -> str | None:
-    """The layer of a world that can be made from a log's images, if it has some and the camera is known."""
+    """The map layer that can be made from a log's images, or None if there are none or the camera is unknown."""
     return "points" if "camera" in log.streams and log.rig.find(CameraSettings) is not None else None
 
 
 def doubts(use: Use, _: Diagnostics) -> Iterator[str]:
-    """A map without points that the camera could find, where the estimator needs them."""
+    """A warning if the estimator needs map points and the map has none."""
     used = [name for name in NAMES if name in use.sensors]
     points = use.log.world.points
     if not used or "camera" not in use.modalities:

@@ -1,4 +1,4 @@
-"""What is drawn of a camera: the points of the map, images, and identified points in them."""
+"""Plots of the camera: points of the map, images, and named points in them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,7 @@ def draw(log: Log) -> Marks:
 
 
 def has_pictures(log: Log) -> bool:
-    """Whether the log holds images, or points that were identified in some."""
+    """Whether the log has images or named points in images."""
     return "camera" in log.streams or "sightings" in log.streams
 
 
@@ -41,7 +41,7 @@ def images(log: Log) -> Iterator[tuple[float, bytes]]:
 
 
 def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
-    """Time, names (K) and pixels (K, 2) of the identified points in each image."""
+    """Time, names (K) and pixels (K, 2) of the named points in each image."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return

@@ -1,8 +1,8 @@
-"""Where the robot is from what a camera sees alone: for an unknown start, a wrong one, and after being carried elsewhere.
+"""Localization from images alone, for an unknown or wrong start and a kidnapped robot.
 
-A frame that shows enough of the map tells the pose by itself. One that tells it less clearly needs others to agree with it along
-the odometry, and so do those that are to refute a track, which is under suspicion once points of the map are persistently not
-where they are expected. Where the start is known but for its heading, a frame must agree with it.
+An image with enough inliers gives the pose by itself; otherwise several images must agree along the odometry. A track is
+suspicious if points of the map are persistently not found where they are predicted. If the start position is known, an image must
+agree with it.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from factors.motion import ChainState, propagate
 from factors.se2 import Array
 
 MISSED = "points in images were not where they were expected"  # why a track is lost
-CLEAR, CLEAR_SHARE = 8, 0.5  # points that agree, and their share, for a frame to be believed by itself
-AGREEING = 3  # frames, otherwise
+CLEAR, CLEAR_SHARE = 8, 0.5  # minimum number and share of inliers for a single image to be accepted
+AGREEING = 3  # images that must agree otherwise
 KEPT = 5.0  # s
-APART = 25.0  # squared Mahalanobis distance, beyond which two poses are different places
-LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m, m, rad: closer poses are the same place
-POOR_FRAMES, POOR_TIME = 3, 0.3  # frames, and s, in which points must be missed for a suspicion
-SEARCH_INTERVAL = 1.0  # s between searches that find nothing
+APART = 25.0  # squared Mahalanobis distance above which two poses disagree
+LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m, m, rad: lower bound of the covariance
+POOR_FRAMES, POOR_TIME = 3, 0.3  # images, and s, with missing points before a track is suspicious
+SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
 
 
 @dataclass(frozen=True)
 class _Fix:
-    """A pose (3,) with body-frame ``covariance`` (3, 3) from one frame."""
+    """A pose (3,) with body-frame ``covariance`` (3, 3) from one image."""
 
     odometry: ChainState
     pose: Array
@@ -41,25 +41,25 @@ class _Fix:
 
 
 class PixelFinder:
-    """Poses from frames; see the module."""
+    """Finds poses from images; see the module."""
 
     at_once = True
 
     def __init__(self, points: KnownPoints, motion: Motion) -> None:
         self._points, self._motion = points, motion
-        self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
+        self.start: KnownPosition | None = None  # known start position while the heading is sought
         self._fixes: list[_Fix] = []
         self._stamps: list[tuple[float, bool]] = []
         self._fruitless = -np.inf
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry at the last frame that told a pose; None if none did."""
+        """The odometry state at the last image that gave a pose, or None."""
         return self._fixes[-1].odometry if self._fixes else None
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """What the last frame told."""
+        """The poses of the last image."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -67,14 +67,14 @@ class PixelFinder:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last frame, if it is clear or others agree."""
+        """The pose at the last image, if it is unambiguous or other images agree."""
         if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
         last = self._fixes[-1]
         return PosePrior(last.odometry.t, last.pose, se2.body_to_world(last.pose, last.covariance))
 
     def _suspicious_since(self) -> float | None:
-        """When the points began not to be where they are expected, None if all is well."""
+        """The time since which points are not where they are predicted, or None."""
         poor: list[float] = []
         for t, missed in reversed(self._stamps):
             if not missed:
@@ -84,14 +84,14 @@ class PixelFinder:
         return poor[-1] if enough else None
 
     def follow(self, observation: object, odometry: ChainState, view: object) -> None:
-        """Nothing: what is missed in an image tells whether a track is lost."""
+        """Nothing to record: missing points tell whether the track is lost."""
 
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Since when a track must have been wrong, after a frame was taken at its ``pose`` (3,): points were missed since then, and
-        the last frames agree on another place. None where they do not.
+        """The time since which the track must have been wrong, after an image was processed at its ``pose`` (3,): points have
+        been missing since then, and the last images agree on another pose. None if they do not.
 
-        How sure the track is does not count: the points of one that is not are missed as they are looked for in wrong places.
-        Frames from that time on that were taken before are forgotten.
+        The track's covariance is not used, because an uncertain track misses points by searching in the wrong place. Earlier
+        results from after that time are discarded.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
         self._stamps.append((m.t, self._points.missed))
@@ -106,7 +106,7 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Find the pose from a frame alone; False where it tells none."""
+        """Find the pose from an image alone; False if that fails."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
@@ -123,13 +123,13 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) drawn from what the last frame told."""
+        """Poses (N, 3) sampled from the last image's result."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
 
     def clear(self) -> None:
-        """Forget the frames: the track begins anew, or is trusted."""
+        """Forget the images: a new track starts, or the current one is trusted."""
         self._fixes, self._stamps = [], []
 
     @staticmethod
@@ -137,7 +137,7 @@ class PixelFinder:
         return bool(2.0 * start.loss(found.pose[None], now, found.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
-        """Whether the last frames agree, along the odometry."""
+        """Whether the last images agree along the odometry."""
         if len(self._fixes) < AGREEING:
             return False
         *others, last = self._fixes[-AGREEING:]
@@ -149,6 +149,6 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Squared Mahalanobis distance of a fix from a pose (3,) with body-frame covariance (3, 3)."""
+    """Squared Mahalanobis distance of a pose from an image to a pose (3,) with body-frame covariance (3, 3)."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

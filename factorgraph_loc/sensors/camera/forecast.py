@@ -1,4 +1,4 @@
-"""What a camera is expected to tell on the way, by the points of the map: the part of cameras in planning."""
+"""Expected information of a camera that sees points of the map, for path planning."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,13 +15,13 @@ from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-IMAGES_PER_SECOND = 2.0  # where nothing else is said
+IMAGES_PER_SECOND = 2.0  # default rate
 
 
 @dataclass(frozen=True, eq=False)
 class CameraForecast:
-    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of images, ``looks_per_metre``; what is seen in one is as ``settings``
-    tell, and not through walls. It draws no images, so that particles are not weighed by any."""
+    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` for images, ``looks_per_metre``; visibility follows ``settings`` and
+    walls. It draws no simulated images, so particles are not weighed."""
 
     world: World
     model: CameraModel
@@ -30,7 +30,7 @@ class CameraForecast:
     goals: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Of the points in sight."""
+        """Information of the visible points."""
         looks = (self.looks_per_metre * ways)[:, None, None]
         return np.asarray(looks * np.array([self._of_image(pose) for pose in poses]).reshape(-1, 3, 3))
 
@@ -38,7 +38,7 @@ class CameraForecast:
         """Nothing."""
 
     def _of_image(self, pose: Array) -> Array:
-        """Information (3, 3) of one image from a pose (3,)."""
+        """Information (3, 3) of one image taken at pose (3,)."""
         model, points = self.model, self.world.points
         assert points is not None, "a camera has points to look at"
         pixels, depth = reprojection.predict(model, pose, points.positions)
@@ -53,8 +53,7 @@ class CameraForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> CameraForecast | None:
-    """Of a robot that drives at ``speed`` [m/s], with the rate of a simulation's settings; None if it has no camera or the map no
-    points."""
+    """The forecast for a robot with ``speed`` [m/s], with the rate of the simulation settings; None without a camera or points."""
     camera = rig.find(CameraSettings)
     if camera is None or world.points is None:
         return None

@@ -1,7 +1,7 @@
-"""From images to features and tracks: computed in parallel once, and kept in the user's cache folder.
+"""Detection and tracking of image features, in parallel, with a cache in the user's cache folder.
 
-What is kept is named by a hash of an image's bytes, of what is looked for, and of the code that looks: a changed image or
-a changed feature is another name, and the same image in two logs is one.
+Cache keys are hashes of the image's bytes, the settings and the code, so a changed image or feature is computed again, and equal
+images in two logs are computed once.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import follow
 from factors.camera.model import CameraModel
 
-# what the features of an image depend on, and what tracks depend on besides
+# what features depend on, and what tracks depend on in addition
 FEATURE_CODE = (
     "colour.py",
     "colour_features.py",
@@ -47,15 +47,15 @@ FEATURE_CODE = (
     "weights.npz",
 )
 TRACK_CODE = ("matching.py", "tracks.py")
-PART = 8  # images that a process is given at a time
-FEW = 64  # images: for fewer, processes take longer to start than the work takes
+PART = 8  # images per task
+FEW = 64  # images below which starting processes takes longer than the work
 
 Size = tuple[int, int]  # width, height
 
 
 @dataclass(frozen=True)
 class _Image:
-    """A file with the ``key`` of its features, and these if they are known; ``fault``: why it cannot have any."""
+    """A file with the ``key`` of its features, the features if known, or the ``fault`` of the file."""
 
     file: Path
     key: str = ""
@@ -67,22 +67,19 @@ class _Image:
 def with_features(
     log: Log, settings: FrontendSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Log, tuple[str, ...]]:
-    """The log with features and tracks in place of its images, and what is wrong with these, one line each.
+    """Replace the images of a log by features and tracks. Returns the log and warnings, one line each.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
-    ``progress`` is given the share done. Other processes are spawned for many images that are not in the cache, so a script that
-    calls this needs the usual ``if __name__ == "__main__"``.
+    ``progress`` is called with the completed share. Processes are spawned if many images are not in the cache, so a script that
+    calls this needs ``if __name__ == "__main__"``. A log without images is returned unchanged.
 
-    InputError if the rig has no camera, or if it is calibrated for another size than all images have; RunFailedError if a
-    process dies. A log without images is given back as it is.
+    InputError if the rig has no camera, or is calibrated for another size than all images have; RunFailedError if a process dies.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return log, ()
     if log.rig.find(CameraSettings) is None:
-        raise InputError(
-            f"{log.name}: has images, but its rig {log.rig.name} has no [camera] that tells where they look"
-        )
+        raise InputError(f"{log.name}: has images, but its rig {log.rig.name} has no [camera] with its mounting")
     camera = log.rig.of(CameraSettings).model()
     kept = FeatureCache(cache_folder())
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
@@ -94,7 +91,7 @@ def with_features(
         for t, f, numbers in zip(stream.t.tolist(), found, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
-    unkept = (f"features are not kept, {kept.fault}",) if kept.fault else ()
+    unkept = (f"features are not cached, {kept.fault}",) if kept.fault else ()
     return replace(log, streams=streams), (*_doubts(log, images), *unkept)
 
 
@@ -105,9 +102,9 @@ def _features(
     kept: FeatureCache,
     progress: Callable[[float], None],
 ) -> list[_Image]:
-    """The features of N images, from the cache where they are there."""
+    """The features of N images, from the cache if possible."""
     about = f"{settings.feature} {settings.count} {size} {code_version(FEATURE_CODE)} "
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing are done outside of the interpreter
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing release the interpreter lock
         images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
     wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
     new: dict[str, _Image] = {}
@@ -133,17 +130,17 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _Image:
 
 
 def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _Image]:
-    """The features of each file as bytes, or what is wrong with it, in the order of the files."""
+    """The features of each file as bytes, or its fault, in the order of the files."""
     processes = min(os.cpu_count() or 1, len(files) // FEW)
     if processes < 2:
         yield from (_find(file, settings, size) for file in files)
         return
     parts = [files[i : i + PART] for i in range(0, len(files), PART)]
-    early: dict[int, list[bytes | _Image]] = {}  # of parts that come later
+    early: dict[int, list[bytes | _Image]] = {}  # results of tasks that finished out of order
     due = 0
     for at, found in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
         if isinstance(found, ProcessDiedError):
-            raise RunFailedError("a process died while it looked for features in images")
+            raise RunFailedError("a process died during feature detection")
         if isinstance(found, Exception):
             raise found
         early[at] = found
@@ -153,7 +150,7 @@ def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iter
 
 
 def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _Image]:
-    """The same of some files, in a process among others."""
+    """The features of some files; runs in a worker process."""
     cv2.setNumThreads(1)
     return [_find(file, settings, size) for file in files]
 
@@ -172,12 +169,12 @@ def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _Image:
 
 @cache
 def _extractor(settings: FrontendSettings) -> Extractor:
-    """One for each process: it keeps its memory from image to image."""
+    """The extractor, one per process because it reuses its memory."""
     return extractor(settings.feature, settings.count)
 
 
 def _nothing(settings: FrontendSettings) -> Found:
-    """What is found in an image that shows nothing."""
+    """The result for an image without features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 
@@ -189,7 +186,7 @@ def _tracks(
     camera: CameraModel,
     kept: FeatureCache,
 ) -> list[Integers]:
-    """Numbers (K,) of each image's features, from the cache where they are there."""
+    """Track numbers (K,) of each image's features, from the cache if possible."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(
@@ -215,7 +212,7 @@ def _tracks(
 
 
 def _require_calibrated(log: Log, images: list[_Image], camera: CameraModel) -> None:
-    """InputError if images can be decoded, but none has the size that the camera is calibrated for."""
+    """InputError if images can be decoded but none has the size that the camera is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
         width, height = sizes[0]
@@ -242,7 +239,7 @@ def _doubts(log: Log, images: list[_Image]) -> tuple[str, ...]:
 
 @cache
 def code_version(names: tuple[str, ...]) -> str:
-    """A hash of files of this package, and of the versions of what they call."""
+    """A hash of source files of this package and the versions of the libraries they use."""
     package = resources.files("factorgraph_loc.vision")
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for name in names:

@@ -1,4 +1,4 @@
-"""Features and tracks of images that come one after the other, as :mod:`.frontend` and :mod:`.tracks` find those of a log."""
+"""Online feature detection and tracking, equal to :mod:`.frontend` and :mod:`.tracks` on a log."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from factors.se2 import Array
 
 @dataclass
 class _Seen:
-    """One of the last images: directions (K, 2) and numbers (K,) of its features, and which the image after it did not show."""
+    """A recent image: directions (K, 2) and track numbers (K,) of its features, and which the next image did not match."""
 
     found: Found
     directions: Array
@@ -28,7 +28,7 @@ class _Seen:
 
 
 class LiveFrontend:
-    """Keeps the last two images; for one thread at a time."""
+    """Detects and tracks features, keeping the last two images. Not thread-safe."""
 
     def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
         self._feature, self._camera = settings.feature, camera
@@ -37,9 +37,9 @@ class LiveFrontend:
         self._following = 0
 
     def frame(self, t: float, image: object) -> CameraFrame:
-        """What is found in an image taken at ``t`` [s], an array as :func:`~factorgraph_loc.vision.images.as_image` takes it.
+        """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.
 
-        InputError if it is none, or has another size than the camera is calibrated for.
+        InputError if it is not such an array, or has another size than the camera is calibrated for.
         """
         pixels = as_image(image, f"image at {t:.3f} s")
         height, width = pixels.shape[:2]
@@ -52,7 +52,7 @@ class LiveFrontend:
         return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)
 
     def _follow(self, found: Found) -> Integers:
-        """Numbers (K,) of the features of the next image; see :func:`~factorgraph_loc.vision.tracks.follow`."""
+        """Track numbers (K,) of the features of the next image; see :func:`~factorgraph_loc.vision.tracks.follow`."""
         every = np.arange(len(found.pixels))
         numbers = np.full(len(every), -1, dtype=np.int64)
         here = _Seen(found, undistorted(self._camera, found.pixels), numbers, every)
@@ -72,7 +72,7 @@ class LiveFrontend:
         return numbers
 
     def _pairs(self, a: _Seen, first: Integers, b: _Seen, second: Integers) -> Integers:
-        """Pairs (M, 2) of features among ``first`` of one image and ``second`` of another."""
+        """Matches (M, 2) between features ``first`` of one image and ``second`` of another."""
         found = pairs(
             (a.directions[first], a.found.descriptors[first]),
             (b.directions[second], b.found.descriptors[second]),

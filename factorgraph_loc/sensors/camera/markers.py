@@ -1,4 +1,4 @@
-"""Sightings of markers in the images of a log."""
+"""Detection of fiducial markers in the images of a log."""
 
 import hashlib
 import json
@@ -17,20 +17,20 @@ from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.fiducials import find_markers
 from factorgraph_loc.vision.images import read_image
 
-CODE = ("fiducials.py", "images.py")  # what is found depends on
-Marked = list[tuple[int, list[list[float]]]]  # numbers of markers, and the pixels of their corners
+CODE = ("fiducials.py", "images.py")  # files that the result depends on
+Marked = list[tuple[int, list[list[float]]]]  # marker numbers and the pixels of their corners
 
 
 def with_markers(log: Log, family: MarkerFamily) -> Log:
-    """The log with the corners of the markers in its images as the stream ``sightings``, by the names ``FAMILY-NUMBER/CORNER``.
+    """Add the marker corners in the images of a log as the stream ``sightings``, with names ``FAMILY-NUMBER/CORNER``.
 
-    What was found is kept in the user's cache. InputError for a log without images, or with identified pixels of its own.
+    Results are cached. InputError if the log has no images, or already has sightings.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream) or not len(stream.t):
-        raise InputError(f"{log.name}: has no images to look for markers in")
+        raise InputError(f"{log.name}: has no images to detect markers in")
     if "sightings" in log.streams:
-        raise InputError(f"{log.name}: has sightings already, expected either these or [markers]")
+        raise InputError(f"{log.name}: already has sightings, expected either these or [markers]")
     kept = FeatureCache(cache_folder())
     t: list[float] = []
     names: list[str] = []
@@ -49,7 +49,7 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
     kept.trim()
     warnings = [f"markers: {len(faults)} images cannot be used, the first: {faults[0]}"] if faults else []
     if not names:
-        warnings.append(f"markers: none of {family} is found in {len(stream.t)} images")
+        warnings.append(f"markers: no marker of {family} was found in {len(stream.t)} images")
         return replace(log, warnings=(*log.warnings, *warnings))
     u, v = np.array(pixels).T
     return replace(

@@ -1,4 +1,4 @@
-"""Identified points in an image."""
+"""Named points in an image."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -8,12 +8,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """Identified points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: by the second
-    camera of a stereo pair."""
+    """Named points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: whether the second
+    camera of a stereo pair saw them."""
 
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
-    frame: ClassVar[None] = None  # no features were looked for
+    frame: ClassVar[None] = None  # there are no features
     t: float
     points: tuple[str, ...]
     pixels: Array
@@ -21,15 +21,15 @@ class PixelSightings:
 
     @property
     def sensor(self) -> str:
-        """The sensor that saw them."""
+        """The channel."""
         return "sightings_right" if self.right else "sightings"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those of the points."""
+        """Names of the points."""
         return self.points
 
     @property
     def count(self) -> int:
-        """How many points were seen."""
+        """Number of points."""
         return len(self.pixels)

@@ -1,4 +1,4 @@
-"""What is done with a log's images before an estimator runs: their features are found, or they are set aside."""
+"""Preparation of a log's images before a run: features are computed, or the images are ignored."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -19,12 +19,12 @@ from factors.se2 import Array
 
 
 def uses_images(sensors: Collection[str], modalities: Collection[str]) -> bool:
-    """Whether images are used by an estimator of these ``modalities`` that is given these ``sensors``."""
+    """Whether an estimator with these ``modalities`` and ``sensors`` uses images."""
     return "camera" in sensors and "camera" in modalities
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """What is looked for in images: what the map's points look like in them, else what the rig's camera says."""
+    """The feature settings: those of the map's points, else those of the rig's camera."""
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
     points = world.points
@@ -34,15 +34,15 @@ def frontend_of(rig: Rig, world: World) -> FrontendSettings:
 
 
 def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
-    """Stamps (N,) and features of a log's images, once those were found; InputError if it has none."""
+    """Timestamps (N,) and features of a log's images after feature detection; InputError if it has none."""
     stream = log.streams.get("camera")
     if not isinstance(stream, FeatureStream):
-        raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+        raise InputError(f"{log.name}: has no images (camera), so there are no points to map")
     return stream.t + log.rig.time_offset("camera"), stream.frame
 
 
 def prepare(use: Use, progress: Callable[[float], None]) -> Prepared:
-    """The log with features in place of images, if the run has them; an estimator that takes none is given empty frames."""
+    """Replace images by features if the run uses them, else by empty frames."""
     log, stream = use.log, use.log.streams.get("camera")
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
         return Prepared(log)
@@ -56,11 +56,11 @@ def prepare(use: Use, progress: Callable[[float], None]) -> Prepared:
 
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> Prepared:
-    """Frames without features: their stamps still count for when the run begins and ends."""
+    """Frames without features; their timestamps still define the start and end of the run."""
     nothing = CameraFrame(
         0.0, "", np.empty((0, 2)), np.empty(0), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64)
     )
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
-    told = (f"{log.name}: {estimator} takes no images: all {len(stream.t)} are ignored",)
-    by_name = estimator == "dead_reckoning"  # which says so by its name
+    told = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
+    by_name = estimator == "dead_reckoning"  # obvious from its name
     return Prepared(replace(log, streams={**log.streams, "camera": frames}), () if by_name else told)

@@ -1,4 +1,4 @@
-"""Features and identified points that a program hands over."""
+"""Validation of pushed features and named points."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,7 +20,7 @@ BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 
 
 def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
-    """The fields of identified points; InputError names the first that cannot be."""
+    """The fields of named points; InputError names the first invalid one."""
     points = names(where, "points", m.points)
     return {
         "points": points,
@@ -30,7 +30,7 @@ def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
 
 
 def check_frame(m: CameraFrame, where: str) -> dict[str, Any]:
-    """The fields of an image's features; InputError names the first that cannot be."""
+    """The fields of an image's features; InputError names the first invalid one."""
     pixels = numbers(where, "pixels", m.pixels)
     if pixels.ndim != 2:
         raise InputError(f"{where}: pixels has shape {pixels.shape}, expected (K, 2)")
@@ -46,7 +46,7 @@ def check_frame(m: CameraFrame, where: str) -> dict[str, Any]:
 
 
 def _descriptors(where: str, value: object, count: int | None, feature: str) -> Any:
-    """Descriptors (K, D), bytes of a feature that is compared by bits."""
+    """Descriptors (K, D); bytes for a binary feature."""
     rows = numbers(where, "descriptors", value)
     if rows.ndim != 2 or len(rows) != count:
         raise InputError(f"{where}: descriptors has shape {rows.shape}, expected ({count}, D)")
@@ -58,17 +58,17 @@ def _descriptors(where: str, value: object, count: int | None, feature: str) -> 
 
 
 class Widths:
-    """How long descriptors are, by their feature: as those of the map, or as those that came first."""
+    """Descriptor lengths by feature: those of the map, or of the first frame."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points
         self._known = {} if points is None or not points.feature else {points.feature: points.descriptors.shape[1]}
 
     def require(self, m: Measurement, where: str) -> None:
-        """InputError for descriptors of another length."""
+        """InputError if the descriptors have another length."""
         if not isinstance(m, CameraFrame) or not len(m.pixels):
             return
         width = m.descriptors.shape[1]
         if width != self._known.setdefault(m.feature, width) or not width:
-            expected = f"{self._known[m.feature]} numbers each, as those of {plain(m.feature)} before"
+            expected = f"{self._known[m.feature]} numbers each, as in earlier {plain(m.feature)}"
             raise bad_field(where, "length of descriptors", width, expected)

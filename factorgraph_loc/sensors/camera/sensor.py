@@ -1,4 +1,4 @@
-"""Points of the map seen by a camera, as all estimators take them in: by name, or as features that are found in the map."""
+"""Points of the map seen by a camera, identified by name or by matching features."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from factors.motion import Increment, propagate
 from factors.se2 import Array
 from factors.update import Correction, robust_update, update_state
 
-DISAGREES = "camera: does not agree with the others"  # why a sighting is rejected
-CAMERAS = ("camera", "sightings")  # sensors that share the rig's camera: found features, and points by name
-FEW_SHARE = 0.3  # of named points, and
-FEW, MANY = 6, 20  # of points that are found by what they look like, where so many are expected: they are missed
-UNSURE = 1.0  # m: a prediction that is known no better may miss the map altogether
-MOST = 100  # points of one image that are used: more tell hardly more, as the errors of neighbours in a map are alike
-EXACT = 0.1  # a map whose errors are that share of a pixel's, seen from 1 m, is taken as exact
-# A pixel is so sharp that one step from a poor prediction does not lead to the optimum
-ITERATIONS, SETTLED = 8, 1e-3  # m, rad: a step that needs no further one
+DISAGREES = "camera: does not agree with the others"  # reason of a rejection
+CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
+FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
+FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
+UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
+MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
+EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
+# Pixels are so precise that one step from a poor prediction does not reach the optimum
+ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
 
-Pixels = PixelSightings | CameraFrame  # what a camera sees
+Pixels = PixelSightings | CameraFrame  # measurements of a camera
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """What is expected when an image is taken: the ``pose`` (3,) of the variable that a factor hangs on, with its body-frame
-    ``covariance`` (3, 3); and of the camera's constants that are estimated their changes (P,) and ``spread`` (P, P)."""
+    """The prediction for an image: ``pose`` (3,) of the factor's variable with body-frame ``covariance`` (3, 3), and the
+    corrections (P,) of the camera's constants that are estimated with their ``spread`` (P, P)."""
 
     pose: Array
     covariance: Array
@@ -54,10 +54,10 @@ class Predicted:
 
 
 class KnownPoints:
-    """Turns what a camera sees into factors; what the map or the rig lacks is counted as ignored, what cannot be right as rejected.
+    """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
 
     ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``motion``: of the robot, to check the stamps of images by.
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``motion``: used to check the timestamps of images.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class KnownPoints:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
-        self._tempering = 1.0 if settings is None else settings.tempering  # of points that are found in the map
+        self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
             self.map = setup.world.points
         self._others_matter = use != "known"
-        self.used = np.empty(0, dtype=np.int64)  # features of the last image that show points of the map
+        self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
@@ -85,7 +85,7 @@ class KnownPoints:
         self._clock: ClockCheck | None = None
         if motion is not None and not self.needs_twist:
             self._clock = ClockCheck(motion, diagnostics)
-        self.missed = False  # whether points of the map were not where they were expected in the last image
+        self.missed = False  # whether points of the map were missing in the last image
         self._map_matters = False
         if settings is not None and len(self.map):
             worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
@@ -93,7 +93,7 @@ class KnownPoints:
 
     @property
     def known(self) -> bool:
-        """Whether there is a camera that is used, and a point in the map."""
+        """Whether the camera is used and the map has points."""
         return self.model is not None and len(self.map) > 0
 
     @property
@@ -102,7 +102,7 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """All points of the map that are named, none of them doubted, on the pose at their time."""
+        """All named points of the map without outlier rejection, on the pose at their time."""
         if self.model is None:
             self._diagnostics.ignore("camera", len(m.pixels))
             return None
@@ -118,9 +118,9 @@ class KnownPoints:
     def factor(
         self, m: Pixels, predicted: Predicted, offset: Increment | None = None, twist: Array | None = None
     ) -> ReprojectionFactor | None:
-        """The factor of the known points, on the pose at the image's time, or on the one that lies ``offset`` before it.
+        """The factor of the known points, on the pose at the image's time or on one that lies ``offset`` before it.
 
-        ``twist`` (3,): the robot's velocity then, where the camera's time offset is estimated.
+        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
@@ -147,7 +147,7 @@ class KnownPoints:
         return _rows(factor, right) if agreed else None
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """The pose that an image tells without a prediction, None where it tells none, and how many points it seemed to show."""
+        """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
         if self.model is None or not self.known:
             return None, 0
         if isinstance(m, PixelSightings):
@@ -178,7 +178,7 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """A factor of no points yet, where features can be found in the map."""
+        """A factor without points yet; None if features cannot be matched with the map."""
         if self.model is None or self.associator is None:
             if self.model is None or not self._others_matter:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -191,7 +191,7 @@ class KnownPoints:
     def _found(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
-        """A factor of the points that are found in a frame."""
+        """The factor of the points matched in a frame."""
         assert self.associator is not None
         seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
         self.used = seen.features
@@ -208,7 +208,7 @@ class KnownPoints:
         return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """Where the camera is when the image is taken, with what is not known of its constants."""
+        """The pose of the camera for an image, including the uncertainty of its constants."""
         pose, covariance = predicted.pose, predicted.covariance
         if here.offset is not None:
             noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
@@ -236,8 +236,8 @@ def pixel_update(
     constants: Array | None = None,
     spread: Array | None = None,
 ) -> Correction:
-    """Kalman update, up to the optimum, of ``pose`` (3,) with body-frame ``covariance`` (3, 3), then of the changes of the camera's
-    constants (P,), with their ``spread`` (P, P), where they are estimated."""
+    """Iterated Kalman update of ``pose`` (3,) with body-frame ``covariance`` (3, 3), and of the corrections of the camera's
+    constants (P,) with covariance ``spread`` (P, P) if they are estimated."""
     if constants is None or spread is None:
         return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
     size = 3 + len(constants)
@@ -252,13 +252,13 @@ def pixel_update(
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """The camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, *arrays))
 
 
 def _lift(model: CameraModel) -> Array:
-    """The camera's perturbation (6, 3), turn first, in its own frame, by that of the robot's planar pose."""
+    """Jacobian (6, 3) of the camera's perturbation in its own frame (rotation first) by that of the robot's planar pose."""
     x, y, _ = model.position
     lift = np.zeros((6, 3))
     lift[:3, 2] = model.rotation[2]
@@ -268,8 +268,8 @@ def _lift(model: CameraModel) -> Array:
 
 
 def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Which points agree near what is predicted; all where too few are seen to tell. ``focal``: standard deviation of the logarithm
-    of the focal length."""
+    """Inliers near the prediction; all points if too few are seen to tell. ``focal``: standard deviation of the logarithm of the
+    focal length."""
     model, count = here.model, len(here.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)

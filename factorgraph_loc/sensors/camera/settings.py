@@ -1,4 +1,4 @@
-"""The camera of a rig, as it stands in ``NAME.rig.toml``."""
+"""The camera settings of a rig."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
 Focal = Annotated[float, Field(gt=1.0, le=1e5, description="px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5, description="px")]
 Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
@@ -26,9 +26,9 @@ WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
 class CameraUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated.
 
-    ``roll``, ``pitch``, ``yaw``: of turns about the robot's axes; ``focal``: of the focal length, as a share.
+    ``roll``, ``pitch``, ``yaw``: rotations about the robot's axes; ``focal``: relative error of the focal length.
     """
 
     x: Metres = 0.0
@@ -37,18 +37,18 @@ class CameraUncertainty(FileModel):
     roll: Turn = 0.0
     pitch: Turn = 0.0
     yaw: Turn = 0.0
-    focal: Annotated[float, Field(ge=0.0, le=1.0, description="as a share")] = 0.0
+    focal: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
     time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
 
 class CameraSettings(SensorSettings):
     """A camera. See :class:`factors.camera.model.CameraModel` for the model.
 
-    Mounted at (x, y, z) it looks along the robot's x axis, then turned by ``roll`` about x, ``pitch`` about y (down where
-    positive) and ``yaw`` about z (to the left). ``time_offset`` [s] is added to the stamps of its images. ``pixel_sigma`` [px] and
-    ``robust``, the scale of Huber's loss in standard deviations: of a feature found and matched, the errors of lens and
-    mounting included. ``tempering`` is for features that are found in a map: the errors of map and feature stay from image to
-    image, so that each image tells less than its pixels seem to.
+    Mounted at (x, y, z), it looks along the robot's x axis, rotated by ``roll`` about x, ``pitch`` about y (down is positive) and
+    ``yaw`` about z (left is positive). ``time_offset`` [s] is added to the timestamps of its images. ``pixel_sigma`` [px] and
+    ``robust``, the scale of Huber's loss in standard deviations, apply to a matched feature and include errors of lens and
+    mounting. ``tempering`` applies to features matched with a map, because errors of map and features are correlated between
+    images.
     """
 
     constants: ClassVar[tuple[str, ...]] = reprojection.PARAMETERS
@@ -58,7 +58,7 @@ class CameraSettings(SensorSettings):
     fy: Focal
     cx: Pixel
     cy: Pixel
-    distortion: Annotated[tuple[Lens, Lens, Lens, Lens], Field(description="k1, k2, p1, p2 as OpenCV has them")] = (
+    distortion: Annotated[tuple[Lens, Lens, Lens, Lens], Field(description="k1, k2, p1, p2 as in OpenCV")] = (
         0.0,
         0.0,
         0.0,

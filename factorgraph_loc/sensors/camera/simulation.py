@@ -1,4 +1,4 @@
-"""Pixels of named points in sight, drawn from the camera's model without any image."""
+"""Simulated pixels of visible named points, from the camera model without rendering."""
 
 import math
 from dataclasses import replace
@@ -16,12 +16,12 @@ from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-NEAR = 0.3  # m of depth, below which no point is recognized
-OBLIQUE = math.radians(75.0)  # from a surface's normal, beyond which nothing on it is recognized
+NEAR = 0.3  # m of depth below which no point is detected
+OBLIQUE = math.radians(75.0)  # angle to a surface's normal above which nothing on it is detected
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The pixels that the camera of a simulated drive identifies, in a world with points."""
+    """The named points that the camera of a simulated drive detects, in a world with points."""
     if ride.world.points is None:
         return Simulated()
     settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
@@ -31,7 +31,7 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """How often per second a simulated drive looks for all points; ValueError without a camera for them."""
+    """Rate [Hz] of the simulated images; ValueError if the rig has no camera."""
     if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")
     return {"points": settings.pixels.rate * settings.world.points}
@@ -40,8 +40,8 @@ def looks(settings: Any) -> dict[str, float]:
 def pixel_stream(
     model: CameraModel, world: World, times: Array, poses: Array, settings: PixelSettings, rng: np.random.Generator
 ) -> SightingStream:
-    """What the camera identifies at ``times`` (N,) from ``poses`` (N, 3) of the robot: points of the map that are in the image,
-    not too far, on a surface that is not seen too obliquely, and not behind a wall or furniture, however high."""
+    """The points that the camera detects at ``times`` (N,) from robot ``poses`` (N, 3): points of the map inside the image,
+    within range, not too oblique, and not occluded by walls or furniture of any height."""
     points = world.points
     assert points is not None, "the world has points"
     positions, normals = points.positions, surface_normals(world, points.positions[:, :2])
@@ -68,7 +68,7 @@ def pixel_stream(
 
 
 def surface_normals(world: World, places: Array) -> Array:
-    """Unit vectors (K, 2) away from the wall that is nearest to each of ``places`` (K, 2), to the side that the place is on."""
+    """Unit normals (K, 2) of the walls nearest to ``places`` (K, 2), on the side of each place."""
     best = np.full(len(places), np.inf)
     out = np.zeros((len(places), 2))
     for x1, y1, x2, y2 in world.walls:
@@ -84,7 +84,7 @@ def surface_normals(world: World, places: Array) -> Array:
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
-    """Places of at most ``count`` rows, drawn at random, of each of the ``frames`` (K,), which are in order."""
+    """Indices of at most ``count`` random rows of each of the ``frames`` (K,), which are sorted."""
     shuffled = np.lexsort((rng.random(len(frames)), frames))
     starts = np.searchsorted(frames, frames)
     return np.sort(shuffled[np.arange(len(frames)) - starts < count])

@@ -1,4 +1,4 @@
-"""What is simulated of identified points in images."""
+"""Simulation settings of named points in images."""
 
 from typing import Annotated
 
@@ -9,8 +9,8 @@ from factorgraph_loc.model.simulation_units import Hertz, Metres, Share
 
 
 class PixelSettings(FileModel):
-    """Which named points the camera identifies: at ``rate`` looks per second at most ``max_points`` of those in sight, chosen at
-    random, that are at most ``max_depth`` ahead. A share ``wrong`` of them is reported anywhere in the image."""
+    """Detection of named points: ``rate`` images per second, each with at most ``max_points`` random visible points of at most
+    ``max_depth``. A share ``wrong`` of them is reported at a random pixel."""
 
     rate: Hertz = 5.0
     max_points: Annotated[int, Field(ge=1, le=10_000)] = 20

@@ -1,4 +1,4 @@
-"""The rows of cameras: identified points, images and their features."""
+"""The streams of cameras: named points, images and their features."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class SightingStream(Stream):
-    """One row an identified point in an image: its name and pixel (``u``, ``v``) [px]. Rows of one stamp belong together."""
+    """Rows of named points in images: name and pixel (``u``, ``v``) [px]. Rows with equal timestamps form one measurement."""
 
     point: Sequence[str]
     u: Array
@@ -32,24 +32,24 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class RightSightingStream(SightingStream):
-    """The same of the second camera of a stereo pair (``rig.camera_right``)."""
+    """The same for the second camera of a stereo pair (``rig.camera_right``)."""
 
     right: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """Images that were taken: files (N) by their paths. :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+    """Image files (N,). :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
     file: Sequence[Path]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        raise InputError("images are no measurements before their features are found")
+        raise InputError("images have no measurements before feature detection")
 
 
 @dataclass(frozen=True)
 class FeatureStream(Stream):
-    """What was found in images: ``frame`` (N), whose own stamps do not count."""
+    """Features of images: ``frame`` (N,), whose own timestamps are ignored."""
 
     frame: Sequence[CameraFrame]
 

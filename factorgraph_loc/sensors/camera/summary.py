@@ -1,4 +1,4 @@
-"""What a log's images and identified pixels hold, and what looks wrong with them."""
+"""Summary of a log's images and named points, with warnings."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import read_image
 from factorgraph_loc.vision.settings import FrontendSettings
 
-LOOKED_AT = 40  # images, evenly over the log: all of them would take minutes
+LOOKED_AT = 40  # images that are examined, evenly over the log
 SHOWN = 5  # names in a line
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """The images: how many there are, and of the ``looked_at`` ones how many could be read (``readable``), their ``sizes``
-    (WIDTHxHEIGHT: count), the median number of ``features`` of the rig's kind in them, and the first ``fault``."""
+    """The images: their number; of the ``looked_at`` examined ones how many are ``readable``, their ``sizes`` (WIDTHxHEIGHT:
+    count), the median number of ``features``, and the first ``fault``."""
 
     images: int
     looked_at: int
@@ -35,8 +35,8 @@ class ImageSummary:
 
 @dataclass(frozen=True)
 class PixelSummary:
-    """Identified pixels. ``frames``: stamps; ``known``: how many points of the map are seen; ``unknown``: rows by name that the
-    map lacks; ``outside``: rows whose pixel lies outside of the image."""
+    """Named points. ``frames``: timestamps; ``known``: points of the map that are seen; ``unknown``: rows by names that the map
+    lacks; ``outside``: rows outside of the image."""
 
     rows: int
     frames: int
@@ -46,13 +46,13 @@ class PixelSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """``images``, an :class:`ImageSummary`, and ``pixels``, a :class:`PixelSummary`, of a log; None where it has no such stream."""
+    """``images``, an :class:`ImageSummary`, and ``pixels``, a :class:`PixelSummary`; None if the log lacks the stream."""
     images, pixels = summarize_images(log), summarize_pixels(log)
     text = []
     if images is not None:
         sizes = ", ".join(images.sizes) or "unknown"
         text.append(
-            f"images: {images.images}, of {sizes} px; {images.readable} of the {images.looked_at} looked at can be read, "
+            f"images: {images.images}, of {sizes} px; {images.readable} of the {images.looked_at} examined can be read, "
             f"with {images.features:.0f} {images.feature} features (median)"
         )
     if pixels is not None:
@@ -65,7 +65,7 @@ def summarize(log: Log) -> Summary:
 
 
 def summarize_images(log: Log) -> ImageSummary | None:
-    """What the stream ``camera`` holds, from some of its images; None where there are none."""
+    """Summary of the stream ``camera`` from some of its images, or None."""
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return None
@@ -88,7 +88,7 @@ def summarize_images(log: Log) -> ImageSummary | None:
 
 
 def summarize_pixels(log: Log) -> PixelSummary | None:
-    """What the stream ``sightings`` holds; None where there is none."""
+    """Summary of the stream ``sightings``, or None."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return None
@@ -108,7 +108,7 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 
 
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[str]:
-    """What looks wrong with images and identified pixels, as lines for people."""
+    """Warnings about images and named points."""
     out = []
     if log.rig.find(CameraSettings) is None:
         there = [name for name, found in (("images", images), ("identified pixels", pixels)) if found is not None]
@@ -116,12 +116,12 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
     if images is not None:
         if images.fault is not None:
             lost = images.looked_at - images.readable
-            out.append(f"{lost} of the {images.looked_at} images looked at cannot be read: {images.fault}")
+            out.append(f"{lost} of the {images.looked_at} examined images cannot be read: {images.fault}")
         if len(images.sizes) > 1:
             out.append(f"images have several sizes: {', '.join(images.sizes)}")
         out += _calibration(log, images)
         if images.readable and images.features == 0.0:
-            out.append(f"half of the images looked at, or more, show no {images.feature} features")
+            out.append(f"half of the examined images, or more, show no {images.feature} features")
     if pixels is not None:
         if pixels.unknown:
             rows, names = sum(pixels.unknown.values()), list(pixels.unknown)

@@ -1,7 +1,6 @@
-"""Images in the native format: ``camera.csv`` with the folder ``camera``.
+"""Images in the native format: ``camera.csv`` and the folder ``camera``.
 
-Images are not opened here: whether they can be decoded, and have the size that the camera was calibrated for, is found out
-where their features are looked for (:mod:`factorgraph_loc.sensors.camera.frontend`).
+Images are decoded and checked later, by :mod:`factorgraph_loc.sensors.camera.frontend`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,47 +19,46 @@ FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
-    """The images that there are, in order of arrival; of several at one stamp the last. They lie below ``folder``, which was
-    checked itself, by default that of the native format.
+    """The existing images in order of arrival; of several with one timestamp the last. They are in ``folder``, which must be
+    validated, by default that of the native format.
 
-    InputError for a path that leaves the folder or is no regular file, and a stamp that is late by more than 0.5 s."""
+    InputError if a path leaves the folder or is no regular file, or a timestamp is late by more than 0.5 s.
+    """
     checks.arrivals(table.path, table.rows, table.t_ns, warnings)
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
     named = zip(table.rows.tolist(), table.names["file"], strict=True)
     paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]
     last = {t: i for i, t in enumerate(table.t_ns.tolist())}
     if dropped := len(paths) - len(last):
-        warnings.append(f"{table.path}: {dropped} rows have the stamp of a later row and are left out")
+        warnings.append(f"{table.path}: {dropped} rows have the timestamp of a later row and are skipped")
     latest = sorted(last.values())
     keep = [i for i in latest if paths[i] is not None]
     if missing := [i for i in latest if paths[i] is None]:
         first = f"{table.names['file'][missing[0]]} of row {table.rows[missing[0]]}"
         warnings.append(
-            f"{table.path}: {len(missing)} of {len(latest)} images are missing and left out, the first is {first}"
+            f"{table.path}: {len(missing)} of {len(latest)} images are missing and skipped, the first is {first}"
         )
     t = checks.seconds(table.t_ns[keep], t0_ns)
     return ImageStream(t, [path for path in (paths[i] for i in keep) if path is not None])
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """The images of a log's folder."""
+    """The images in a log's folder."""
     return make_images(rows["camera"], reading.t0_ns, reading.warnings)
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """The rows of images, which are copied into the folder; InputError for features, which cannot be written."""
+    """The rows of images, which are copied to the folder; InputError for features, which cannot be written."""
     if not isinstance(stream, ImageStream):
-        raise InputError(f"{writing.log}: camera holds features, expected the images in which they were found")
+        raise InputError(f"{writing.log}: camera holds features, expected the images they were computed from")
     return {
         "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
     }
 
 
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:
-    """Put the images into the new folder ``camera`` of a log's ``folder``, and return their names there, by their numbers.
-
-    They are copies: whoever edits one does not edit the other. InputError names one that is gone.
-    """
+    """Copy the images into the new folder ``camera`` in ``folder``, numbered, and return their names. InputError if one is
+    missing."""
     target = folder / FOLDER
     target.mkdir()
     names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
@@ -73,7 +71,7 @@ def write_images(files: Sequence[Path], folder: Path) -> list[str]:
 
 
 def _image(folder: Path, source: str, name: str) -> Path | None:
-    """The path of an image below ``folder``; None if there is no such file."""
+    """The path of an image in ``folder``, or None if there is no such file."""
     try:
         path = inside(folder, name, source)
     except NoFileNameError:

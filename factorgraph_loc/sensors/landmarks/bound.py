@@ -1,4 +1,4 @@
-"""Identified landmarks as a sensor of a run."""
+"""The landmark sensor of a run."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from factors.update import Correction
 
 GOING_BACK = 5.0  # s that an estimator may go back in time
 SURVEYED_ITERATIONS = 4
-SEARCH_INTERVAL = 1.0  # s between searches while there is a suspicion
+SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
 
 
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
-    """Landmarks that were seen at one time: those of the map as one term, and each other one as a term. ``surveyed``: some of these
-    have a survey, which a first look from afar is too far from to be linearised but once."""
+    """Landmarks seen at one time: one term for those of the map, and one term for each other landmark. ``surveyed``: some have a
+    survey prior, which requires several linearisations if the first sighting is from afar."""
 
     surveyed: bool = False
 
@@ -46,7 +46,7 @@ class LandmarkObservation(ResidualObservation):
 
     @property
     def measured(self) -> BearingRangeFactor:
-        """All of them as one factor, wherever they are."""
+        """All landmarks as one factor."""
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
@@ -56,7 +56,7 @@ class LandmarkObservation(ResidualObservation):
             if factor.estimated and term.blocks[0] in values:
                 parameters = np.zeros((len(poses), len(PARAMETERS)))
                 parameters[:, list(factor.estimated)] = values[term.blocks[0]]
-            if factor.free:  # a landmark that is elsewhere is as a robot that is elsewhere
+            if factor.free:  # an error of the landmark's position is equivalent to one of the robot's
                 places = values[term.blocks[-1]]
                 factor, at = replace(factor, points=places[:1]), poses.copy()
                 at[:, :2] -= places - places[0]
@@ -68,7 +68,7 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """Those of the map at the time that they were seen."""
+        """The landmarks of the map, on the pose at the time of the measurement."""
         if self.blocks:
             return None
         factor = self.measured
@@ -77,7 +77,7 @@ class LandmarkObservation(ResidualObservation):
         )
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """The same on the pose alone: constants of the sensor are held, other landmarks are as uncertain as ``spreads`` say."""
+        """The observation on the pose only: constants are fixed, other landmarks have covariances ``spreads``."""
         fixed = []
         for term in self.terms:
             factor = cast(BearingRangeFactor, term.factor)
@@ -90,8 +90,8 @@ class LandmarkObservation(ResidualObservation):
 
 
 class LandmarkSensor(Sensor):
-    """Landmarks as all estimators take them in. ``use`` of the map: see :class:`KnownLandmarks`; what is not of the map becomes a
-    block ``bearing_range/NAME`` once two sightings agree where it is."""
+    """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
+    ``bearing_range/NAME`` once two sightings agree on its position."""
 
     modality = "bearing_range"
     lost = "landmarks were not where they were expected"
@@ -100,7 +100,7 @@ class LandmarkSensor(Sensor):
         setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
         self.constants, self._motion = constants, motion
         self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices, carries=True)
-        # what is seen before the start is counted when it is used there
+        # sightings before the start are counted when they are used there
         self._sought = KnownLandmarks(setup, Diagnostics())
         self._shared = (self.modality,) if constants.names else ()
         self._new: NewLandmarks[tuple[float, LandmarkObservation]] = NewLandmarks()
@@ -117,7 +117,7 @@ class LandmarkSensor(Sensor):
             block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
-            if view.value(block) is None:  # the estimator does without
+            if view.value(block) is None:  # the estimator does not estimate it
                 here = replace(factor, points=position[None], point_covariances=spread[None], free=False)
                 terms.append(Term(here, self._shared, 2))
             else:
@@ -139,7 +139,7 @@ class LandmarkSensor(Sensor):
                 yield new
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """A landmark that no block stands for: it comes in when an earlier sighting agrees, at where it is seen now."""
+        """A new landmark if an earlier sighting agrees with this one, with its position from this sighting."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         point, (by_pose, *others), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
         here = (view.t, LandmarkObservation(t, (term,)))
@@ -180,7 +180,7 @@ class LandmarkSensor(Sensor):
 
 
 class LandmarkFinder:
-    """A :class:`~factorgraph_loc.sensors.base.Finder` by landmarks: hypotheses from the last minute, and a monitor of the track."""
+    """A :class:`~factorgraph_loc.sensors.base.Finder`: hypotheses from the sightings of the last minute, and a track monitor."""
 
     at_once = False
 
@@ -208,7 +208,7 @@ class LandmarkFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """Since when most landmarks are not where they are expected."""
+        """The time since which most landmarks are not where they are predicted."""
         return self._monitor.suspicious_since
 
     def look(self, m: BearingRange, odometry: ChainState) -> bool:
@@ -242,7 +242,7 @@ class LandmarkFinder:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """The sensor of a run, None where it is not used; its time offset cannot differ from particle to particle."""
+    """The sensor of a run, or None if it is not used. With particles its time offset is not estimated."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

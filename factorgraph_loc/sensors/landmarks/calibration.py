@@ -1,4 +1,4 @@
-"""A sensor of identified landmarks: its constants and scatter, from sightings at the poses of the reference."""
+"""Calibration of constants and noise of a landmark sensor, from sightings at reference poses."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
-INLIER = 4.0  # standard deviations beyond which a sighting has no part in the scatter
+INLIER = 4.0  # standard deviations above which a sighting is excluded from the scatter
 LAGS = np.concatenate(([0.0], np.geomspace(0.15, 60.0, 16)))  # s, edges of the bins of the autocorrelation
-NEIGHBOURS = 200  # of a sighting, in its track, that the autocorrelation looks at
-MIN_PAIRS = 30  # in a bin, below which it says nothing
+NEIGHBOURS = 200  # sightings of the same landmark used for the autocorrelation of each
+MIN_PAIRS = 30  # minimum number per bin
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """K sightings of landmarks of the map: stamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2), ``ranges`` and ``bearings``
-    (K,), and the number of the landmark in the map, ``track`` (K,)."""
+    """K sightings of landmarks of the map: timestamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2), ``ranges`` and
+    ``bearings`` (K,), and ``track`` (K,), the index of the landmark in the map."""
 
     log: Log
     t: Array
@@ -37,7 +37,7 @@ class Sightings:
     track: Integers
 
     def thinned(self, count: int) -> Sightings:
-        """About ``count`` of them, all of a stamp or none: every so many stamps."""
+        """About ``count`` of the sightings, by keeping every n-th timestamp."""
         _, stamp = np.unique(self.t, return_inverse=True)
         return self._part(stamp % max(1, round(len(self.t) / count)) == 0)
 
@@ -48,13 +48,13 @@ class Sightings:
         return self._part(early), self._part(~early)
 
     def residuals(self, settings: BearingRangeSettings) -> Array:
-        """Range and bearing (K, 2), predicted less measured, in standard deviations; zero where not measured."""
+        """Range and bearing residuals (K, 2), predicted minus measured, in standard deviations; zero if not measured."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
-        """The same in m and rad, NaN where not measured."""
+        """The residuals in m and rad, NaN if not measured."""
         out = self.residuals(settings) * bearing_range.sigmas(settings.model(), self.ranges)
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
@@ -67,10 +67,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How alike neighbouring residuals of one landmark are, of range and bearing (2,).
+    """Autocorrelation of the residuals of a landmark, for range and bearing (2,).
 
     ``next_one``: correlation of consecutive sightings; ``time`` [s]: until it falls below 1/e; ``lags`` (B,) [s] and ``function``
-    (B, 2). NaN where there are too few.
+    (B, 2). NaN if there are too few sightings.
     """
 
     next_one: Array
@@ -80,7 +80,7 @@ class Correlation:
 
 
 def sightings_of(log: Log) -> Sightings:
-    """The sightings of landmarks of the map where the reference has poses, with a margin for the clocks."""
+    """The sightings of mapped landmarks within the reference, with a margin for clock offsets."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
     assert log.reference is not None
@@ -95,7 +95,7 @@ def sightings_of(log: Log) -> Sightings:
 
 
 def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> tuple[Constant, ...]:
-    """What may be fitted; neutral are the values of the rig. Without the reference's heading this is the range scale alone."""
+    """The constants that may be fitted, with the rig's values as neutral ones; only the range scale without reference headings."""
     has_range = any(np.isfinite(one.ranges).any() for one in seen)
     has_bearing = any(np.isfinite(one.bearings).any() for one in seen)
     has_heading = all(one.log.reference is not None and one.log.reference.has_heading for one in seen)
@@ -114,19 +114,19 @@ def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> t
 
 
 def could_be_depths(seen: Sequence[Sightings]) -> bool:
-    """Whether the logs can tell distances from depths along one axis: there must be bearings beside the ranges."""
+    """Whether distances and depths can be distinguished, which requires bearings and ranges."""
     return any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in seen)
 
 
 def range_spread(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """Robust standard deviation of the ranges' residuals [m]."""
+    """Robust standard deviation of the range residuals [m]."""
     return float(spread(np.concatenate([one.errors(settings) for one in seen]))[0])
 
 
 def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> BearingRangeSettings:
-    """The settings with the scatter of the residuals as noise: maximum likelihood of the inliers.
+    """The settings with noise set to the maximum-likelihood scatter of the inliers.
 
-    The variance of a range is that of a constant and of a share of the range.
+    The variance of a range is that of a constant error plus that of an error proportional to the range.
     """
     errors = np.concatenate([one.errors(settings) for one in seen])
     ranges = np.concatenate([one.ranges for one in seen])
@@ -145,7 +145,7 @@ def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> B
 
 
 def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
-    """Autocorrelation of the residuals of one log within the track of each landmark, outliers left out."""
+    """Autocorrelation of the residuals of each landmark in one log, without outliers."""
     whitened = seen.errors(settings) / bearing_range.sigmas(settings.model(), seen.ranges)
     whitened[np.abs(whitened) > INLIER] = np.nan
     count = len(LAGS) - 1
@@ -174,7 +174,7 @@ def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
 
 
 def _falls(lags: Array, function: Array) -> float:
-    """The lag at which the correlation falls below 1/e; the last lag looked at where it never does."""
+    """The lag at which the correlation falls below 1/e, or the last lag."""
     known = np.flatnonzero(np.isfinite(function))
     if not len(known):
         return float("nan")
@@ -190,7 +190,7 @@ def _falls(lags: Array, function: Array) -> float:
 
 
 def _range_scatter(errors: Array, ranges: Array) -> tuple[float, float]:
-    """Standard deviation of a range: constant part [m] and share of the range."""
+    """Standard deviation of a range: constant part [m] and relative part."""
     constant, relative = float(spread(errors[:, None])[0]), 0.0
     for _ in range(5):
         inside = np.abs(errors) < INLIER * np.hypot(constant, relative * ranges)

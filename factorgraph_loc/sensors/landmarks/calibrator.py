@@ -1,4 +1,4 @@
-"""How a sensor of landmarks is calibrated: by its sightings from the poses of the reference, and by the EKF's errors."""
+"""The calibrator of a landmark sensor, from sightings at reference poses and the EKF's errors."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,27 +18,27 @@ from factorgraph_loc.sensors.landmarks.figures import correlation_figure, sighti
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 
 MIN_SIGHTINGS = 100
-MOST_SIGHTINGS = 12000  # of a log that have a part in fits
-# ranges are taken to be of the other kind, distance or depth, if then their spread is below this share
+MOST_SIGHTINGS = 12000  # per log in fits
+# ranges are of the other kind, distance or depth, if that reduces their spread below this share
 BETTER_KIND = 0.9
-ROUNDS = 2  # of constants and scatter in turn
+ROUNDS = 2  # of fitting constants and scatter in turn
 RANGE_KIND = "range_kind"
 SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
-FIRST = BearingRangeSettings(range_sigma=0.1)  # of which nothing is known
+FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
 SCATTER = Unit("bearing_range", tuple(SIGMAS))
 
 
 @dataclass(frozen=True)
 class SensorFit(ConstantsFound):
-    """The parts are thinned out of all sightings that were ``seen``. ``settings``: with all constants and their scatter, of the
-    kind of ranges that fits best."""
+    """The parts are thinned from all sightings ``seen``. ``settings``: with all constants and the scatter, for the kind of ranges
+    that fits best."""
 
     settings: BearingRangeSettings = FIRST
     seen: tuple[Sightings, ...] = ()
 
 
 class LandmarkCalibrator(ConstantsCalibrator):
-    """See the module."""
+    """The calibrator of a landmark sensor."""
 
     section, channel, is_consistent = "bearing_range", "bearing_range", True
     noise = (SCATTER,)
@@ -56,7 +56,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first = FIRST
 
     def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> SensorFit | None:
-        """The constants of the sensor, of logs with sightings."""
+        """The constants of the sensor, from logs with sightings."""
         if self.channel not in logs[0].streams:
             return None
         seen, before = tuple(_sightings(log) for log in logs), self.settings(rig)
@@ -73,7 +73,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def _fit_and_scatter(
         self, seen: Sequence[Sightings], before: BearingRangeSettings
     ) -> tuple[Fit, BearingRangeSettings]:
-        """All constants of the sensor and its scatter, in turn."""
+        """Fit all constants and the scatter in turn."""
         constants = sightings.constants_of(seen, before)
         start = {c.name: c.neutral for c in constants}
         settings = sightings.with_scatter(seen, before)
@@ -84,7 +84,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return everything, settings
 
     def base(self, found: SensorFit, rig: Rig, accepted: Collection[str] | None) -> BearingRangeSettings:
-        """The settings with the scatter of all constants together, of the kind of ranges that is accepted."""
+        """The settings with the scatter of all constants, for the accepted kind of ranges."""
         settings = found.settings.model_copy(update={c.name: c.neutral for c in found.everything.constants})
         if accepted is None or f"{self.section}.{RANGE_KIND}" in accepted:
             return settings
@@ -100,7 +100,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         *,
         by_log: bool,
     ) -> Settled:
-        """With the scatter that is left, and how alike neighbouring errors are."""
+        """The result with the remaining scatter and the autocorrelation of errors."""
         settings = sightings.with_scatter(found.parts, base)
         before, notes = rig.bearing_range, []
         if before is not None and settings.range_kind != before.range_kind:
@@ -109,19 +109,19 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return Settled({self.section: settings}, learnt, notes, correlations)
 
     def constant_units(self, found: SensorFit, kept: Sequence[Learnt], learnt: Rig, start: Rig) -> dict[Unit, float]:
-        """Constants of another kind of ranges are none of this one."""
+        """The units; constants of another kind of ranges are left out."""
         if learnt.bearing_range.range_kind == self.settings(start).range_kind:
             return super().constant_units(found, kept, learnt, start)
         return {Unit(self.section, (*(c.name for c in kept), RANGE_KIND)): float("inf")}
 
     def inflated(self, rig: Rig, factor: float) -> Rig:
-        """The rig with the sensor's sigmas multiplied, at most to their bounds."""
+        """The rig with the sensor's standard deviations multiplied, limited to their bounds."""
         settings = rig.bearing_range
         update = {name: factor * getattr(settings, name) for name in SIGMAS}
         return rig.model_copy(update={self.section: settings.model_copy(update=update)})
 
     def document(self, told: Told) -> dict[str, Any]:
-        """The factor on the noise, and how alike neighbouring errors are."""
+        """The factor on the noise, and the autocorrelation of errors."""
         return {
             "noise_factor": None if told.trial is None else told.trial.factor,
             "correlation": {
@@ -131,32 +131,32 @@ class LandmarkCalibrator(ConstantsCalibrator):
         }
 
     def told_noise(self, told: Told) -> list[str]:
-        """The scatter, and what the rig has of it."""
+        """The scatter, and the noise in the rig."""
         scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
         if told.found is None or scatter is None or settings is None:
             return []
         out = []
         if SCATTER not in told.accepted:
-            out.append("<p>The noise of the sightings is refused: the rig has that of the input.</p>")
+            out.append("<p>The noise of the sightings is rejected: the rig keeps that of the input.</p>")
         rows = [
             (f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(settings, n))) for n, unit in SIGMAS.items()
         ]
         out.append(table(("noise of the sightings", "scatter", "in the rig"), rows))
         if trial is not None and SCATTER in told.accepted:
             out.append(
-                f"<p>The scatter was multiplied by {trial.factor:.2f}: then the EKF's errors are as large as it says "
+                f"<p>The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
                 f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
             )
         return out
 
     def told_residuals(self, told: Told) -> list[str]:
-        """Of the sightings, and how alike neighbouring ones are."""
+        """The residuals of the sightings and their autocorrelation."""
         if told.found is None:
             return []
         return [
-            "<h2>How alike neighbouring errors are</h2>",
-            "<p>Estimators take errors as independent. Where the correlation is far above 0, many sightings say little more than "
-            "one, and the noise in the rig must be larger than the scatter.</p>",
+            "<h2>Correlation of consecutive errors</h2>",
+            "<p>Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
+            "information than one, and the noise in the rig must be larger than the scatter.</p>",
             table(*_correlations(told)),
             "<h2>Residuals of the sightings</h2>",
             image(sightings_figure(told.found.seen, told.learnt.bearing_range)),
@@ -165,11 +165,11 @@ class LandmarkCalibrator(ConstantsCalibrator):
 
 
 def _sightings(log: Log) -> Sightings:
-    """The sightings of a log; InputError if they are too few."""
+    """The sightings of a log; InputError if there are too few."""
     seen = sightings.sightings_of(log)
     if len(seen.t) < MIN_SIGHTINGS:
         raise InputError(
-            f"{log.name}: has {len(seen.t)} sightings of landmarks of the map while there is a reference, "
+            f"{log.name}: has {len(seen.t)} sightings of mapped landmarks within the reference, "
             f"expected {MIN_SIGHTINGS} or more"
         )
     return seen

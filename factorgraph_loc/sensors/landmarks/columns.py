@@ -7,17 +7,17 @@ BEARING_RANGE = Table(
     (
         STAMP,
         named("landmark", "the name of a landmark"),
-        # radios that got no answer say 0, and gross errors may lie below: no measurement then
+        # radios report 0 without an answer, and gross errors may be negative: these are missing values
         number(
             "range",
             LENGTH,
             -LONGEST_RANGE,
             LONGEST_RANGE,
-            "distance; below 0.001 it is left out",
+            "distance; a value below 0.001 is skipped",
             may_lack=True,
             left_out_below=NEAREST,
         ),
-        number("bearing", ANGLE, -FULL_TURN, FULL_TURN, "direction in the sensor's frame", may_lack=True),
+        number("bearing", ANGLE, -FULL_TURN, FULL_TURN, "direction in the sensor frame", may_lack=True),
     ),
     "one measurement",
     stream="factorgraph_loc.sensors.landmarks.stream:BearingRangeStream",

@@ -1,4 +1,4 @@
-"""What a run can do with landmarks, in words."""
+"""Descriptions of what a run can do with landmarks."""
 
 from collections.abc import Sequence
 
@@ -11,15 +11,15 @@ from factorgraph_loc.sensors.usage import Use
 
 
 def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
-    """What ``sensors`` could find in the map, and the words for that nothing of it was."""
+    """The kind of map elements that ``sensors`` could detect, and the message if none were detected."""
     if log.world.landmarks and "bearing_range" in sensors:
         return "landmarks", "no landmark of the map was seen"
     return None
 
 
 def check(use: Use) -> None:
-    """InputError where landmarks are to be estimated (by the setting ``landmarks`` of the estimator) and no sighting tells where
-    one is, nor is of one that the map keeps: all would be ignored."""
+    """InputError if landmarks are to be estimated (setting ``landmarks`` of the estimator) but no sighting determines the
+    position of one or shows a landmark of the map."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     stream = log.streams.get("bearing_range")
     if wanted == "known" or "bearing_range" not in use.sensors:
@@ -33,6 +33,6 @@ def check(use: Use) -> None:
     lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
     name = use.estimator
     raise InputError(
-        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be placed; give a map of "
+        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be located; give a map of "
         f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
     )

@@ -1,4 +1,4 @@
-"""What is drawn of landmarks."""
+"""Plots of landmarks."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from factorgraph_loc.sensors.marks import Marks
 
 
 def draw(log: Log) -> Marks:
-    """The landmarks of the map, on the floor, and when a range or bearing of one is measured."""
+    """The landmarks of the map, on the floor, and the times of their sightings."""
     places = log.world.positions()
     positions = np.column_stack((places, np.zeros(len(places))))
     stream = log.streams.get("bearing_range")

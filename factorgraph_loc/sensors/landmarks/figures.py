@@ -1,4 +1,4 @@
-"""Plots of what the calibration of a landmark sensor left over, as PNG images."""
+"""Plots of the residuals of the calibration of a landmark sensor, as PNG images."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.text import plain
 from factors.landmarks import model as bearing_range
 
-_SHOWN = 3000  # dots of a log in a panel
-_VIEW = 5.0  # robust standard deviations; what lies beyond is drawn at the edge
+_SHOWN = 3000  # dots per log and panel
+_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
 
 
 def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> bytes:
@@ -46,7 +46,7 @@ def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) 
 
 
 def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correlation]) -> bytes:
-    """Autocorrelation of the residuals of one landmark, of each log."""
+    """Autocorrelation of the residuals of one landmark, for each log."""
     columns = [(0, "range"), (1, "bearing")]
     columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in correlations)]
     figure, axes = grid(1, max(1, len(columns)), 4.0)

@@ -1,12 +1,11 @@
-"""Where the robot is, from identified landmarks alone: for an unknown start, and after being carried elsewhere.
+"""Localization from identified landmarks alone, for an unknown start and a kidnapped robot.
 
-The sightings of the last seconds are chained by odometry to the present. Poses that few of them determine are candidates (one
-landmark: a circle around it; two: the alignment of two points); each is scored against all sightings by the robust likelihood,
-the best are refined by Gauss-Newton, and those that remain apart are hypotheses. Their weights are posterior probabilities
-under a flat prior, by Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6):
-likelihood times the volume of the mode. Where the start is known but for its heading, it takes the place of the flat prior, and
-candidates are made from it too. Hypotheses made from few features and tested by the others: Jensfelt, Kristensen,
-IEEE Transactions on Robotics and Automation 17(5), 2001.
+The sightings of the last minute are related to the present pose by odometry. Candidate poses are generated from few of them (one
+landmark: a circle around it; two: the alignment of two points) and scored against all sightings by the robust likelihood; the
+best are refined by Gauss-Newton, and those that remain distinct are hypotheses. Their weights are posterior probabilities by
+Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6): likelihood times the volume
+of the mode, under a flat prior or, if the start position is known, under that. Generating hypotheses from few features and
+testing them with the others: Jensfelt, Kristensen, IEEE Transactions on Robotics and Automation 17(5), 2001.
 """
 
 from __future__ import annotations
@@ -28,30 +27,30 @@ from factors.motion import ChainState
 from factors.se2 import Array
 from factors.update import GATE
 
-DURATION = 60.0  # s, how far back sightings count
-INTERVAL = 1.0  # s: errors of one landmark's sightings closer than that are nearly the same, so that they count as one
-ROWS = 60  # the newest sightings that count
-REFINED = 24  # candidates
-# Mahalanobis distances squared: of poses that are one hypothesis, and of one from where its sightings together lead
+DURATION = 60.0  # s of sightings that are used
+INTERVAL = 1.0  # s; closer sightings of a landmark have nearly equal errors and count once
+ROWS = 60  # newest sightings that are used
+REFINED = 24  # number of refined candidates
+# squared Mahalanobis distances: between equal hypotheses, and between one and the joint solution of its sightings
 SAME, DIVERGED = 9.0, 25.0
 NEGLIGIBLE = 1e-3  # weight of a hypothesis
-MARGIN = 5.0  # m, how far beyond the landmarks of the map the robot may be
-WIDE = 3.0  # m, standard deviation of a hypothesis that is no Gaussian
-# what a hypothesis must explain to refute a track: that many landmarks and that share of the sightings, and so much more of them
+MARGIN = 5.0  # m; distance from the landmarks of the map at which the robot may be
+WIDE = 3.0  # m; standard deviation above which a hypothesis is not treated as Gaussian
+# to refute a track a hypothesis must explain: that many landmarks, that share of the sightings, and so many more of them
 REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
 
 CLEAR_WEIGHT = 0.99
-# the largest standard deviations of a clear hypothesis: m (or that of a single range, where this is larger), rad
+# largest standard deviations of an unambiguous hypothesis: m (or that of a range, if larger), rad
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
 CLEAR_SIGHTINGS = 4
-FOUND_HEADING = 0.3  # rad, of a heading where the position was known: there is no other place to take it for
+FOUND_HEADING = 0.3  # rad; for a known start position, where only the heading can be confused
 
 
 @dataclass(frozen=True)
 class Hypothesis(Mode):
     """A mode whose weight is its posterior probability.
 
-    ``explained``: how many sightings lie within the gate; ``share``: of all; ``landmarks``: of how many different ones.
+    ``explained``: number of sightings within the gate; ``share``: relative to all; ``landmarks``: number of different landmarks.
     """
 
     explained: int
@@ -60,7 +59,7 @@ class Hypothesis(Mode):
 
 
 class Relocalizer:
-    """Hypotheses of the present pose from the last sightings; see the module. ``positions`` (L, 2): of the map's landmarks."""
+    """Hypotheses of the present pose from recent sightings; see the module. ``positions`` (L, 2): of the map's landmarks."""
 
     def __init__(self, motion: Motion, positions: Array) -> None:
         self._motion = motion
@@ -71,27 +70,27 @@ class Relocalizer:
         self._window: Window | None = None
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._best: PosePrior | None = None
-        self.start: KnownPosition | None = None  # where the robot began, while its heading is sought
+        self.start: KnownPosition | None = None  # known start position while the heading is sought
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Those of the last search, the likeliest first."""
+        """The hypotheses of the last search, most likely first."""
         return self._hypotheses
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last sighting if one hypothesis is clear, else None."""
+        """The pose at the last sighting if one hypothesis is unambiguous, else None."""
         return self._best
 
     @property
     def status(self) -> Status:
-        """``unlocalized`` without a hypothesis, ``localized`` if one is clear."""
+        """``unlocalized`` without hypotheses, ``localized`` if one is unambiguous, else ``ambiguous``."""
         if self._best is not None:
             return "localized"
         return "ambiguous" if self._hypotheses else "unlocalized"
 
     def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
-        """Take the landmarks seen when the odometry was at ``odometry``; late ones, and those taken before, may come again."""
+        """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
         self._model = seen.model
         for point, distance, bearing in zip(seen.points, seen.ranges, seen.bearings, strict=True):
             rows = self._sightings.setdefault((float(point[0]), float(point[1])), [])
@@ -109,7 +108,7 @@ class Relocalizer:
                 del self._sightings[key]
 
     def search(self) -> None:
-        """Find the hypotheses for the time of the last sighting."""
+        """Find the hypotheses at the time of the last sighting."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
         earlier, before = self._hypotheses, self._window
         self._hypotheses, self._best, self._window = (), None, None
@@ -132,8 +131,8 @@ class Relocalizer:
         self._best = self._clear(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last sighting, drawn from the hypotheses; in place of those that are too wide to be Gaussian, from
-        the likelihood of that sighting alone (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
+        """Poses (N, 3) at the last sighting, sampled from the hypotheses; those too wide to be Gaussian are replaced by samples
+        from the likelihood of that sighting (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
         if self._window is None:
             return np.empty((0, 3))
         narrow = [h for h in self._hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
@@ -146,9 +145,9 @@ class Relocalizer:
         return np.concatenate(poses)
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: the clear
-        hypothesis explains nearly all sightings, and far more of them. Landmarks that the map has in wrong places also
-        agree on some place, but on one that the others speak against."""
+        """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: an
+        unambiguous hypothesis explains nearly all sightings, and far more than the track. Wrongly mapped landmarks may also
+        agree on a pose, but the others contradict it."""
         if self._best is None or self._window is None:
             return False
         if self._hypotheses[0].share < REFUTING_SHARE or self._hypotheses[0].landmarks < REFUTING_LANDMARKS:
@@ -159,7 +158,7 @@ class Relocalizer:
         return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: Window, poses: Array, covariances: Array) -> Array:
-        """Log of the prior probability (N,) of modes with these body-frame covariances (N, 3, 3)."""
+        """Log prior probability (N,) of modes with body-frame covariances (N, 3, 3)."""
         volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
@@ -167,7 +166,7 @@ class Relocalizer:
     def _weighed(
         self, window: Window, poses: Array, covariances: Array, squared: Array, logs: Array
     ) -> tuple[Hypothesis, ...]:
-        """Those that differ, with their posterior probabilities beside that of being elsewhere, where nothing is explained."""
+        """Distinct hypotheses with posterior probabilities; the alternative is a pose outside that explains nothing."""
         covariances = se2.body_to_world(poses, covariances)
         kept: list[int] = []
         for i in np.argsort(-logs):
@@ -191,13 +190,13 @@ class Relocalizer:
         )
 
     def _clear(self, window: Window) -> PosePrior | None:
-        """The likeliest hypothesis if it is clear, with the moments of all its sightings together."""
+        """The most likely hypothesis if it is unambiguous, with the moments of the joint solution of its sightings."""
         if not self._hypotheses:
             return None
         best = self._hypotheses[0]
         if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
             return None
-        # one landmark alone may be a wrong one, unless the start agrees with it
+        # a single landmark may be misidentified, unless the start agrees
         if best.explained < CLEAR_SIGHTINGS or best.landmarks < (2 if self.start is None else 1):
             return None
         pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
@@ -212,7 +211,7 @@ class Relocalizer:
 
 
 def _thinned(rows: list[Sighting]) -> list[Sighting]:
-    """Of the sightings of one landmark those that lie an interval apart, and the last."""
+    """Sightings of one landmark that are at least an interval apart, and the last one."""
     kept = rows[:1]
     for row in rows[1:]:
         if row.odometry.t >= kept[-1].odometry.t + INTERVAL:
@@ -221,7 +220,7 @@ def _thinned(rows: list[Sighting]) -> list[Sighting]:
 
 
 def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
-    """Indices of at most ``count`` poses (N, 3) in the order of their losses (N,), without those near a better one."""
+    """Indices of at most ``count`` poses (N, 3) by increasing loss (N,), without those near a better one."""
     kept: list[int] = []
     losses = losses.copy()
     while len(kept) < count and np.isfinite(losses).any():
@@ -233,7 +232,7 @@ def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.
 
 
 def _distance(pose: Array, other: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance between two poses (3,) under a covariance (3, 3) in the world's frame."""
+    """Squared Mahalanobis distance between poses (3,) with covariance (3, 3) in the world frame."""
     difference = pose - other
     difference[2] = se2.wrap_scalar(difference[2])
     return float(positive.squared(difference, covariance))

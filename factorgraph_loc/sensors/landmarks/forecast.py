@@ -1,6 +1,6 @@
-"""What would be seen of landmarks on the way, and how well it would agree with each particle: the part of landmarks in planning.
+"""Expected information and simulated sightings of landmarks along a path, for planning.
 
-The sightings of one look are as one with the mean of all, of less noise. Landmarks that are not seen tell nothing.
+Repeated sightings from one pose are replaced by their mean with reduced noise. Landmarks out of sight add nothing.
 """
 
 import math
@@ -24,8 +24,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class LandmarkForecast:
-    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of sightings, ``looks_per_metre``, of what is in sight as ``settings``
-    tell but for the rate."""
+    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` for landmarks, ``looks_per_metre``; visibility follows ``settings``."""
 
     world: World
     model: BearingRangeModel
@@ -34,7 +33,7 @@ class LandmarkForecast:
     goals: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Of the landmarks in sight."""
+        """Information of the visible landmarks."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
         by_pose, _, _ = bearing_range.jacobians(self.model, poses[n], points[k])
@@ -45,7 +44,7 @@ class LandmarkForecast:
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """By sightings that are drawn, of as many looks at each place as are made about it."""
+        """Weigh particles by simulated sightings."""
         looks, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
         for s in range(len(poses)):
@@ -63,7 +62,7 @@ class LandmarkForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> LandmarkForecast | None:
-    """Of a robot that drives at ``speed`` [m/s], with the settings of a simulation; None if it has no such sensor or the map no
+    """The forecast for a robot with ``speed`` [m/s], with the settings of a simulation; None without a landmark sensor or
     landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None

@@ -1,4 +1,4 @@
-"""Where single sightings put landmarks, in the robot's frame."""
+"""Positions of landmarks from single sightings, in the robot frame."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors.landmarks.model import located, sigmas
 from factors.se2 import Array
 
-STEP = 1e-6  # m or rad, of numerical derivatives
+STEP = 1e-6  # m or rad; of numerical derivatives
 
 
 class LocatedLandmark(NamedTuple):
-    """A ``landmark`` that was seen at ``t`` [s of the log] at ``point`` (2,) [m], with ``covariance`` (2, 2) [m^2]."""
+    """A ``landmark`` seen at ``t`` [s of the log] at ``point`` (2,) [m] with ``covariance`` (2, 2) [m^2], in the robot frame."""
 
     t: float
     landmark: str
@@ -24,8 +24,8 @@ class LocatedLandmark(NamedTuple):
 
 
 def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
-    """The landmarks of ``names`` whose range and bearing were measured at once; none if the log's sightings are not among the
-    ``sensors``, or its rig does not know that sensor."""
+    """The landmarks in ``names`` for which range and bearing were measured at once; empty if the log's sightings are not among
+    ``sensors``, or its rig lacks the sensor."""
     stream, settings = log.streams.get("bearing_range"), log.rig.find(BearingRangeSettings)
     if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
         return []

@@ -10,10 +10,9 @@ from factors.se2 import Array
 
 
 class Landmark(FileModel):
-    """A point landmark: position [m] in the world's frame, and how well it is known.
+    """A point landmark: position [m] in the world frame and its uncertainty.
 
-    ``sigma``: standard deviation of its survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], in place of ``sigma``, where
-    the map was made from a log and the errors in x and y differ or go together.
+    ``sigma``: standard deviation of the survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], instead of ``sigma``.
     """
 
     x: Coordinate

@@ -1,4 +1,4 @@
-"""Whether landmarks can be mapped from the sightings of a log."""
+"""Checks whether landmarks can be mapped from a log."""
 
 import numpy as np
 
@@ -9,17 +9,17 @@ from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 
 
 def mappable(log: Log) -> str | None:
-    """The layer of a world that can be made from a log's sightings, if it has some."""
+    """The map layer that can be made from a log's sightings, or None."""
     return "landmarks" if "bearing_range" in log.streams else None
 
 
 def check(log: Log) -> None:
-    """InputError if no landmark can be located from what the log's sightings hold."""
+    """InputError if the log's sightings cannot locate any landmark."""
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream) or not len(stream.t):
-        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so that there is nothing to map")
+        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
     if log.rig.find(BearingRangeSettings) is None:
-        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and place")
+        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
     if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
         lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
         raise InputError(

@@ -1,4 +1,4 @@
-"""What a sensor of identified landmarks reports."""
+"""Measurements of identified landmarks."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,7 +10,7 @@ from factors.se2 import Array
 class BearingRange:
     """Identified landmarks seen at one time.
 
-    ``landmarks``: K names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor's frame]: NaN where not measured.
+    ``landmarks``: K names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor frame]: NaN if not measured.
     """
 
     sensor: ClassVar[str] = "bearing_range"
@@ -23,5 +23,5 @@ class BearingRange:
 
     @property
     def count(self) -> int:
-        """How many landmarks were seen."""
+        """Number of landmarks seen."""
         return len(self.landmarks)

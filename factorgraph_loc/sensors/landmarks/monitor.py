@@ -1,4 +1,4 @@
-"""Whether a track is lost: told by the innovations of the landmarks."""
+"""Detection of a lost track by the innovations of landmarks."""
 
 import numpy as np
 
@@ -6,16 +6,16 @@ from factors import positive
 from factors.se2 import Array
 from factors.update import GATE, Sightings
 
-STAMPS, DURATION = 4, 2.0  # at least as many, over at least so many seconds
-KEPT = 100  # stamps
+STAMPS, DURATION = 4, 2.0  # minimum number of timestamps, and their duration in s
+KEPT = 100  # timestamps
 BEYOND = 2.0  # times the gate
 SHARE = 0.6  # of the landmarks
 
 
 class TrackMonitor:
-    """Whether the innovations of a track say that it is lost: most landmarks of the last stamps lie far beyond the gate.
+    """Detects that most landmarks of the last timestamps are far outside the gate.
 
-    That is a suspicion: landmarks of a wrong map look the same. Whether there is a better place a :class:`Relocalizer` tells.
+    That is only a suspicion, because a wrong map looks the same. A :class:`Relocalizer` tells whether there is a better pose.
     """
 
     def __init__(self) -> None:
@@ -24,11 +24,11 @@ class TrackMonitor:
 
     @property
     def suspicious_since(self) -> float | None:
-        """When most landmarks began to lie beyond, None if all is well."""
+        """The time since which most landmarks are outside, or None."""
         return self._since
 
     def add(self, t: float, seen: Sightings, pose: Array, covariance: Array) -> None:
-        """Take the landmarks of a stamp, with the ``pose`` (3,) predicted there and its body-frame ``covariance`` (3, 3)."""
+        """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = seen.whitened([pose])
         spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
         squared = positive.squared(residual, spread)
@@ -42,17 +42,17 @@ class TrackMonitor:
             self._since = None
 
     def clear(self) -> None:
-        """Forget the stamps: the track begins anew."""
+        """Forget the history: a new track starts."""
         self._stamps.clear()
         self._since = None
 
     def _beginning(self) -> float:
-        """The change point: as many landmarks as can be beyond from there on, and within before."""
+        """The change point: it maximises the number of landmarks outside after and inside before it."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 
     def _last(self) -> list[tuple[float, int, int]]:
-        """The fewest last stamps that are enough to judge by, none if there are too few."""
+        """The fewest last timestamps that are sufficient, empty if there are too few."""
         for i in range(len(self._stamps) - STAMPS, -1, -1):
             if self._stamps[i][0] <= self._stamps[-1][0] - DURATION:
                 return self._stamps[i:]

@@ -1,4 +1,4 @@
-"""Landmarks that the map lacks: when one is taken in, and where it is."""
+"""Initialization of landmarks that are not in the map."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from factors import positive
 from factors.se2 import Array
 from factors.update import GATE
 
-MAX_PENDING = 5  # sightings that wait for another to agree
+MAX_PENDING = 5  # sightings per landmark that wait for another to agree
 
 Sighting = TypeVar("Sighting")
 
 
 @dataclass(frozen=True)
 class NewLandmarks(Generic[Sighting]):
-    """Sightings of landmarks that are not taken in yet: that needs two that agree where it is, as one may be an outlier.
+    """Sightings of landmarks that are not initialized yet: two must agree on the position, because one may be an outlier.
 
-    A value: filters go back to an earlier one when a measurement is late.
+    Immutable, because filters go back to an earlier state when a measurement is late.
     """
 
     pending: Mapping[str, tuple[tuple[Array, Array, Sighting], ...]] = field(default_factory=dict)
@@ -27,8 +27,8 @@ class NewLandmarks(Generic[Sighting]):
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighting
     ) -> tuple[NewLandmarks[Sighting], Sighting | None]:
-        """With a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2): what waits from now on, and an
-        earlier sighting that agrees, or None."""
+        """Add a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2). Returns the new pending sightings,
+        and an earlier sighting that agrees, or None."""
         waiting = self.pending.get(name, ())
         for earlier, spread, candidate in reversed(waiting):
             apart = point - earlier

@@ -1,4 +1,4 @@
-"""Identified landmarks, as all estimators take them in."""
+"""Factors of identified landmarks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from factors.update import Correction
 
 
 class KnownLandmarks:
-    """Turns measurements into factors; what the map or the rig lacks is counted as ignored.
+    """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
 
-    ``use`` of the map: ``known`` takes its landmarks as they are and ignores others, ``extended`` estimates the others, ``unknown``
-    estimates all, as if there were no map. ``estimated``: places of the sensor's constants that are estimated. ``carries``: the
-    estimator knows where landmarks of the map are whose survey is not exact; else that widens the noise.
+    ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
+    estimates all landmarks without the map. ``estimated``: indices of the sensor's constants that are estimated. ``carries``:
+    whether the estimator estimates landmarks with an inexact survey; otherwise the survey's covariance is added to the noise.
     """
 
     def __init__(
@@ -49,15 +49,15 @@ class KnownLandmarks:
 
     @property
     def known(self) -> bool:
-        """Whether there is a sensor of landmarks, and a landmark in the map."""
+        """Whether there is a landmark sensor and the map has landmarks."""
         return self._model is not None and bool(self._positions)
 
     def factor(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
     ) -> BearingRangeFactor | None:
-        """The factor of the known landmarks, on the pose at its time, or on the one that lies ``offset`` before it.
+        """The factor of the known landmarks, on the pose at the measurement's time or on one that lies ``offset`` before it.
 
-        ``twist`` (3,): the robot's velocity then, where the sensor's time offset is estimated.
+        ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
         """
         if self._model is None:
             self._diagnostics.ignore("bearing_range", len(m.landmarks))
@@ -82,7 +82,7 @@ class KnownLandmarks:
     def surveyed(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
     ) -> list[tuple[str, BearingRangeFactor]]:
-        """The landmarks of the map whose survey is not exact by name, each with a factor on the pose and its position."""
+        """The landmarks with an inexact survey by name, each with a factor on the pose and its position."""
         if self._model is None or not self._carries or not self._surveys:
             return []
         told = ~(np.isnan(m.range) & np.isnan(m.bearing))
@@ -91,7 +91,7 @@ class KnownLandmarks:
         return [(m.landmarks[i], replace(factor, free=True)) for i, factor in zip(rows, free, strict=True)]
 
     def survey(self, name: str) -> tuple[Array, Array]:
-        """Position (2,) and covariance (2, 2) of a landmark, as the map has them."""
+        """Position (2,) and covariance (2, 2) of a landmark in the map."""
         return self._positions[name], self._surveys[name]
 
     def others(
@@ -133,7 +133,7 @@ class KnownLandmarks:
         )
 
     def _count(self, m: BearingRange) -> int:
-        """How many landmarks of a measurement are used: those of the map with either value, others with both."""
+        """Number of usable landmarks: those of the map with either value, others with both."""
         lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
         return sum(
             not (no_range and no_bearing)
@@ -152,7 +152,7 @@ class KnownLandmarks:
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
-    """Factors on one pose alone, of one measurement, as one."""
+    """Merge the factors of one measurement on one pose."""
     first, *others = factors
     if not others:
         return first

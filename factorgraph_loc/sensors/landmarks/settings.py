@@ -1,4 +1,4 @@
-"""Settings of a sensor of identified landmarks in the rig."""
+"""Rig settings of a landmark sensor."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -11,12 +11,12 @@ from factors.landmarks.model import PARAMETERS, BearingRangeModel
 
 
 class BearingRangeUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way."""
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
     y: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
     bearing_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
-    range_scale: Annotated[float, Field(ge=0.0, le=1.0, description="as a share")] = 0.0
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
     depth_axis: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
     time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
 
@@ -24,8 +24,8 @@ class BearingRangeUncertainty(FileModel):
 class BearingRangeSettings(SensorSettings):
     """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model.
 
-    A landmark whose position was surveyed with a larger sigma than ``exact_survey`` times ``range_sigma`` is estimated on the way,
-    with its survey as the prior; others are taken as exact.
+    A landmark with a survey sigma above ``exact_survey`` times ``range_sigma`` is estimated with its survey as prior; others are
+    treated as exact.
     """
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
@@ -33,14 +33,14 @@ class BearingRangeSettings(SensorSettings):
     y: Offset = 0.0
     heading: Angle = 0.0
     bearing_bias: Angle = 0.0
-    range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported over true")] = 1.0
+    range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported divided by true")] = 1.0
     range_kind: Annotated[Literal["distance", "depth"], Field(description="depth: along one axis only")] = "distance"
-    depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor's frame")] = 0.0
+    depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor frame")] = 0.0
     range_sigma: Annotated[float, Field(ge=1e-4, le=10.0, description="m")]
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
     bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad, not degrees")] = 0.05
     robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
-    exact_survey: Annotated[float, Field(ge=0.0, le=10.0, description="as a share of range_sigma")] = 0.2
+    exact_survey: Annotated[float, Field(ge=0.0, le=10.0, description="relative to range_sigma")] = 0.2
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
 
     def model(self) -> BearingRangeModel:

@@ -1,4 +1,4 @@
-"""Range and bearing of landmarks in sight, drawn from the model of a rig."""
+"""Simulated range and bearing of visible landmarks, from the model of a rig."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +32,7 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """How often per second a simulated drive looks for all landmarks; ValueError without a sensor for them."""
+    """Rate [Hz] of the simulated sightings; ValueError without a landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with bearing_range")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
@@ -46,13 +46,13 @@ def sighting_stream(
     settings: SightingSettings,
     rng: np.random.Generator,
 ) -> BearingRangeStream:
-    """What the sensor reports at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in view and not behind a wall."""
+    """Sightings at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in the field of view and not behind a wall."""
     points, names = world.positions(), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
     ranges, bearings = bearing_range.predict(model, poses[n], points[k])
     sigma = bearing_range.sigmas(model, ranges)
     noise = sigma * rng.standard_normal((len(n), 2))
-    # a range is above zero whatever the noise
+    # a range is positive whatever the noise
     ranges = np.maximum(ranges + noise[:, 0], 1e-3)
     return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
 
@@ -60,7 +60,7 @@ def sighting_stream(
 def in_sight(
     model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which of ``poses`` (N, 3) see which landmarks: places (K,) in both."""
+    """Visible pairs of ``poses`` (N, 3) and landmarks: indices (K,) of both."""
     points = world.positions()
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors[:, None], points[None])
@@ -74,7 +74,7 @@ def in_sight(
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSightings:
-    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor`: one look at the landmarks at a time."""
+    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor` of landmarks."""
 
     model: BearingRangeModel
     world: World
@@ -85,17 +85,17 @@ class SimulatedSightings:
 
     @property
     def rate(self) -> float:
-        """Looks per second."""
+        """Measurement rate [Hz]."""
         return self.settings.rate
 
     def measure(self, t: float, pose: Array) -> BearingRange:
-        """A look at ``t``."""
+        """The sightings at ``t``."""
         seen = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
         return BearingRange(t, tuple(seen.landmark), seen.range, seen.bearing)
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
-    """The sensor of a rig; None if it has none, or the world no landmarks."""
+    """The sensor of a rig, or None if the rig lacks it or the world has no landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     return SimulatedSightings(rig.of(BearingRangeSettings).model(), world, settings.sightings, rng)

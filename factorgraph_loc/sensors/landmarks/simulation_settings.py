@@ -1,4 +1,4 @@
-"""What is simulated of a sensor of landmarks."""
+"""Simulation settings of a landmark sensor."""
 
 from typing import Annotated
 
@@ -9,8 +9,8 @@ from factorgraph_loc.model.simulation_units import Hertz, Metres
 
 
 class SightingSettings(FileModel):
-    """When landmarks are seen: ``rate`` looks per second, up to ``max_range``, within ``field_of_view`` [rad] about the sensor's
-    axis, and not through walls."""
+    """Visibility of landmarks: ``rate`` measurements per second, up to ``max_range``, within ``field_of_view`` [rad] about the
+    sensor's axis, and not through walls."""
 
     rate: Hertz = 2.0
     max_range: Metres = 6.0

@@ -1,4 +1,4 @@
-"""The rows of a sensor of identified landmarks."""
+"""The stream of a landmark sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class BearingRangeStream(ScanStream):
-    """One row a landmark: its name, range [m] and bearing [rad] (NaN where not measured). Rows of one stamp belong together."""
+    """Rows of landmarks: name, range [m] and bearing [rad], NaN if not measured. Rows of one timestamp form one measurement."""
 
     kind: ClassVar[type[Any]] = BearingRange
     landmark: Sequence[str]

@@ -1,9 +1,8 @@
-"""What the sightings of landmarks in a log hold, and what looks wrong with them and with the map.
+"""Summary of the landmark sightings in a log, with warnings about them and the map.
 
-Where there is a reference, each landmark's position is also estimated from its own sightings, taken from the reference poses:
-by the robust median where range and bearing are measured, by robust trilateration from ranges alone. A landmark whose map position
-lies far from that is a suspect. Sightings are also compared with where the reference says that their landmarks are, at shifts of
-time.
+With a reference, the position of each landmark is also estimated from its sightings at the reference poses: by the robust median
+of ranges and bearings, or by robust trilateration from ranges alone. A landmark far from its map position is a suspect. Sightings
+are also compared with the predictions from the reference at various time shifts.
 """
 
 from collections import Counter
@@ -24,19 +23,20 @@ from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
-MIN_SIGHTINGS = 10  # below these nothing is said about a landmark
-MIN_OFFSET = 0.5  # m; survey errors below this do no harm that a robust estimator could not bear
+MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
+MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 MIN_PASSES = 3
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
-PASS = 10.0  # s; errors of sightings in one pass are not independent, so passes are counted, not sightings
-MOST = 2000  # sightings that are compared at shifts of time
-_REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
-_ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
+PASS = 10.0  # s; errors within a pass are correlated, so passes are counted, not sightings
+MOST = 2000  # sightings that are compared at time shifts
+_REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
+_ROUNDING = 1e-6  # s; tolerance of differences of timestamps
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A landmark that its sightings put elsewhere: ``offset`` (2,) [m] from the map; ``swapped_with``: whose place that seems."""
+    """A landmark with a wrong position in the map: ``offset`` (2,) [m] from there; ``swapped_with``: landmark at whose position
+    it is."""
 
     landmark: str
     offset: Array
@@ -45,13 +45,15 @@ class Suspect:
 
     def __str__(self) -> str:
         distance = float(np.hypot(*self.offset))
-        text = f"landmark {self.landmark}: {self.sightings} sightings put it {distance:.2f} m from its place in the map"
+        text = (
+            f"landmark {self.landmark}: {self.sightings} sightings put it {distance:.2f} m from its position in the map"
+        )
         return f"{text}; swapped with {self.swapped_with}?" if self.swapped_with else text
 
 
 def summarize(log: Log) -> Summary:
-    """Landmarks that are never seen (``unseen``), the count of sightings by name that the map lacks (``unknown``), and landmarks
-    that their sightings put elsewhere (``suspects``)."""
+    """Landmarks that are never seen (``unseen``), the number of sightings by name that the map lacks (``unknown``), and landmarks
+    with a wrong position in the map (``suspects``)."""
     unseen, unknown = _unmatched(log)
     suspects = find_suspects(log)
     problems = [
@@ -65,10 +67,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """The landmarks that their sightings from the reference poses put elsewhere than the map does; none without a reference.
-
-    The map is doubted beyond ``MIN_OFFSET`` and beyond five standard errors.
-    """
+    """The landmarks whose position from sightings at reference poses differs from the map by more than ``MIN_OFFSET`` and five
+    standard errors; none without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, seen in _seen_from_reference(log).items():
         passes = len(np.unique(seen.t // PASS))
@@ -86,7 +86,7 @@ def find_suspects(log: Log) -> tuple[Suspect, ...]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Sightings of one landmark from the reference: times (N,), poses of the sensor (N, 3), calibrated range and bearing (N,)."""
+    """Sightings of one landmark from the reference: times (N,), sensor poses (N, 3), calibrated ranges and bearings (N,)."""
 
     t: Array
     sensors: Array
@@ -99,7 +99,7 @@ class _Seen:
 
 
 def _seen_from_reference(log: Log) -> dict[str, _Seen]:
-    """The sightings with a range, by landmark of the map, where the reference has poses."""
+    """The sightings with a range, by landmark of the map, within the reference."""
     stream = log.streams.get("bearing_range")
     if (
         log.reference is None
@@ -124,7 +124,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
 
 
 def _by_range_and_bearing(seen: _Seen) -> tuple[Array, float]:
-    """Median of the positions that each sighting implies, and their robust standard deviation [m]."""
+    """Median of the positions from the sightings, and their robust standard deviation [m]."""
     rows = np.isfinite(seen.bearings)
     direction = seen.sensors[rows, 2] + seen.bearings[rows]
     points = seen.sensors[rows, :2] + seen.ranges[rows, None] * np.stack(
@@ -135,7 +135,7 @@ def _by_range_and_bearing(seen: _Seen) -> tuple[Array, float]:
 
 
 def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
-    """Robust trilateration from the map's place, and the spread that, over sqrt(passes), is its standard error [m]."""
+    """Robust trilateration from the map's position, and the spread [m], whose standard error is the spread over sqrt(passes)."""
 
     def residual(point: Array) -> Array:
         away: Array = seen.sensors[:, :2] - point
@@ -151,7 +151,7 @@ def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
 
 
 def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
-    """The other suspect, where each of the two is seen nearer to the other's place than to its own."""
+    """The other suspect if each of the two is nearer to the other's map position than to its own."""
     for other in implied:
         if other != name:
             mine, theirs = _place(world, name), _place(world, other)
@@ -171,7 +171,7 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
-    """Landmarks of the map that are never seen, and the count of sightings of names that the map lacks."""
+    """Landmarks of the map that are never seen, and the number of sightings by name that the map lacks."""
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream):
         return (), {}
@@ -181,7 +181,7 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[str]:
-    """A line, if sightings of mapped landmarks fit the reference better at another time."""
+    """A warning if sightings of mapped landmarks fit the reference better at another time."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []

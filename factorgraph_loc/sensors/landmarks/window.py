@@ -1,4 +1,4 @@
-"""The last sightings of landmarks as constraints on the present pose, many poses at a time."""
+"""Recent sightings of landmarks as constraints on the present pose, vectorised over poses."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from factors.landmarks.model import BearingRangeModel, jacobians, located, resid
 from factors.motion import ChainState
 from factors.se2 import Array
 
-RECENT = 6  # landmarks from whose last sightings candidates are made
+RECENT = 6  # landmarks whose last sightings generate candidates
 CIRCLE = 72  # candidates around a landmark
-HEADINGS = 24  # of each of them, where no bearing tells the heading
-RADII = (0.7, 1.5, 3.0, 6.0)  # m, where no range tells the distance
-BASELINE = 0.3  # m, of two landmarks that are aligned
+HEADINGS = 24  # per candidate, if there is no bearing
+RADII = (0.7, 1.5, 3.0, 6.0)  # m, if there is no range
+BASELINE = 0.3  # m; minimum distance of two landmarks that are aligned
 FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the flat prior: 1/m^2, 1/m^2, 1/rad^2
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """One landmark, seen when the odometry was at ``odometry``; ``point`` (2,) is its place in the map."""
+    """A landmark seen at ``odometry``; ``point`` (2,) is its position in the map."""
 
     odometry: ChainState
     point: Array
@@ -33,8 +33,8 @@ class Sighting:
 
 
 class Window:
-    """K sightings as constraints on the present pose, and the start where that is known but for its heading. ``now``: the odometry
-    at the last one; ``points`` (K, 2): in the map."""
+    """K sightings as constraints on the present pose, and the start if its position is known. ``now``: the odometry at the last
+    one; ``points`` (K, 2): in the map."""
 
     def __init__(
         self, model: BearingRangeModel, rows: list[Sighting], motion: Motion, start: KnownPosition | None = None
@@ -46,19 +46,19 @@ class Window:
         self._ranges, self._bearings = np.array([(r.range, r.bearing) for r in rows]).T
         since = [motion.relative(r.odometry, self.now) for r in rows]
         self._forth = np.array([i.delta for i in since])
-        self._back = se2.inverse(self._forth)  # the pose at each sighting in the frame of the present one
-        self._carried = se2.adjoint(self._forth)  # of a perturbation of the present pose to that at the sighting
+        self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present one
+        self._carried = se2.adjoint(self._forth)  # from a perturbation of the present pose to that at the sighting
         self._covariance = np.array([i.covariance for i in since])
         self._drift = self._carried @ self._covariance @ self._carried.transpose(0, 2, 1)
         self._missing = np.isnan(np.column_stack((self._ranges, self._bearings)))
         self._sigmas = sigmas(model, self._ranges)
 
     def starts(self) -> Array:
-        """Present poses (N, 3) that come from the start, none where that is not known."""
+        """Present poses (N, 3) from the start position, empty if it is unknown."""
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Present poses (N, 3) that put the landmark seen last on its range and bearing, in all directions from it."""
+        """Present poses (N, 3) that agree with the last seen landmark, on a circle around it."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -66,7 +66,7 @@ class Window:
         return self._placed(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Present poses (N, 3) drawn from the start, where that is not known from the likelihood of the last sighting alone."""
+        """Present poses (N, 3) sampled from the start, or from the likelihood of the last sighting if that is unknown."""
         if self._start is not None:
             return self._start.drawn(rng, count, self.now)
         k, noise = len(self.points) - 1, rng.standard_normal((2, count))
@@ -80,13 +80,13 @@ class Window:
         return self._placed(k, headings, ranges, bearings)
 
     def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Present poses (N, 3) that had the headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
+        """Present poses (N, 3) that had headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         there = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - there, headings)), self._forth[k])
 
     def alignments(self) -> Array:
-        """Present poses (N, 3) that put two landmarks seen with range and bearing where the map has them."""
+        """Present poses (N, 3) that align two landmarks with range and bearing with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
         there, here = self.points[pairs], self._from_present()[pairs]
@@ -99,15 +99,15 @@ class Window:
         return np.asarray(poses[wide])
 
     def grain(self) -> Array:
-        """Covariance (3, 3) of what a candidate stands for: the distance to its neighbours, and the noise it was made from."""
+        """Covariance (3, 3) of the region of a candidate: the spacing of candidates and the noise they were generated from."""
         heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
         distances = self._ranges[~self._missing[:, 0]]
         position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
         return np.diag(np.square((position, position, heading)))
 
     def whitener(self, spread: Array | None = None) -> Array:
-        """Whiteners (K, 2, 2) of the residuals, for the noise widened by the odometry's error, and by that of the present pose,
-        with body-frame covariance ``spread`` (3, 3). The geometry is that of the measured range and bearing."""
+        """Whitening matrices (K, 2, 2) of the residuals for the sensor noise, the odometry error, and the error of the present
+        pose with body-frame covariance ``spread`` (3, 3), all linearised at the measured range and bearing."""
         error = self._drift
         if spread is not None:
             error = error + self._carried @ spread @ self._carried.transpose(0, 2, 1)
@@ -116,7 +116,7 @@ class Window:
         )
         jacobian[self._missing] = 0.0
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
-        # without a bearing the direction of the range is not known: the worst
+        # without a bearing the direction of the range is unknown: use the worst case
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
         covariance[:, 0, 0] = np.where(self._missing[:, 1], 1.0 + worst, covariance[:, 0, 0])
         return positive.whitener(covariance)
@@ -126,14 +126,14 @@ class Window:
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, spread: Array | None = None) -> Array:
-        """Losses (N,) of present poses (N, 3): the robust ones of the sightings, and that of the start."""
+        """Losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the start."""
         found: Array = robust_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return found if self._start is None else found + self._start.loss(poses, self.now, spread)
 
     def refined(
         self, poses: Array, whitener: Array, iterations: int, spread: Array | None = None
     ) -> tuple[Array, Array]:
-        """Poses (N, 3) after iterations of Levenberg and Marquardt on the losses, with body-frame covariances (N, 3, 3)."""
+        """Poses (N, 3) after Levenberg-Marquardt iterations on the losses, with body-frame covariances (N, 3, 3)."""
         damping = np.full((len(poses), 1, 1), 1e-2)
         loss = self.losses(poses, whitener, spread)
         for _ in range(iterations):
@@ -148,11 +148,11 @@ class Window:
         return poses, np.asarray(np.linalg.inv(self._normal_equations(poses, whitener, spread)[0]))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """A hypothesis (3,) after Gauss-Newton with the odometry's errors taken as what they are, common to all sightings before
-        them; and its body-frame covariance (3, 3). The path is marginalised out: with weighted Jacobians J by it, of covariance C,
-        residuals e have the covariance R = 1 + J C J', and those along the most likely path are R^-1 e."""
+        """A hypothesis (3,) after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3). The path is
+        marginalised: with its covariance C and whitened Jacobians J by it, residuals e have the covariance R = 1 + J C J', and
+        those along the most likely path are R^-1 e."""
         covariances = self._covariance
-        if self._start is not None:  # the first row, of which no robust loss takes anything
+        if self._start is not None:  # the first row, which has no robust loss
             covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
         rows = np.arange(len(covariances))
         common = covariances[np.maximum(rows[:, None], rows)]
@@ -177,33 +177,34 @@ class Window:
         return pose, covariance
 
     def _recent(self) -> list[int]:
-        """The last sighting of each landmark, the newest first."""
+        """The last sighting of each landmark, newest first."""
         last = {tuple(p): k for k, p in enumerate(self.points.tolist())}
         return sorted(last.values(), reverse=True)[:RECENT]
 
     def _from_robot(self) -> Array:
-        """The landmarks (K, 2) in the robot's frame when seen; a missing range is taken as medium, a missing bearing as zero."""
+        """The landmarks (K, 2) in the robot frame when seen; a missing range is replaced by a medium one, a missing bearing by
+        0."""
         ranges = np.where(self._missing[:, 0], RADII[2], self._ranges)
         return located(self._model, ranges, np.where(self._missing[:, 1], 0.0, self._bearings))
 
     def _from_present(self) -> Array:
-        """The same (K, 2) in the robot's present frame."""
+        """The landmarks (K, 2) in the present robot frame."""
         return se2.transform_from(self._back, self._from_robot())
 
     def _residuals(self, poses: Array) -> Array:
-        """Residuals (N, K, 2) in units of the sensor's noise at present poses (N, 3)."""
+        """Residuals (N, K, 2) in standard deviations of the sensor at present poses (N, 3)."""
         at = se2.compose(poses[:, None], self._back)
         return residuals(self._model, at, self.points, self._ranges, self._bearings)
 
     def _jacobians(self, poses: Array) -> Array:
-        """Those of the residuals (N, K, 2, 3) by the present pose's perturbation."""
+        """Jacobians (N, K, 2, 3) of the residuals by the perturbation of the present pose."""
         at = se2.compose(poses[:, None], self._back)
         jacobian = jacobians(self._model, at, self.points)[0] / self._sigmas[..., None]
         jacobian[:, self._missing] = 0.0
         return np.asarray(jacobian @ self._carried)
 
     def _normal_equations(self, poses: Array, whitener: Array, spread: Array | None) -> tuple[Array, Array]:
-        """Robustly weighted information (N, 3, 3), with that of a nearly flat prior or of the start, and gradient (N, 3)."""
+        """Robustly weighted information (N, 3, 3), including that of a nearly flat prior or the start, and gradient (N, 3)."""
         jacobian = whitener @ self._jacobians(poses)
         error = (whitener @ self._residuals(poses)[..., None])[..., 0]
         weight = robust_weight(np.sum(error**2, axis=-1), self._model.robust)

@@ -28,9 +28,9 @@ INCREMENTS = Table(
     "odometry",
     (
         STAMP,
-        within("dx", LENGTH, LONGEST_WAY, "way ahead since the row before"),
-        within("dy", LENGTH, LONGEST_WAY, "way to the left since the row before"),
-        within("dtheta", ANGLE, MOST_TURNED, "turn since the row before"),
+        within("dx", LENGTH, LONGEST_WAY, "forward motion since the row before"),
+        within("dy", LENGTH, LONGEST_WAY, "motion to the left since the row before"),
+        within("dtheta", ANGLE, MOST_TURNED, "rotation since the row before"),
     ),
     "one each",
     stream="factorgraph_loc.sensors.odometry.stream:IncrementStream",
@@ -41,12 +41,15 @@ IMU = Table(
     "one each",
     stream="factorgraph_loc.sensors.odometry.stream:YawRateStream",
 )
-# of what counters of wheels told; made into increments
+# wheel counters, which are converted to increments
 WAYS = Table(
     "odometry",
     (
         STAMP,
-        *(within(side, LENGTH, 1e9, "way of that wheel so far; counters hold 32 bits") for side in ("left", "right")),
+        *(
+            within(side, LENGTH, 1e9, "distance of that wheel so far; counters have 32 bits")
+            for side in ("left", "right")
+        ),
     ),
     "one each",
 )

@@ -1,4 +1,4 @@
-"""What wheel odometry and gyro report."""
+"""Measurements of wheel odometry and gyro."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,7 +19,7 @@ class VelocityOdometry:
 
 @dataclass(frozen=True, slots=True)
 class IncrementOdometry:
-    """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot's frame at the previous row."""
+    """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at the previous row."""
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"

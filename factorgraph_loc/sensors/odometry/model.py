@@ -6,15 +6,15 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
 from factors.odometry.model import OdometryModel
 
-# m, rad, s: how long the error of a constant acts before what is seen corrects it
+# m, rad, s: over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 
 
 def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
     """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
 
-    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants, whose error then is in its
-    noise: as of a random walk that after :data:`WAY`, :data:`TURN` or :data:`TIME` has the variance of the constant's effect.
+    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants: their errors are part of the noise,
+    as a random walk that reaches the variance of the constant's effect after :data:`WAY`, :data:`TURN` or :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()

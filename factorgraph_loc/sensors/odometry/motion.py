@@ -1,4 +1,4 @@
-"""The odometry of a run, as all estimators take it in."""
+"""The odometry of a run."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from factors.odometry.model import PARAMETERS, OdometryFactor, between_factor
 from factors.se2 import Array
 
 HORIZON = 5.0  # s of odometry that are kept
-UNUSED = {"imu": "yaw rate", "twist": "motion in space"}  # what is said of rows of a sensor that is not used
-TWIST_TIME = 0.1  # s over which the velocity is taken
+UNUSED = {"imu": "yaw rate", "twist": "motion in space"}  # reason why rows of an unused sensor are ignored
+TWIST_TIME = 0.1  # s over which the velocity is averaged
 
 
 class Motion:
-    """Odometry rows in, relative motion between any two recent times out.
+    """The motion sensor (:class:`~factorgraph_loc.model.motion.Motion`) made of wheel odometry.
 
-    A gyro replaces the rotation of the wheels where ``sensors`` name it (``imu``).
-    ``self_calibration``: the uncertain constants of the odometry are estimated; else their error is part of the noise.
+    A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``self_calibration``: the uncertain constants of
+    the odometry are estimated; otherwise their error is part of the noise.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Motion:
         self._diagnostics = diagnostics
 
     def keep(self, horizon: float) -> None:
-        """Keep the odometry of the last ``horizon`` seconds, as far as it is there yet."""
+        """Keep the odometry of the last ``horizon`` seconds."""
         self.horizon = self._chain.horizon = horizon
 
     def _new_chain(self) -> OdometryChain:
@@ -52,7 +52,7 @@ class Motion:
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
     def add(self, m: Measurement) -> None:
-        """Take a row; one of a sensor that is not used is counted as ignored, one older than what is kept as late."""
+        """Add a row. A row of an unused sensor is counted as ignored, one older than the kept rows as late."""
         match m:
             case YawRate() if self._use_gyro:
                 kept = self._chain.add_yaw_rate(m.t, m.w)
@@ -73,20 +73,20 @@ class Motion:
         return self._chain.relative(start, end)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """``delta`` (3,) of an increment under changed ``constants`` (P,), and the Jacobian (3, P) of its perturbation."""
+        """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """An increment under changed ``constants`` (P,)."""
+        """An increment corrected for ``constants`` (P,)."""
         if not self.constants.names:
             return increment
         delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Poses (R, 3) at times (R,), before or after, in the frame of the pose at ``start``, under changed ``constants`` (P,),
-        taken as :func:`factors.odometry.model.recalibrated` does."""
+        """Poses (R, 3) at times (R,) relative to the pose at ``start``, for ``constants`` (P,), linearised as in
+        :func:`factors.odometry.model.recalibrated`."""
         states = self._chain.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
@@ -98,17 +98,17 @@ class Motion:
         return np.asarray(se2.exp(moved))
 
     def factor(self, increment: Increment) -> OdometryFactor:
-        """An increment as a factor on two poses, and on the constants where there are any."""
+        """An increment as a factor on two poses, and on the constants if there are any."""
         return OdometryFactor(increment, self.constants.indices)
 
     def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
-        """An increment without constants as a factor of GTSAM's on two poses."""
+        """An increment without constants as a GTSAM factor on two poses."""
         return between_factor(*keys, increment)
 
     def _full(self, constants: Array) -> Array:
         return self.constants.full(constants, len(PARAMETERS))
 
     def twist(self, t: float) -> Array:
-        """The robot's velocity (3,) just before ``t``, in its own frame."""
+        """The robot's velocity (3,) just before ``t``, in the robot frame."""
         moved = self.relative(self.state(t - TWIST_TIME), self.state(t))
         return np.asarray(se2.log(moved.delta) / TWIST_TIME)

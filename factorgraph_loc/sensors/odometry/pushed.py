@@ -1,4 +1,4 @@
-"""Wheel odometry that a program hands over."""
+"""Validation of pushed wheel odometry."""
 
 import math
 
@@ -10,7 +10,7 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 
 
 class Increments:
-    """Increments, whose meaning depends on their order."""
+    """Checks that increments are in order of time."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         self._newest = -math.inf

@@ -1,4 +1,4 @@
-"""Settings of wheel odometry and gyro in the rig."""
+"""Rig settings of wheel odometry and gyro."""
 
 from typing import Annotated, ClassVar
 
@@ -11,7 +11,7 @@ from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
-    """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) passed."""
+    """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) elapsed."""
 
     per_distance: Noise = 0.0
     per_rotation: Noise = 0.0
@@ -22,8 +22,7 @@ class GrowthSettings(FileModel):
 
 
 class OdometryNoise(FileModel):
-    """How the error grows: along the track [m], across it [m], in heading [rad]. What is not given is that of wheels of which
-    nothing is known, indoors."""
+    """Growth of the error: along the track [m], across it [m], in heading [rad]. The defaults are for unknown indoor wheels."""
 
     along: GrowthSettings = GrowthSettings(per_distance=0.05, per_time=0.005)
     lateral: GrowthSettings = GrowthSettings(per_distance=0.02, per_time=0.005)
@@ -31,9 +30,9 @@ class OdometryNoise(FileModel):
 
 
 class OdometryUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; one above 0 is estimated on the way.
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated.
 
-    Those of the scales are shares of the scale; that of the heading-rate bias is in rad/s, that of the drift in rad/m.
+    Those of the scales are relative; that of the heading-rate bias is in rad/s, that of the drift in rad/m.
     """
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
@@ -48,7 +47,7 @@ class OdometrySettings(SensorSettings):
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     scale_distance: Scale = 1.0
     scale_rotation: Scale = 1.0
-    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, what is reported at rest")] = 0.0
+    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, reported at rest")] = 0.0
     heading_rate_bias: Rate = 0.0
     heading_drift: Annotated[float, Field(ge=-1.0, le=1.0, description="rad/m")] = 0.0
     direction: Angle = 0.0
@@ -63,8 +62,8 @@ class OdometrySettings(SensorSettings):
 
 
 class ImuSettings(SensorSettings):
-    """The gyro: its yaw rate replaces the rotation of the wheels where an estimator is given the sensor ``imu``, of a rig without
-    these settings with the default ones."""
+    """The gyro. Its yaw rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``; a rig without these
+    settings has the default ones."""
 
     bias: Rate = 0.0
     heading: GrowthSettings = GrowthSettings(per_time=0.005)

@@ -1,6 +1,6 @@
-"""Wheel odometry made from a reference, for recordings whose own was not kept.
+"""Wheel odometry simulated from a reference, for recordings without odometry.
 
-Results with it must say that it was simulated: its errors are those of the model below, not of wheels.
+Results with it must state that it was simulated.
 """
 
 import math
@@ -27,22 +27,22 @@ DESCRIPTION = (
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The wheels of a simulated drive."""
+    """The odometry of a simulated drive."""
     return Simulated({"odometry": wheel_odometry(ride.truth, int(ride.rng("odometry").integers(2**32)))})
 
 
 def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
-    """What wheels might have reported on the way of ``reference``, from its first pose on, which is a row without motion.
+    """Simulated odometry along ``reference``, starting with a row without motion at its first pose.
 
-    With increments (dx, dy, dyaw) of the reference over 0.1 s, in the body's frame, and ds = length of (dx, dy):
+    With increments (dx, dy, dyaw) of the reference over 0.1 s, in the body frame, and ds = length of (dx, dy):
 
     - dx' = (1 + s) dx + 0.01 sqrt(ds) n1
     - dy' = (1 + s) dy + 0.005 sqrt(ds) n2
     - dyaw' = (1 + g) dyaw + b ds + radians(1.5) sqrt(ds) n3
 
     s, g ~ N(0, 0.02) and b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1). Drawn from ``default_rng(seed)`` in the
-    order s, b, g, then n1 and n2 of each row, then n3 of each row. There are no rows inside gaps of the reference of more than
-    60 s: the one behind such a gap has its whole way.
+    order s, b, g, then n1 and n2 of each row, then n3 of each row. Gaps of the reference above 60 s have no rows; the row after
+    such a gap contains its whole motion.
     """
     t = _grid(reference.t)
     count = len(t) - 1
@@ -62,7 +62,7 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
 
 
 def _grid(stamps: Array) -> Array:
-    """Times (N,) at 10 Hz from the first of ``stamps`` on; those inside long gaps are left out, as a clock may jump by days."""
+    """Times (N,) at 10 Hz from the first of ``stamps``, without long gaps, because a clock may jump by days."""
     long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
     begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
     first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)

@@ -1,4 +1,4 @@
-"""The rows of wheel odometry and gyro."""
+"""The streams of wheel odometry and gyro."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class VelocityStream(Stream):
 
 @dataclass(frozen=True)
 class IncrementStream(Stream):
-    """``dx``, ``dy``, ``dtheta`` (N,): motion since the previous row, in the robot's frame at that row."""
+    """``dx``, ``dy``, ``dtheta`` (N,): motion since the previous row, in the robot frame at that row."""
 
     rank: ClassVar[int] = 0
     kind: ClassVar[type[Any]] = IncrementOdometry
@@ -33,7 +33,7 @@ class IncrementStream(Stream):
     dtheta: Array
 
     def begun_anew(self) -> IncrementStream:
-        """The same with a first increment of zero: wheels do not feel how they are carried."""
+        """The stream with a first increment of zero, because wheels do not measure how the robot is carried."""
         moves = np.arange(len(self.t)) > 0
         return replace(self, dx=self.dx * moves, dy=self.dy * moves, dtheta=self.dtheta * moves)
 

@@ -1,6 +1,6 @@
-"""Whether what tells of the same motion agrees: odometry, gyro and reference, in time, in sign and in unit.
+"""Checks whether odometry, gyro and reference agree in time, sign and unit.
 
-Turn rates (of a reference without heading: speeds) are compared at shifts of time.
+Turn rates, or speeds if the reference has no headings, are compared at various time shifts.
 """
 
 from dataclasses import dataclass
@@ -17,28 +17,28 @@ from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStr
 from factorgraph_loc.sensors.summary import Summary
 from factors.se2 import Array
 
-WINDOW = 0.2  # s over which a rate is taken, at least
-MOVES = 0.03  # rad/s and m/s: root mean square of rates, at least
-ALIKE = 0.6  # correlation of the same motion, at least
-DEGREES = (20.0, 150.0)  # times radians
-COVERED = 0.9  # share of a log whose reference is whole
+WINDOW = 0.2  # s; minimum time over which a rate is averaged
+MOVES = 0.03  # rad/s and m/s: minimum root mean square of rates
+ALIKE = 0.6  # minimum correlation of equal motion
+DEGREES = (20.0, 150.0)  # range of the slope if one rate is in degrees
+COVERED = 0.9  # minimum share of a log that the reference should cover
 
 
 @dataclass(frozen=True)
 class Match:
-    """``shift`` [s]: how much later the one is stamped than the other; ``slope``: how many times as much it tells."""
+    """``shift`` [s]: delay of one signal to the other; ``slope``: ratio of their values."""
 
     shift: float
     slope: float
 
 
 def summarize(log: Log) -> Summary:
-    """What does not fit the odometry of a log."""
+    """Warnings about the odometry of a log."""
     return Summary(problems=motion_problems(log))
 
 
 def motion_problems(log: Log) -> list[str]:
-    """Lines on a gyro and a reference that do not fit the odometry, and on a reference that is shorter than it. Of a log with long
+    """Warnings about a gyro and a reference that contradict the odometry, and a reference that is shorter. In a log with long
     gaps the longest part between them is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -70,17 +70,16 @@ def motion_problems(log: Log) -> list[str]:
 
 
 def _longest(t: Array) -> tuple[float, float]:
-    """Begin and end of the longest time without a gap of more than :data:`~factorgraph_loc.model.ticks.TICK_GAP` between stamps
-    (N,)."""
+    """Start and end of the longest part without a gap above :data:`~factorgraph_loc.model.ticks.TICK_GAP` in timestamps (N,)."""
     parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
     longest = max(parts, key=lambda part: float(part[-1] - part[0]))
     return float(longest[0]), float(longest[-1])
 
 
 def match(rates: Array, others: Array) -> Match | None:
-    """How much later ``others`` (N,) tell what ``rates`` (N,) tell, at times ``STEP`` apart; None if they do not tell the same.
+    """Delay of ``others`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
 
-    The slope is negative where they have the opposite sign. A shift that explains hardly more than none is none.
+    The slope is negative if the signs differ. A shift that hardly improves the correlation is set to zero.
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(others)) < FEWEST:
         return None
@@ -95,7 +94,7 @@ def match(rates: Array, others: Array) -> Match | None:
 
 
 def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
-    """Correlation and slope of ``others``, ``shift`` steps later, by ``rates``; zeros where neither moves."""
+    """Correlation and slope of ``others``, ``shift`` steps later, by ``rates``; zeros without motion."""
     a = rates[max(0, -shift) : len(rates) - max(0, shift)]
     b = others[max(0, shift) : len(others) - max(0, -shift)]
     both = np.isfinite(a) & np.isfinite(b)
@@ -107,12 +106,14 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
-    """Lines on how a match differs from one of the same clock, sign and unit; ``sensor``: whose time_offset would mend it."""
+    """Warnings about a wrong clock, sign or unit; ``sensor``: the one whose time_offset would correct it."""
     if found is None:
         return []
     lines = []
     if found.slope < 0.0:
-        lines.append(f"{name} turns the other way than the odometry: angles are counter-clockwise, seen from above")
+        lines.append(
+            f"{name} turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
+        )
     size = abs(found.slope)
     if DEGREES[0] < size < DEGREES[1]:
         lines.append(f"{name} turns {size:.0f} times as much as the odometry: is it in degrees?")

@@ -1,4 +1,4 @@
-"""Wheel odometry as a stream."""
+"""Conversion of odometry tables to streams."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from factorgraph_loc.sensors.tables import Reading, stream_of
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The stream of velocities, or of increments, of which those of one stamp follow each other."""
+    """The stream of velocities or increments; rows with equal timestamps are merged."""
     told = rows["odometry"]
     if "dx" not in told.numbers:
         return stream_of(VELOCITIES, told, reading.t0_ns, reading.warnings)

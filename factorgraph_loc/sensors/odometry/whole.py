@@ -10,7 +10,7 @@ from factorgraph_loc.sensors.odometry.motion import Motion
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
-    """The motion between any two times of a log, by the odometry and gyro among ``sensors``."""
+    """The motion between any two times of a log, from the odometry and gyro among ``sensors``."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.keep(math.inf)
     for m in log.measurements(sensors):

@@ -1,4 +1,4 @@
-"""Readers of RFID tags: detection, strength and phase."""
+"""RFID readers: detection, strength and phase of tags."""
 
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

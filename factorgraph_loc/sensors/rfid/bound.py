@@ -1,4 +1,4 @@
-"""An RFID reader as a sensor of a run: what its antennas read and did not read, how strongly, and with which phase."""
+"""The RFID sensor of a run: tag reads and misses, signal strength, and phase."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ NO_RESIDUAL = np.empty((0, 1))
 
 @dataclass(frozen=True)
 class TagObservation:
-    """A likelihood of what was read, of the pose alone. ``found``: how many reads."""
+    """A likelihood of the pose from RFID. ``found``: number of reads."""
 
     t: float
     factor: RfidFactor
     found: int
-    here: TagReadCounts | None = None  # what was read and not read, from the pose at the scan's time
-    rounds: int = 0  # of antennas, of what was read and not read
+    here: TagReadCounts | None = None  # reads and misses, relative to the pose at the scan's time
+    rounds: int = 0  # antenna rounds, for reads and misses
     blocks: tuple[str, ...] = ()
     iterations: ClassVar[int] = rfid_update.ITERATIONS
 
     @property
     def is_judged(self) -> bool:
-        """What was read and not read."""
+        """Whether it is an observation of reads and misses."""
         return self.here is not None
 
     @property
     def things(self) -> frozenset[Hashable]:
-        """The tags that were read, by their places in the map."""
+        """The tags that were read, by index in the map."""
         looks = self.factor.seen
         return (
             frozenset(np.flatnonzero(looks.hits.any(axis=0)).tolist())
@@ -56,7 +56,7 @@ class TagObservation:
         )
 
     def at_its_time(self) -> Self | None:
-        """Only of what was read and not read: strength and phase have many optima."""
+        """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
         return None if self.here is None else replace(self, factor=replace(self.factor, seen=self.here))
 
     @property
@@ -71,7 +71,7 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """The most likely pose, by Fisher scoring; what else is in the state follows by correlation."""
+        """The most likely pose, by Fisher scoring; other components are corrected by their correlation."""
         own = np.ascontiguousarray(covariance[:3, :3])
         found = rfid_update.updated([self.factor], pose, own, iterations)
         delta, after = se2.log(se2.between(pose, found.pose)), found.covariance
@@ -90,11 +90,11 @@ class TagObservation:
 
 
 class TagSensor(Sensor):
-    """Scans of tags as all estimators take them in.
+    """Scans of RFID tags.
 
-    Each tells what was read and not read, then the strengths of the reads, and once a second the phases of the last ones. A silence
-    of the reader (:class:`~factorgraph_loc.sensors.rfid.monitor.Silence`) is no evidence. Only what was read and not read tells of
-    other places: strength and phase have many optima there.
+    Each scan gives an observation of reads and misses and one of the signal strengths; once per second the recent phases give
+    another one. Silence of the reader (:class:`~factorgraph_loc.sensors.rfid.monitor.Silence`) is not used as evidence. Only reads
+    and misses are used to find a pose, because strength and phase have multimodal likelihoods.
     """
 
     modality = "rfid"
@@ -109,7 +109,7 @@ class TagSensor(Sensor):
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), Silence()
-        self._heard = -math.inf  # the last scan that counted for a silence
+        self._heard = -math.inf  # last scan that was checked for silence
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         looks, likelihood = self.tags.looks(m), self.tags.likelihood
@@ -150,7 +150,7 @@ class TagSensor(Sensor):
         return True
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        # a scan without reads that comes again, as the estimator went back, counts once
+        # a scan without reads that is repeated after going back in time counts once
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
             if self._silence.add(observation.found, evidence) and not lasted:
@@ -175,7 +175,7 @@ class TagSensor(Sensor):
         self._monitor.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
-        """All reads and misses as one factor."""
+        """Merge all reads and misses into one factor."""
         looks = [seen for o in observations if isinstance(seen := o.factor.seen, TagReadCounts)]
         factors = [o.factor for o in observations if not isinstance(o.factor.seen, TagReadCounts)]
         if looks and self.tags.likelihood is not None:
@@ -183,7 +183,7 @@ class TagSensor(Sensor):
         return [Term(factor, (), ROWS) for factor in factors]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Tags count by what is known of their states at the end, and not by what was known at each scan."""
+        """The factor with the tag states as known at the end instead of at each scan."""
         tags = cast(RfidFactor, factor)
         return None if tags.is_phase and width > 1.0 else tags.with_odds(self.tags.states.odds)
 
@@ -197,6 +197,6 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """The sensor of a run; None where it is not used."""
+    """The sensor of a run, or None if it is not used."""
     sensor = TagSensor(binding.setup, binding.diagnostics)
     return sensor if sensor.tags.likelihood is not None else None

@@ -1,4 +1,4 @@
-"""What a run can do with RFID tags, in words."""
+"""Descriptions of what a run can do with RFID tags."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,20 +11,20 @@ SHOWN = 5  # names in a warning
 
 
 def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
-    """What ``sensors`` could find in the map, and the words for that nothing of it was."""
+    """The kind of map elements that ``sensors`` could detect, and the message if none were detected."""
     return ("tags", "no tag of the map was read") if log.world.tags and "rfid" in sensors else None
 
 
 def mappable(log: Log) -> str | None:
-    """The layer of a world that can be made from a log's reads, if it has some."""
+    """The map layer that can be made from a log's reads, or None."""
     return "tags" if "rfid" in log.streams else None
 
 
 def doubts(use: Use, diagnostics: Diagnostics) -> Iterator[str]:
-    """That an estimator takes no tags, that none is read, or which are believed dead at the end, the surest first."""
+    """Warnings that an estimator does not use RFID, that no tag is read, or that tags are believed dead."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
-    if rounds and use.estimator != "dead_reckoning":  # which says so by its name
-        yield f"{log.name}: {use.estimator} takes no tags: all {rounds} inventory rounds are ignored"
+    if rounds and use.estimator != "dead_reckoning":  # obvious from its name
+        yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
     if "rfid" not in use.sensors:
         return
     stream, tags = log.streams.get("rfid"), log.world.tags

@@ -1,4 +1,4 @@
-"""What is drawn of RFID tags."""
+"""Plots of RFID tags."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from factorgraph_loc.sensors.rfid.tag_map import tag_map
 
 
 def draw(log: Log) -> Marks:
-    """The tags of the map, the survey's errors corrected as the rig knows them, and when an antenna has read one."""
+    """The tags of the map, corrected by the rig's survey transform, and the times of their reads."""
     known = tag_map(log.world, log.rig.of(SurveySettings))
     stream = log.streams.get("rfid")
     t, seen = np.empty(0), tuple[str, ...]()

@@ -1,4 +1,4 @@
-"""What antennas are expected to read on the way: the part of RFID in planning."""
+"""Expected information of RFID antennas along a path, for planning."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.se2 import Array
 
-ROUNDS_PER_SECOND = 2.0  # where nothing else is said
+ROUNDS_PER_SECOND = 2.0  # default rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class RfidForecast:
 
     @property
     def goals(self) -> Array:
-        """The tags' places."""
+        """The positions of the tags."""
         return self.likelihood.tags.points[:, :2]
 
     @cached_property
@@ -35,7 +35,7 @@ class RfidForecast:
         return make_tables(self.likelihood)
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """In proportion to the rounds, whatever is read in them."""
+        """Expected information, proportional to the number of rounds."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
@@ -43,7 +43,7 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * found)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """By scans that are drawn, as many rounds as there are on the way, spread over the places."""
+        """Weigh particles by simulated scans, with the path's rounds distributed over the poses."""
         looks, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(looks + 1) * total // looks).astype(np.int64)
         found = np.empty_like(out)
@@ -53,8 +53,7 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> RfidForecast | None:
-    """Of a robot that drives at ``speed`` [m/s], with the rates of a simulation's settings; None if it has no antennas or the map
-    no tags."""
+    """The forecast for a robot with ``speed`` [m/s], with the rates of a simulation; None without antennas or tags."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     rate = ROUNDS_PER_SECOND if settings is None else settings.rounds_per_second

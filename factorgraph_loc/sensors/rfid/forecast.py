@@ -1,10 +1,10 @@
-"""Compiled loops behind :mod:`factorgraph_loc.planning.information`: what antennas would read on the way, and how well the reads
-would agree with each particle.
+"""Compiled kernels for :mod:`factorgraph_loc.planning.information`: simulated reads along a path and their likelihood for
+particles.
 
-A robot with several antennas looks from one place with all of them. So a table holds, for each place of a tag in the robot's
-frame, what all antennas would make of it: the tag is looked up once. Only reads make a difference between antennas, and they are
-few: log p(z | x) = sum of log(1 - q) over everything in reach + sum of logit(q) over the reads. Both are kept relative to what
-the floor of false reads says, so that a tag beyond reach counts nothing. False reads of tags beyond reach are not drawn.
+All antennas of a robot measure from one pose, so a table holds the result of all antennas for each tag position in the robot
+frame, and a tag is looked up once. Only reads need the individual antennas, and they are few: log p(z | x) = sum of log(1 - q) over
+all tags in range + sum of logit(q) over the reads. Both are relative to the floor of false reads, so that tags out of range
+contribute nothing. False reads of tags out of range are not simulated.
 """
 
 import math
@@ -21,23 +21,21 @@ from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed
 from factors.se2 import Array
 
 CELL = 0.15  # m, of the tables
-FACINGS = 24  # directions in which a tag may face
-LEVEL = 0.25  # m: tags at the same height, to so much, share a table
-NOTHING = (
-    1e-3  # where no antenna reads a tag with so much more than the probability of a false read, it is out of reach
-)
-MOST_LOOKS = 1 << 16  # on a path: in the numbers of draws, so that paths of all lengths share them
-ALMOST_NEVER = 1e-12  # probability of a read, where there is no floor
+FACINGS = 24  # directions of tags
+LEVEL = 0.25  # m; tags within this height range share a table
+NOTHING = 1e-3  # a tag is out of range if no antenna exceeds the probability of a false read by this
+MOST_LOOKS = 1 << 16  # per path; a stride of random numbers, so that paths of all lengths share them
+ALMOST_NEVER = 1e-12  # minimum probability of a read
 
 
 class ScanTables(NamedTuple):
-    """What A antennas read of a tag in a cell of the robot's frame, layers F (by where the tag faces, the last where that is not
-    known or does not matter) of N x N cells for each of L heights.
+    """The response of A antennas to a tag in a cell of the robot frame: layers F (facings of the tag, the last for an unknown or
+    irrelevant one) of N x N cells for each of L heights.
 
     ``read`` (L F N N, A): probability. ``gain`` (A, L F N N): its logit, and ``missed`` (L F N N): sum over antennas of log(1 - q),
-    both above those of the floor, and zero at the edge. ``silent`` (L F N N): the sum itself, but zero at the edge, where nothing
-    is drawn. ``size``: N. ``points`` (T, 2) [m], ``facing`` (T,) [rad], NaN where not known, and ``first`` (T,): the first cell
-    of each tag's tables; ``layers``: F.
+    both relative to the floor, and zero at the edge. ``silent`` (L F N N): the absolute sum, but zero at the edge. ``size``: N.
+    ``points`` (T, 2) [m], ``facing`` (T,) [rad], NaN if unknown, and ``first`` (T,): first cell of each tag's tables; ``layers``:
+    F.
     """
 
     read: Array
@@ -110,7 +108,7 @@ def _fill(packed: Packed, heights: Array, half: int, out: Array) -> None:
 
 @numba.njit(cache=True)
 def _uniform(seed: np.uint64, number: int) -> float:
-    """The draw with this number, the same for all candidates (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
+    """The random number with this index, the same for all candidates (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
     z = seed + np.uint64(number + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -122,18 +120,18 @@ def _uniform(seed: np.uint64, number: int) -> float:
 def look_poses(
     particles: Array, along: Array, steps: Places, last: Places, sigmas: Array, normals: Array, out: Array
 ) -> None:
-    """Where M particles are at S stations of a path, (S, M, 3): the start, the looks and the end.
+    """Poses of M particles at S stations of a path, (S, M, 3): the start, the measurement poses and the end.
 
-    ``particles`` (M, 3); ``along`` (P, 3): poses of the path; ``steps`` (S,): which of them are stations; ``last`` (M,): the last
-    pose that each particle reaches, where it stays; ``sigmas`` (S, 3): of the motion's noise from one station to the next, in
-    the robot's frame, with the draws ``normals`` (S, M, 3).
+    ``particles`` (M, 3); ``along`` (P, 3): poses of the path; ``steps`` (S,): indices of the stations; ``last`` (M,): index of the
+    last pose that each particle reaches, where it stays; ``sigmas`` (S, 3): motion noise between stations in the robot frame, with
+    standard normal draws ``normals`` (S, M, 3).
     """
     count = len(particles)
     errors = np.zeros((count, 3))
     for k in range(len(steps)):
         end = along[steps[k]]
         begin = along[steps[k - 1]] if k else end
-        # the earlier error, seen from the end: the adjoint of the inverse motion
+        # adjoint of the inverse motion: the earlier error seen from the end
         ce, se = math.cos(end[2]), math.sin(end[2])
         c, s = math.cos(end[2] - begin[2]), math.sin(end[2] - begin[2])
         back_x, back_y = (
@@ -158,7 +156,7 @@ def look_poses(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """In which cell a tag is seen from poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
+    """The cells in which a tag is seen from poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -190,15 +188,16 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Tempered log-likelihood (J, M) of the scans that the first J = ``scans`` particles might make on one path, for each of M.
+    """Tempered log-likelihood (J, M) of scans simulated from the first J = ``scans`` particles on one path, for each of M
+    particles.
 
-    ``poses`` (S, M, 3): where they look; ``rounds`` (S,); ``stops`` (M,): how many looks each gets to make.
+    ``poses`` (S, M, 3): measurement poses; ``rounds`` (S,); ``stops`` (M,): number of measurements of each particle.
     """
     looks, count, _ = poses.shape
     tags = len(tables.points)
     missed = tables.missed
     cells = np.empty((looks, tags, count), np.int32)
-    # what it says that no antenna reads anything, in all looks up to each
+    # log-likelihood of no reads at all, cumulated over the measurements
     silence = np.zeros((looks + 1, count), np.float32)
     turns = np.empty((2, count), np.float32)
     for k in range(looks):
@@ -222,7 +221,7 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw the reads of each scan, and add what they say."""
+    """Draw the reads of each scan, and add their log-likelihood."""
     looks, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain
@@ -254,7 +253,7 @@ def _add_reads(
 
 @numba.njit(cache=True)
 def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
-    """How many of ``count`` rounds read a tag, by inversion, and what is left of the draw, again uniform."""
+    """Number of ``count`` rounds that read a tag, by inversion, and the rest of the draw, which is uniform again."""
     p = (1.0 - q) ** count
     k = 0
     while uniform >= p and k < count:
@@ -266,8 +265,8 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
 
 @numba.njit(cache=True)
 def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
-    """Covariances (J, 3, 3) of M particles at one of the stations ``poses`` (S, M, 3), that of ``index`` (J,), with each of
-    ``weights`` (J, M). Headings are taken relative to the first particle's."""
+    """Weighted covariances (J, 3, 3) of M particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with ``weights`` (J, M).
+    Headings are relative to the first particle's."""
     count = poses.shape[1]
     d = np.empty(3)
     first, second = np.empty(3), np.empty((3, 3))
@@ -294,7 +293,7 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
 
 @numba.njit(cache=True)
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
-    """Entropies (J,) [nats] of histograms of the first ``dims`` coordinates: cells of size ``cell`` (3,); else as
+    """Entropies (J,) [nats] of histograms of the first ``dims`` coordinates with cells of size ``cell`` (3,); otherwise as
     :func:`covariances`."""
     stations, count, _ = poses.shape
     volume = 0.0
@@ -321,7 +320,7 @@ def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, d
 
 @numba.njit(cache=True)
 def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
-    """Numbers (M,) of the cells, below M, the same for particles in one cell: a hash table with open addressing."""
+    """Cell indices (M,) below M, equal for particles in one cell: a hash table with open addressing."""
     count = len(poses)
     size = 1
     while size < 4 * count:

@@ -1,4 +1,4 @@
-"""Learnt detection grids on disk: ``.npz`` without pickles."""
+"""Files of learnt detection grids: ``.npz`` without pickles."""
 
 from pathlib import Path
 
@@ -11,15 +11,12 @@ from factorgraph_loc.files.npz import read_npz
 from factors.rfid.model import GridModel
 
 FARTHEST = 1000.0  # m from the antenna
-FINEST = 1e-3  # m from knot to knot
-LARGEST = 20.0  # of a logit: beyond it a probability is 0 or 1 to nine digits, and nothing could ever move it
+FINEST = 1e-3  # m; minimum distance of knots
+LARGEST = 20.0  # of a logit; the probability is 0 or 1 to nine digits
 
 
 def read_grid(path: str | Path) -> GridModel:
-    """Read a grid; logits that are infinite (a probability of exactly 0 or 1) are taken as very large ones.
-
-    InputError names what is missing or has a wrong shape.
-    """
+    """Read a grid; infinite logits are clipped. InputError names what is missing or has a wrong shape."""
     found = {name: np.asarray(values, dtype=float) for name, values in read_npz(Path(path), GRID).items()}
     for name in ("logits", "origin", "cell", "heights"):
         if name not in found:
@@ -44,7 +41,7 @@ def read_grid(path: str | Path) -> GridModel:
 
 
 def write_grid(grid: GridModel, path: str | Path) -> None:
-    """Write a grid at once or not at all."""
+    """Write a grid atomically."""
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,

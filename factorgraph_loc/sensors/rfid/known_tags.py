@@ -1,4 +1,4 @@
-"""Inventory rounds of RFID antennas, as all estimators take them in."""
+"""Reads and misses of the tags of the map."""
 
 import math
 from dataclasses import replace
@@ -13,24 +13,24 @@ from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.tag_states import TagStates
 from factors.se2 import Array, Integers
 
-EXACT = 0.2  # a survey that is so much better than what a pass tells (as a share of that) is taken as exact
+EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
 
 def trust(sigmas: Array, pass_sigma: float) -> float:
-    """The exponent that a likelihood of tags is due whose places have errors of these ``sigmas`` (T,) [m].
+    """The exponent of a likelihood of tags whose positions have standard deviations ``sigmas`` (T,) [m].
 
-    Such an error is the same each time that a tag is passed, so that no number of reads tells the pose better. A pass by itself
-    tells it with a variance of ``pass_sigma`` squared, and with the sum of both where the tag's place is not exact.
+    The survey error is the same in all reads of a tag, so reads cannot average it out. A pass of a tag determines the pose with
+    variance ``pass_sigma`` squared, and with the sum of both variances if the survey is inexact.
     """
     counted = np.where(sigmas > EXACT * pass_sigma, sigmas, 0.0)
     return float(np.mean(1.0 / (1.0 + (counted / pass_sigma) ** 2))) if len(sigmas) else 1.0
 
 
 class KnownTags:
-    """Turns scans into looks at the tags of the map; what the map or the rig lacks is counted as ignored.
+    """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
 
-    It also keeps what the scans told of the ``states`` of the tags: that one was read shows when it is looked at, that one was not
-    only from where the robot was, if that is known (:meth:`miss`). Tags that are believed dead stand in the diagnostics.
+    It also tracks the ``states`` of the tags: reads show at once that a tag works; misses are used only with a known pose
+    (:meth:`miss`). Tags that are believed dead are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -46,10 +46,8 @@ class KnownTags:
         self.states = TagStates(len(self.map.names), 0.0 if settings is None else settings.dead_tags)
 
     def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
-        """What the antennas of the rig read, and did not read, of the tags of the map, all from the pose at the scan's time.
-
-        ``count`` off: what is ignored is not counted, as the scan will be looked at once more.
-        """
+        """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Without ``count``,
+        ignored reads are not counted, because the scan will be processed again."""
         diagnostics = self._diagnostics if count else Diagnostics()
         if self.likelihood is None:
             diagnostics.ignore("rfid", len(m.antennas))
@@ -61,7 +59,7 @@ class KnownTags:
             return None
         hits, odds = np.zeros((len(used), len(self.map.names)), dtype=np.int64), self.states.odds
         unknown = 0
-        # a tag counts once a round, as often as it may answer in it
+        # count a tag once per round
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
             place = self.map.index.get(name)
             if place is None:
@@ -75,19 +73,19 @@ class KnownTags:
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds)
 
     def miss(self, t: float, looks: TagReadCounts, pose: Array, covariance: Array) -> None:
-        """Learn of the tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): that of the looks, as
-        it was predicted before them."""
+        """Update the states of tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted
+        pose of the read counts."""
         if self.likelihood is not None:
             self.states.miss(t, self.likelihood.silence(pose, covariance, looks))
             self._tell()
 
     def forget(self, since: float) -> None:
-        """Take back what scans from then on told of tags that were not read."""
+        """Undo the updates by misses since ``since``."""
         self.states.forget(since)
         self._tell()
 
     def silent(self) -> None:
-        """The reader or all tags have failed since a tag was last read: that tells nothing of each of them."""
+        """Ignore misses since the last read, because the reader or all tags have failed."""
         self.forget(math.nextafter(self.states.heard, math.inf))
 
     def _tell(self) -> None:
@@ -97,8 +95,8 @@ class KnownTags:
             told.update(zip((self.map.names[i] for i in believed), self.states.dead[believed].tolist(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
-        """Of antennas that listened: the rows of their looks, -1 of those that the rig lacks; of each row its antenna's place in
-        the rig, and how many rounds there were. It is kept, as scan after scan is of the same antennas."""
+        """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because
+        consecutive scans have the same antennas."""
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
             used = sorted(set(antennas) - {-1})
@@ -108,11 +106,11 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Of each read of a scan the places of its antenna in the rig and of its tag in the map, -1 where these lack it."""
+        """Antenna and tag indices of each read of a scan, -1 if the rig or the map lacks them."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         return antennas[m.antenna], tags
 
 
-# The parts of an update that are linear algebra of three rows: compiled, as NumPy takes ten times as long for so few. So is the
-# whole update by what was read and not read, which comes often.
+# The linear algebra of an update has three rows only, for which NumPy is ten times slower than compiled code. The update by
+# reads and misses, which is frequent, is compiled as a whole.

@@ -23,10 +23,9 @@ TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
 
 
 class Tag(FileModel):
-    """An RFID tag: position [m] as it was surveyed, and the direction that it faces [rad], None where that is not known.
+    """An RFID tag: surveyed position [m] and the direction that it faces [rad], None if unknown.
 
-    ``sigma``: standard deviation of its survey in x and y [m]; ``covariance``: (xx, xy, yy) [m^2] in place of it, as of a
-    :class:`Landmark`.
+    ``sigma``: standard deviation of the survey in x and y [m]; ``covariance``: (xx, xy, yy) [m^2] instead of ``sigma``.
     """
 
     x: Coordinate
@@ -42,14 +41,14 @@ class Tag(FileModel):
 
 
 class TagsFile(ColumnMapping):
-    """A table of tags as another program wrote it, with the columns epc, x, y and perhaps z, facing, sigma. ``epc_case``: in which
-    letters EPCs are compared with the reads."""
+    """A foreign table of tags with the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: letter case in which EPCs
+    are compared with the reads."""
 
     epc_case: EpcCase = "as written"
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """The tags of a world's file: there, in a table that it names, or in one of another program by a mapping."""
+    """The tags of a world file: inline, in a native table, or in a foreign table with a mapping."""
     if isinstance(content, str):
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):
@@ -59,7 +58,7 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
 
 
 def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
-    """Write tags as a table, and return its name; None if one has a covariance, for which a table has no column."""
+    """Write tags as a table and return its name; None if one has a covariance, which a table cannot hold."""
     if not tags or any(tag.covariance is not None for tag in tags.values()):
         return None
     write_tags(tags, base.with_name(base.name + TAGS_SUFFIX))
@@ -67,17 +66,16 @@ def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
 
 
 def read_tags(path: Path) -> dict[str, Tag]:
-    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and, if they are known, sigma; a facing may be empty.
+    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and optionally sigma; facing may be empty.
 
-    InputError names file, row and field of what is wrong. An EPC that stands there twice is an error: no estimator could tell which
-    of the two it hears, and only who surveyed them can.
+    InputError names file, row and field of an invalid value, or of a duplicate EPC.
     """
     cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
     return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name, TAGS[name]) for name in shape[1:]})
 
 
 def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
-    """Read a table of another program; what is wrong with it is an InputError as of :func:`read_tags`."""
+    """Read a foreign table; InputError as in :func:`read_tags`."""
     mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
     numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.fields if name != "epc"}
     return _tags(path, mapped.cells.rows, in_case(mapped.texts("epc"), mapping.epc_case), numbers)
@@ -100,6 +98,6 @@ def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(TAG_COLUMNS_WITH_SIGMA)
-    # csv writes a float with all its digits, and None as an empty cell
+    # csv writes all digits of a float, and None as an empty cell
     rows.writerows((epc, tag.x, tag.y, tag.z, tag.facing, tag.sigma) for epc, tag in tags.items())
     write_text(path, text.getvalue())

@@ -1,4 +1,4 @@
-"""What an RFID reader reports."""
+"""Measurements of an RFID reader."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,12 +11,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class RfidScan:
-    """Inventory rounds of one or several antennas that ended at one time, with the R tags that were read in them.
+    """Inventory rounds of one or several antennas that ended at one time, with R tag reads.
 
-    ``antennas``: A names of those that listened; a name may stand there twice, for two rounds. A tag of the map that none of the
-    rows names was not read by an antenna that listened. ``antenna`` (R,): which of ``antennas`` read the row; ``tags``: R EPCs, one
-    of them as often as it was read; ``age`` (R,) [s]: how long before ``t``; ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the
-    reader reports it, and ``frequency`` (R,) [Hz] of the carrier: NaN where unknown.
+    ``antennas``: A names of the active antennas; a name may occur twice, for two rounds. A tag of the map without a read was missed
+    by all active antennas. ``antenna`` (R,): index in ``antennas``; ``tags``: R EPCs; ``age`` (R,) [s]: time from the read to
+    ``t``; ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, and ``frequency`` (R,) [Hz] of the carrier: NaN if
+    unknown.
     """
 
     sensor: ClassVar[str] = "rfid"
@@ -33,5 +33,5 @@ class RfidScan:
 
     @property
     def count(self) -> int:
-        """How many rounds there were."""
+        """Number of rounds."""
         return len(self.antennas)

@@ -1,21 +1,21 @@
-"""Whether a track is lost: told by what RFID antennas read and did not read."""
+"""Detection of a lost track, and of a failed reader, from reads and misses."""
 
 import itertools
 import math
 from collections import deque
 
-DURATION = 5.0  # s over which scans are taken together
+DURATION = 5.0  # s of scans that are tested jointly
 KEPT = 60.0  # s
-SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations: a suspicion arises above the one, and goes below the other
-SCANS = 4  # at least
+SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
+SCANS = 4  # minimum number
 
 
-SILENT = 8.0  # log of the odds against a silence at which it is no longer taken for one of the place
+SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
 
 
 class Silence:
-    """Whether no tag is read where tags should be: then the reader or the tags have failed, and not to read them tells nothing
-    of the place, while it would drive an estimate to wherever no tags are."""
+    """Detects that no tag is read where tags should be: the reader or the tags have failed. The misses are then uninformative, and
+    would drive the estimate to an area without tags."""
 
     EVENT = "no tag is read where some should be"
     REJECTED = "rfid: no tag read where some should be"
@@ -25,34 +25,35 @@ class Silence:
 
     @property
     def lasts(self) -> bool:
-        """Whether the last scan was one of such a silence."""
+        """Whether the last scan was part of such a silence."""
         return self._evidence < -SILENT
 
     def add(self, reads: int, evidence: float) -> bool:
-        """Take a scan with so many reads, and the log-probability of it at the predicted pose; True in a silence."""
+        """Add a scan with its number of reads and its log-probability at the predicted pose; True in a silence."""
         self._evidence = 0.0 if reads else self._evidence + evidence
         return self.lasts
 
 
 class ScanMonitor:
-    """Whether scans are much less likely than they would be if the track were right.
+    """Detects that scans are much less likely than they would be on a correct track.
 
-    That is a suspicion: dead tags and a wrong map look the same. Whether there is a better place a :class:`Seeker` tells.
+    That is only a suspicion, because dead tags and a wrong map look the same. A :class:`Seeker` tells whether there is a better
+    pose.
     """
 
     def __init__(self) -> None:
         self._scans: deque[tuple[float, float, float]] = deque()
         self._since: float | None = None
-        self._usual = 0.0  # the mean surprise that was found to mean nothing
+        self._usual = 0.0  # mean excess of the negative log-likelihood that was accepted
 
     @property
     def suspicious_since(self) -> float | None:
-        """When the scans began to be unlikely [s], None if all is well."""
+        """The time [s] since which scans are unlikely, or None."""
         return self._since
 
     def add(self, t: float, surprise: float, variance: float) -> None:
-        """Take a scan: how much larger its negative log-likelihood is than expected, and the variance of that, both at the
-        predicted pose. Scans from ``t`` on that were taken before are forgotten."""
+        """Add a scan: excess of its negative log-likelihood over the expected value, and the variance of that, at the predicted
+        pose. Later scans are discarded."""
         while self._scans and self._scans[-1][0] >= t:
             self._scans.pop()
         self._scans.append((t, surprise, variance))
@@ -65,18 +66,18 @@ class ScanMonitor:
             self._since = None
 
     def accept(self) -> None:
-        """The track is right all the same: the model or the map is not, and scans will go on to be as unlikely as the last ones."""
+        """Accept the track: the model or the map is wrong instead, and scans will remain as unlikely as the last ones."""
         last = self._last()
         self._usual = sum(s[1] for s in last) / max(len(last), 1)
         self._since = None
 
     def clear(self) -> None:
-        """Forget the scans: the track begins anew."""
+        """Forget the scans: a new track starts."""
         self._scans.clear()
         self._since = None
 
     def _z(self) -> float:
-        """The summed surprise of the last scans, in standard deviations."""
+        """The total excess of the last scans, in standard deviations."""
         last = self._last()
         if len(last) < SCANS:
             return 0.0
@@ -87,10 +88,10 @@ class ScanMonitor:
         return list(itertools.takewhile(lambda scan: scan[0] > since, reversed(self._scans)))
 
     def _beginning(self) -> float:
-        """The change point: from there on the sum of the surprises is largest."""
+        """The change point, which maximises the total excess after it."""
         total, most, begin = 0.0, -math.inf, self._scans[-1][0]
         for t, surprise, variance in reversed(self._scans):
-            # scans as they are expected count against
+            # scans as likely as expected count against it
             total += surprise - self._usual - math.sqrt(variance)
             if total > most:
                 most, begin = total, t

@@ -1,4 +1,4 @@
-"""Reads of tags that a program hands over."""
+"""Pushed tag reads and their validation."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from factorgraph_loc.sensors.rfid.columns import READS, RFID
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.text import listed, plain
 
-PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "its place in antennas")
+PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "index in antennas")
 
 
 @dataclass(frozen=True)
 class RfidRead:
-    """A tag that was read: by the antenna of that name, its EPC; ``t`` [s]: when, None for the end of the round. ``rssi`` [dBm],
-    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN where unknown. ``round``: in which of the
-    rounds that are pushed together, as its place in their list of antennas, from 0. None where only the antenna is known: a tag
-    answers once in a round, so that the first read of a tag by an antenna is of its first round, the next of its next."""
+    """A read of a tag: name of the antenna and EPC; ``t`` [s]: time of the read, None for the end of the round. ``rssi`` [dBm],
+    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN if unknown. ``round``: index of the round in
+    the list of antennas that are pushed together, or None. In that case the first read of a tag by an antenna belongs to the
+    antenna's first round, the next one to its next round, as a tag responds once per round."""
 
     antenna: str
     epc: str
@@ -37,8 +37,8 @@ class RfidRead:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """The scan of rounds that ended at ``t``, in which ``antennas`` listened; InputError if a read is of another antenna, or of
-    another one's round, or is none."""
+    """The scan of rounds of ``antennas`` that ended at ``t``; InputError if a read is invalid, or names another antenna or a round
+    of another antenna."""
     t = seconds_of("RfidScan", t)
     where = f"RfidScan at {t:.3f} s"
     antenna_names = names(where, "antennas", items_of(where, "antennas", antennas))
@@ -57,15 +57,12 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 
 
 def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
-    """Which of the rounds each read (R,) belongs to.
-
-    Where a read does not tell it, that is the first round of its antenna in which the tag was not read yet, by the order of time,
-    and the last one if there are more reads than rounds.
-    """
+    """The round of each read (R,). If a read does not name it: the first round of its antenna in which the tag was not read yet, in
+    order of time, or the last round."""
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
         if not isinstance(read.antenna, str) or read.antenna not in names:
-            raise bad_field(where, "antenna", read.antenna, f"one that listened: {listed(names)}")
+            raise bad_field(where, "antenna", read.antenna, f"one of the active antennas: {listed(names)}")
         if not isinstance(read.epc, str):
             raise bad_field(where, "epc", read.epc, RFID["epc"].doc)
         if read.round is None:
@@ -85,10 +82,10 @@ def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRe
 
 
 def check(m: RfidScan, where: str) -> dict[str, Any]:
-    """The fields of a scan; InputError names the first that cannot be."""
+    """The fields of a scan; InputError names the first invalid one."""
     tags, antennas = names(where, "tags", m.tags), names(where, "antennas", m.antennas)
     antenna = integers(where, PLACE, m.antenna, len(tags))
     if np.any((antenna < 0) | (antenna >= len(antennas))):
-        raise bad_field(where, "antenna", antenna.tolist(), f"places in its {len(antennas)} antennas, from 0")
+        raise bad_field(where, "antenna", antenna.tolist(), f"indices of its {len(antennas)} antennas, from 0")
     told = {column.name: within(where, column, getattr(m, column.name), (len(tags),)) for column in READS.columns}
     return {"tags": tags, "antennas": antennas, "antenna": antenna, **told}

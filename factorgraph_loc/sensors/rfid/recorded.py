@@ -1,7 +1,7 @@
-"""Semi-real reads: a virtual tag is read when a recorded one was, in a round at about the same range, bearing, height and facing.
+"""Semi-real reads: resampling of recorded reads at similar range, bearing, height and facing.
 
-What that keeps of a real antenna: its pattern, and that misses last while the robot passes a tag. What it does not: reflections at
-places of the virtual world, that several antennas miss one tag at once, and anything that depends on pitch.
+This preserves the real antenna pattern and that misses persist while the robot passes a tag. It does not preserve reflections,
+simultaneous misses of several antennas, and effects of pitch.
 """
 
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ from factors.se2 import Array
 
 SCALES = np.array(
     (0.3, 0.26, 0.3, 0.3)
-)  # of range [m], |bearing| [rad], height [m], facing's cosine: as far apart as alike
-JITTER = 0.5  # of these scales: how far from its own place each antenna and tag looks for its donors
-DONORS = 8  # rounds that one is drawn from
-FAR = 2.0  # scales: a donor farther away than that is none
-MAX_GAP = 0.5  # s, of the reference
+)  # of range [m], |bearing| [rad], height [m], cosine of the facing: differences of equal importance
+JITTER = 0.5  # of these scales; offset of the donors of each antenna and tag
+DONORS = 8  # rounds to sample from
+FAR = 2.0  # scales; maximum distance of a donor
+MAX_GAP = 0.5  # s; of the reference
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedLooks:
-    """L rounds of a recorded antenna, each with one tag: ``features`` (L, 4), in :data:`SCALES`, and whether it was ``read`` (L,).
+    """L rounds of a recorded antenna with one tag each: ``features`` (L, 4), in :data:`SCALES`, and whether it was ``read`` (L,).
 
-    ``reach`` [m]: beyond it nothing was ever read. ``rfid``: the antennas that recorded them, and what is believed of them.
+    ``reach`` [m]: maximum range of reads. ``rfid``: settings of the recorded antennas.
     """
 
     rfid: RfidSettings
@@ -42,14 +42,14 @@ class RecordedLooks:
     tree: cKDTree
 
     def carried_by(self, rig: Rig) -> Rig:
-        """A rig with the recorded antennas, in a world that was surveyed without error."""
+        """A rig with the recorded antennas, for a world without survey errors."""
         return rig.model_copy(update={"rfid": self.rfid, "survey": SurveySettings()})
 
     def outcomes(self, tags: TagArray, poses: Array, rng: np.random.Generator) -> Array:
-        """What a round of each antenna at poses (N, 3) reads of each tag: 0 or 1, (N, A, T).
+        """Reads of each tag in a round of each antenna at poses (N, 3): 0 or 1, (N, A, T).
 
-        Each antenna and tag has its own place, :data:`JITTER` about the true one, around which its donors are: so neighbouring
-        poses have neighbouring donors, mostly the same recorded tag on one pass, and different tags have different ones.
+        Each antenna and tag has a fixed offset of size :data:`JITTER` at which its donors are searched. So neighbouring poses have
+        neighbouring donors, mostly of one recorded tag and pass, and different tags have different donors.
         """
         antennas = self.rfid.all_antennas()
         out = np.zeros((len(poses), len(antennas), len(tags.points)))
@@ -63,7 +63,7 @@ class RecordedLooks:
         return out
 
     def unmatched(self, tags: TagArray, poses: Array) -> float:
-        """Share of the looks within reach without a recorded one within :data:`FAR` scales."""
+        """Share of the rounds within range that have no donor within :data:`FAR` scales."""
         antennas = self.rfid.all_antennas().values()
         seen = np.concatenate([_features(antenna, tags, poses).reshape(-1, 4) for antenna in antennas])
         near = seen[seen[:, 0] * SCALES[0] <= self.reach]
@@ -74,7 +74,7 @@ class RecordedLooks:
 
 
 def recorded_looks(logs: list[Log]) -> RecordedLooks:
-    """What the antennas of ``logs`` read, and did not read, of the tags that they ever read.
+    """The reads and misses in ``logs`` of all tags that were read at least once.
 
     InputError if a log lacks the reference, the antennas, the tags, or their facings.
     """
@@ -84,7 +84,7 @@ def recorded_looks(logs: list[Log]) -> RecordedLooks:
     features = np.concatenate([part[0] for part in parts])
     read = np.concatenate([part[1] for part in parts])
     if int(read.sum()) < DONORS:
-        raise InputError(f"{logs[0].name}: has {int(read.sum())} reads of tags of its map, too few to draw from")
+        raise InputError(f"{logs[0].name}: has {int(read.sum())} reads of tags of its map, too few to resample")
     reach = float((features[read > 0.0, 0] * SCALES[0]).max())
     keep = features[:, 0] * SCALES[0] <= reach + 1.0
     return RecordedLooks(rfid, features[keep], read[keep], reach, cKDTree(features[keep]))
@@ -97,7 +97,7 @@ def _looks(log: Log) -> tuple[Array, Array]:
     scans = whole_scans(log)
     tags = tag_map(log.world, log.rig.of(SurveySettings), {epc for scan in scans for epc in scan.tags})
     if not np.isfinite(tags.tags.facing).all():
-        raise InputError(f"{log.name}: has tags without a facing, expected one of each to find like ones by")
+        raise InputError(f"{log.name}: has tags without a facing, which resampling needs")
     poses = reference.at(np.array([scan.t for scan in scans]), max_gap=MAX_GAP)
     features, reads = [], []
     for name, antenna in rfid.all_antennas().items():
@@ -118,7 +118,7 @@ def _looks(log: Log) -> tuple[Array, Array]:
             features.append(_features(antenna, tags.tags, poses[rows]).reshape(-1, 4))
             reads.append(np.array(hits).ravel())
     if not features:
-        raise InputError(f"{log.name}: has no round of a known antenna while there is a reference")
+        raise InputError(f"{log.name}: has no round of a known antenna within the reference")
     return np.concatenate(features), np.concatenate(reads)
 
 

@@ -1,6 +1,6 @@
-"""Which inventory round of an antenna a read belongs to: from the gaps between reads, or from the rounds that a log tells.
+"""Assignment of reads to inventory rounds, from the gaps between reads or from logged rounds.
 
-What a round did not read is as telling as what it did, so a read must not fall into a wrong one.
+Misses are as informative as reads, so reads must be assigned correctly.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ OUTSIDE = -1
 
 
 def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Integers:
-    """Numbers (N,) from 0 of the rounds of reads at ``t_ns`` (N,), in order of time, by N antennas.
+    """Round numbers (N,) from 0 of reads at sorted ``t_ns`` (N,) by N antennas.
 
-    A round ends where another antenna reads, or where ``gap`` seconds pass without a read. Rounds without a read leave no trace.
+    A round ends with a read of another antenna, or after ``gap`` seconds without a read. Rounds without reads cannot be detected.
     """
     names = np.asarray(antenna, dtype=str)
     first = np.ones(len(t_ns), dtype=bool)
@@ -27,10 +27,10 @@ def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Inte
 def rounds_from_inventories(
     t_ns: Integers, antenna: Sequence[str], end_ns: Integers, inventory_antenna: Sequence[str], duration_ns: Integers
 ) -> Integers:
-    """Which of R inventories each of N reads belongs to, :data:`OUTSIDE` where none of its antenna holds its stamp.
+    """Index of the inventory among R for each of N reads, :data:`OUTSIDE` if none of its antenna contains its timestamp.
 
-    An inventory holds the stamps from ``end_ns - duration_ns`` to ``end_ns``, both included; a stamp on the border of two belongs
-    to the earlier one.
+    An inventory contains the timestamps from ``end_ns - duration_ns`` to ``end_ns``, inclusive; on a border the earlier one is
+    used.
     """
     names, listening = np.asarray(antenna, dtype=str), np.asarray(inventory_antenna, dtype=str)
     out = np.full(len(t_ns), OUTSIDE, dtype=np.int64)
@@ -49,8 +49,8 @@ def rounds_from_inventories(
 
 
 def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
-    """When it was known (R,) that each of R rounds of :func:`rounds_from_gaps` was over, so that what it did not read counts: at
-    the next read of another antenna, or ``gap`` seconds after its last read."""
+    """Times (R,) at which R rounds of :func:`rounds_from_gaps` were complete: at the next read of another antenna, or ``gap``
+    seconds after the last read."""
     last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
     following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
@@ -65,10 +65,10 @@ def make_rfid_stream(
     inventory_antenna: Sequence[str],
     t0_ns: int,
 ) -> RfidStream:
-    """N reads, each in the round ``number`` (N,) of R, as a stream in the order of the rounds.
+    """The stream of N reads in rounds ``number`` (N,) of R, in the order of the rounds.
 
-    ``columns``: RSSI, phase and frequency, each (N,). ``end_ns`` (R,) and ``inventory_antenna`` (R): of the rounds, in the order of
-    their arrival. Reads of one round keep their order; a round without a read becomes a row without an EPC.
+    ``columns``: RSSI, phase and frequency, each (N,). ``end_ns`` (R,) and ``inventory_antenna`` (R): the rounds in order of
+    arrival. Reads of a round keep their order; a round without reads becomes a row without an EPC.
     """
     silent = np.setdiff1d(np.arange(len(end_ns)), number)
     rounds = np.concatenate((number, silent))

@@ -1,6 +1,6 @@
-"""What a rig says of its RFID antennas: where they sit, what they read, and the errors of the tags' survey.
+"""RFID settings of a rig: antennas, detection models, and the transform of the tags' survey.
 
-See :mod:`factors.rfid.model` for the models. Grids that were learnt lie as ``.npz`` beside the rig's file.
+See :mod:`factors.rfid.model` for the models. Learnt grids are ``.npz`` files next to the rig's file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from factors.rfid.strength import RssiModel
 from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot's frame")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
 Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
@@ -53,21 +53,21 @@ class LogisticSettings(FileModel):
 
 
 class GridSettings(FileModel):
-    """A learnt field of detection probability: the name of an ``.npz`` in the folder of the rig's file."""
+    """A learnt detection grid: the name of an ``.npz`` in the folder of the rig's file."""
 
     kind: Literal["grid"] = "grid"
     file: str
     _folder: Path = PrivateAttr(default=Path())
 
     def model(self) -> GridModel:
-        """Read the grid; InputError names what is wrong with the file."""
+        """Read the grid; InputError if the file is invalid."""
         return read_grid(self.path())
 
     def path(self) -> Path:
         return inside(self._folder, self.file, "grid")
 
     def placed(self, folder: Path) -> GridSettings:
-        """The same, of a rig whose file is in ``folder``."""
+        """A copy whose file reference is relative to ``folder``, which holds the rig's file."""
         out = self.model_copy()
         out._folder = folder
         return out
@@ -77,7 +77,7 @@ ModelSettings = Annotated[BeamSettings | LogisticSettings | GridSettings, Field(
 
 
 class AntennaSettings(FileModel):
-    """One antenna: place and boresight in the robot's frame (``pitch``: upwards), and the name of its model."""
+    """An antenna: position and boresight in the robot frame (``pitch``: up is positive), and the name of its model."""
 
     x: Offset = 0.0
     y: Offset = 0.0
@@ -92,17 +92,17 @@ class RssiSettings(FileModel):
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
     sigma: Annotated[float, Field(ge=0.01, le=30.0, description="dB")]
-    dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of Student's density")]
+    dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of the Student density")]
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
-        """The model for antennas at these places."""
+        """The model for the given antennas."""
         return RssiModel(antennas, self.coefficients, self.sigma, self.dof, self.tempering)
 
 
 class PhaseSettings(FileModel):
-    """See :class:`factors.rfid.phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]: a read counts in several of
-    them, in each by the share of ``step`` in ``window``."""
+    """See :class:`factors.rfid.phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]. Reads in overlapping windows
+    are weighted by ``step`` / ``window``."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
@@ -118,7 +118,7 @@ class PhaseSettings(FileModel):
         return self
 
     def model(self, antennas: tuple[Antenna, ...]) -> PhaseModel:
-        """The model for antennas at these places, of one window."""
+        """The model of one window for the given antennas."""
         return PhaseModel(
             antennas, self.kappa, self.tempering * self.step / self.window, self.max_range, self.min_reads
         )
@@ -128,7 +128,7 @@ RACKHAM_RADIUS = 0.25  # m
 
 
 def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
-    """Eight antennas around the body, as on the robot of the paper, at a height ``z`` [m]."""
+    """Eight antennas around the body at height ``z`` [m], as on the robot of the paper."""
     out = {}
     for i in range(8):
         yaw = se2.wrap_scalar(i * math.pi / 4.0)
@@ -139,20 +139,18 @@ def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
 
 
 def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings]:
-    """The model of antennas that nothing was learnt of."""
+    """The default model of uncalibrated antennas."""
     return {"default": BeamSettings()}
 
 
 class RfidSettings(SensorSettings):
-    """The RFID reader. ``antennas`` by the name that reads give, or a ``preset`` of them at the height ``preset_z``.
+    """The RFID reader. ``antennas`` by name, or a ``preset`` of them at height ``preset_z``.
 
-    ``false_read`` and ``miss``: probabilities below and above which no model goes. ``tempering``: the exponent of the likelihood,
-    below 1 where successive reads go together. ``round_gap`` [s]: between reads that belong to different inventory rounds, where
-    the log does not tell the rounds. ``pass_sigma`` [m]: how well a pass of a tag tells the pose by itself,
-    from which follows how much tags tell whose survey is not exact (:func:`~factorgraph_loc.sensors.rfid.known_tags.trust`).
-    ``dead_tags``: the share of a map's tags that are broken, hidden or gone, before anything is heard of them. The default is a
-    guess for an installation that is kept in order; ``fgloc calibrate`` learns it. ``rssi``, ``phase``: what is made of them, where
-    an estimator is given these sensors.
+    ``false_read`` and ``miss``: lower and upper bounds of the read probability (the latter as 1 - miss). ``tempering``: exponent of
+    the likelihood, below 1 for correlated reads. ``round_gap`` [s]: gap between reads that separates inventory rounds if the log
+    has none. ``pass_sigma`` [m]: accuracy of the pose from one pass of a tag, for tags with an inexact survey
+    (:func:`~factorgraph_loc.sensors.rfid.known_tags.trust`). ``dead_tags``: prior share of broken, hidden or missing tags of a map;
+    ``fgloc calibrate`` learns it. ``rssi``, ``phase``: models used if an estimator uses these sensors.
     """
 
     preset: Literal["rackham"] | None = None
@@ -171,7 +169,7 @@ class RfidSettings(SensorSettings):
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
         if (self.preset is None) == (not self.antennas):
-            raise ValueError("expected either antennas or a preset of them")
+            raise ValueError("expected either antennas or a preset")
         for name, antenna in self.all_antennas().items():
             if antenna.model not in self.models:
                 raise ValueError(
@@ -183,12 +181,12 @@ class RfidSettings(SensorSettings):
         return self.antennas if self.preset is None else rackham(self.preset_z)
 
     def placed(self, folder: Path) -> RfidSettings:
-        """The same, whose grids are files in ``folder``."""
+        """A copy whose grids are files in ``folder``."""
         models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in self.models.items()}
         return self.model_copy(update={"models": models})
 
     def write_beside(self, folder: Path) -> None:
-        """Write its grids into ``folder``."""
+        """Write the grids into ``folder``."""
         for model in self.models.values():
             if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
                 write_grid(model.model(), folder / model.file)
@@ -208,8 +206,8 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The frame in which the tags were surveyed, as it lies in the world: they are turned by ``heading`` about the point
-    (``about_x``, ``about_y``) of the survey, then shifted by ``x`` and ``y``."""
+    """The transform from the tags' survey frame to the world: rotation by ``heading`` about the point (``about_x``, ``about_y``) of
+    the survey, then translation by ``x`` and ``y``."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
     y: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
@@ -218,7 +216,7 @@ class SurveySettings(FileModel):
     about_y: Coordinate = 0.0
 
     def transform(self) -> Array:
-        """The same as a pose (3,) of the survey's origin in the world."""
+        """The pose (3,) of the survey's origin in the world."""
         pivot = np.array((self.about_x, self.about_y))
         turned = se2.transform_from(np.array((0.0, 0.0, self.heading)), pivot)
         origin = pivot + np.array((self.x, self.y)) - turned

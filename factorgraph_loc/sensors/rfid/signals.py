@@ -1,4 +1,4 @@
-"""Strength and phase of RFID reads, as all estimators take them in."""
+"""Observations of signal strength and phase of RFID reads."""
 
 from collections import deque
 from dataclasses import replace
@@ -21,8 +21,7 @@ GOING_BACK = 5.0  # s that an estimator may go back in time
 
 
 class TagSignals:
-    """Turns scans into reads with a strength, and into windows of reads with a phase; without these sensors into nothing.
-    InputError if the rig does not say what is made of a sensor.
+    """Turns scans into strength observations and windows of phases, if these sensors are used. InputError if the rig lacks a model.
 
     Windows of the rig's ``window`` seconds end at least ``step`` seconds apart.
     """
@@ -48,7 +47,7 @@ class TagSignals:
             self._window, self._step = settings.phase.window, settings.phase.step
 
     def strengths(self, m: RfidScan) -> RssiReads | None:
-        """The reads that tell a strength, all from the pose at the scan's time."""
+        """The reads with a strength, relative to the pose at the scan's time."""
         if self.strength is None:
             return None
         antennas, tags = self._tags.places(m)
@@ -58,7 +57,7 @@ class TagSignals:
         return RssiReads(np.zeros((len(rows), 3)), antennas[rows], tags[rows], m.rssi[rows])
 
     def keep(self, m: RfidScan) -> bool:
-        """Keep the phases of a scan; True when a window of them ends with it."""
+        """Add the phases of a scan; True if a window ends with it."""
         if self.phase is None:
             return False
         antennas, tags = self._tags.places(m)
@@ -79,8 +78,8 @@ class TagSignals:
         return np.array([row[0] for row in self._of_window()])
 
     def phases(self, offsets: Array, pose: Array) -> RfidFactor | None:
-        """The window as a factor on a pose, expected to be ``pose`` (3,), in whose frame the robot was at ``offsets`` (R, 3) at the
-        reads; None where too few of them are near."""
+        """The window as a factor on a pose predicted as ``pose`` (3,); ``offsets`` (R, 3): robot poses at the reads relative to it.
+        None if too few reads are near their tags."""
         if self.phase is None:
             return None
         _, antennas, tags, phase, frequency = (np.array(column) for column in zip(*self._of_window(), strict=True))
@@ -89,7 +88,7 @@ class TagSignals:
         return RfidFactor(self.phase, reads) if len(reads.phase) else None
 
     def forget(self, since: float) -> None:
-        """Forget the scans from then on: time goes back, by at most :data:`GOING_BACK`, and they will come again."""
+        """Forget scans since ``since``, at most :data:`GOING_BACK` ago; they will be processed again."""
         while self._rows and self._rows[-1][0] >= since:
             self._rows.pop()
         while self._ended and self._ended[-1] >= since:

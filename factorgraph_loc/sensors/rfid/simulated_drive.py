@@ -1,4 +1,4 @@
-"""What RFID antennas read on a simulated drive, and the map of tags as it is surveyed."""
+"""Simulated RFID reads on a drive, and the surveyed map of tags."""
 
 import math
 from collections.abc import Mapping
@@ -16,8 +16,8 @@ from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
 
-SPARSE = 20  # poses, of which one is enough to tell how well recorded looks match
-MOST_UNMATCHED = 0.1  # share of looks in reach without a recorded one that is alike
+SPARSE = 20  # every n-th pose is used to check the donors
+MOST_UNMATCHED = 0.1  # maximum share of rounds in range without a similar recorded one
 
 
 def simulate(ride: Ride) -> Simulated:
@@ -41,10 +41,10 @@ def simulate(ride: Ride) -> Simulated:
     surveyed, misplaced = _surveyed(ride.world.tags, settings.faults, ride.rng_of_world("survey"))
     metadata, warnings = {}, []
     if recorded is not None:
-        metadata["reads"] = "outcomes of recorded rounds at like range, bearing, height and facing"
+        metadata["reads"] = "resampled from recorded rounds at similar range, bearing, height and facing"
         share = recorded.unmatched(tags.tags, ride.truth.poses[::SPARSE])
         if share > MOST_UNMATCHED:
-            warnings.append(f"rfid: {share:.0%} of the looks in reach have no recorded one that is alike")
+            warnings.append(f"rfid: {share:.0%} of the rounds in range have no similar recorded one")
     if len(dead):
         metadata["dead"] = ", ".join(epcs[i] for i in sorted(dead.tolist()))
     if misplaced:
@@ -53,7 +53,7 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """How often per second a simulated drive looks for all tags; ValueError where rig and faults do not fit together."""
+    """Rate [Hz] of the simulated rounds; ValueError if rig and faults are inconsistent."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no rfid, expected antennas")
     stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
@@ -65,7 +65,7 @@ def looks(settings: Any) -> dict[str, float]:
 def _surveyed(
     tags: Mapping[str, Tag], faults: FaultSettings, rng: np.random.Generator
 ) -> tuple[dict[str, Tag], list[str]]:
-    """The tags of the map that estimators are given, and those that are misplaced in it."""
+    """The tags of the surveyed map, and the names of misplaced ones."""
     names = list(tags)
     chosen = sorted(rng.permutation(len(names))[: round(faults.misplaced * len(names))].tolist())
     surveyed = dict(tags)

@@ -1,4 +1,4 @@
-"""What the RFID antennas of a robot read that chooses where to drive."""
+"""Simulated RFID antennas of an active robot."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 
 class SimulatedReader:
-    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor`: one round of all antennas at a time."""
+    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor`: all antennas measure one round at a time."""
 
     channel, decides = "rfid", True
 
@@ -38,7 +38,7 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """The antennas of a rig; InputError if they are to have faults."""
+    """The antennas of a rig; InputError if the settings have faults."""
     if settings.faults != FaultSettings():
-        raise InputError(f"{settings.name}: has faults, expected none: they are not part of active runs")
+        raise InputError(f"{settings.name}: has faults, which active runs do not support")
     return SimulatedReader(world, rig, settings.rounds_per_second, rng)

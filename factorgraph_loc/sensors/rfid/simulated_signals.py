@@ -1,4 +1,4 @@
-"""What comes with a read: its phase and how strong it was."""
+"""Simulated phase and strength of reads."""
 
 import numpy as np
 
@@ -28,10 +28,10 @@ def strengths(
 def phases(
     rfid: RfidSettings, tags: TagArray, poses: Array, settings: PhaseSettings, rng: np.random.Generator
 ) -> Array:
-    """The phase (N, A, T) in [0, 2 pi) that a read of each tag by each antenna at poses (N, 3) comes with.
+    """Phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at poses (N, 3).
 
-    ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4) with an offset drawn for each antenna and tag, noise, and
-    pi more for a share of the reads.
+    ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4) with a random offset for each antenna and tag, noise, and an
+    additional pi for a share of the reads.
     """
     at = np.array([(antenna.x, antenna.y, antenna.z) for antenna in rfid.all_antennas().values()])
     planar = se2.transform_from(poses[:, None], at[None, :, :2])[:, :, None] - tags.points[:, :2]

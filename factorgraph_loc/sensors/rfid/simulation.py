@@ -1,4 +1,4 @@
-"""Tag reads, drawn from the detection model of a rig, and what may go wrong with them."""
+"""Simulated tag reads from the detection model of a rig, with faults."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ def read_probabilities(rfid: RfidSettings, tags: TagArray, poses: Array) -> Arra
 
 
 def draw_dead(faults: FaultSettings, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Which of so many tags are never read."""
+    """The tags, of ``count``, that are never read."""
     return np.asarray(rng.permutation(count)[: round(faults.dead * count)])
 
 
@@ -34,11 +34,11 @@ def draw_reads(
     dead: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Hits:
-    """Which tag each round reads (N, A, T), of rounds at ``times`` (N,), with all faults but those of the map and the clock.
-    ``dead``: tags that are never read.
+    """Reads (N, A, T) of rounds at ``times`` (N,), with all faults except those of the map and the clock. ``dead``: tags that are
+    never read.
 
-    In a fade a tag is read falsely only. Outside it is read so much more often that, over all, the probability is what the
-    model says, as far as it can be: a rig with ``miss`` of at least the share of fades makes it so.
+    In a fade a tag has false reads only. Outside of fades the probability is raised to preserve the model's overall probability,
+    as far as possible: a rig whose ``miss`` is at least the share of fades allows it.
     """
     shape = probabilities.shape
     share = faults.fading.share
@@ -62,14 +62,14 @@ def draw_reads(
 def rfid_stream(
     names: list[str], epcs: list[str], times: Array, hits: Hits, faults: FaultSettings, signals: Mapping[str, Array]
 ) -> RfidStream:
-    """Reads (N, A, T) of antennas ``names`` (A) and tags ``epcs`` (T) as rows. All antennas end a round at the same ``times`` (N,),
-    and the tags count as read just then. ``signals``: the columns rssi, phase and frequency (N, A, T), those that there are."""
+    """The stream of reads (N, A, T) of antennas ``names`` (A) and tags ``epcs`` (T). All antennas end a round at ``times`` (N,),
+    which are also the times of the reads. ``signals``: the available columns of rssi, phase and frequency (N, A, T)."""
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
     if stop is not None and not stop.rounds_go_on:
         listened[times >= stop.time, names.index(stop.antenna)] = False
     empty = listened & ~hits.any(axis=2)
-    # a column more, of the rounds without a read
+    # an additional column for rounds without reads
     n, a, tag = np.nonzero(np.concatenate((hits & listened[:, :, None], empty[:, :, None]), axis=2))
     t = _jumped(times, faults.clock_jump)[n]
     labels = [*epcs, ""]
@@ -92,17 +92,17 @@ def _jumped(times: Array, jump: ClockJump | None) -> Array:
 
 
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
-    """Whether each antenna has lost each tag, (N, A, T): a Markov chain of two states, from its stationary distribution.
+    """Whether each tag is in a fade for each antenna, (N, A, T): a stationary two-state Markov chain.
 
-    The end of a fade comes with the rate 1 / duration, the start of one with that which gives the share (Gilbert, Bell System
-    Technical Journal 39, 1960).
+    Fades end with the rate 1 / duration and start with the rate that gives the share (Gilbert, Bell System Technical Journal 39,
+    1960).
     """
     out = np.empty((len(times), *shape), dtype=bool)
     rate = 1.0 / (fading.duration * (1.0 - fading.share))
     state = rng.random(shape) < fading.share
     for i in range(len(times)):
         if i:
-            # after a time dt the chain has forgotten its state with this probability, and is in any by the share
+            # probability that the chain has forgotten its state after dt; then it is in a fade with probability share
             forgotten = rng.random(shape) < -np.expm1(-rate * (times[i] - times[i - 1]))
             state = np.where(forgotten, rng.random(shape) < fading.share, state)
         out[i] = state
@@ -110,7 +110,7 @@ def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.
 
 
 def _false(count: int, share: float, shape: tuple[int, ...], rng: np.random.Generator) -> Hits:
-    """Reads anywhere (N, A, T), so many that they are ``share`` of all beside ``count`` others."""
+    """Random false reads (N, A, T), whose expected share of all reads is ``share``, given ``count`` others."""
     out = np.zeros(shape, dtype=bool)
     size = out.size
     extra = min(rng.poisson(count * share / (1.0 - share)), size)

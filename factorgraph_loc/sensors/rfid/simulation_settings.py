@@ -1,4 +1,4 @@
-"""What is simulated of an RFID reader, and its faults."""
+"""Simulation settings of an RFID reader and its faults."""
 
 from typing import Annotated
 
@@ -10,8 +10,8 @@ from factorgraph_loc.sensors.rfid.settings import Weight
 
 
 class PhaseSettings(FileModel):
-    """The phase that comes with a read: ``frequency`` of the carrier, noise ``sigma``, and a share of reads that are off by pi
-    (``flips``), as with most readers."""
+    """Phase of reads: carrier ``frequency``, noise ``sigma``, and the share ``flips`` of reads that are off by pi, as with most
+    readers."""
 
     frequency: Annotated[float, Field(ge=3e8, le=6e9, description="Hz")] = 920.625e6
     sigma: Annotated[float, Field(ge=0.0, le=3.0, description="rad")] = 0.1
@@ -19,7 +19,7 @@ class PhaseSettings(FileModel):
 
 
 class RssiSettings(FileModel):
-    """How strong a read is: ``coefficients`` of :data:`factors.rfid.strength.FEATURES`, and Student's noise of scale ``sigma`` with
+    """Strength of reads: ``coefficients`` of :data:`factors.rfid.strength.FEATURES`, and Student noise of scale ``sigma`` with
     ``dof`` degrees of freedom."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
@@ -28,7 +28,7 @@ class RssiSettings(FileModel):
 
 
 class Fading(FileModel):
-    """Misses that last: each antenna loses each tag for times of mean ``duration``, a ``share`` of all time."""
+    """Persistent misses: each antenna misses each tag for times of mean ``duration``, a ``share`` of all time."""
 
     duration: Annotated[float, Field(ge=1e-3, le=1000.0, description="s")] = 2.0
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
@@ -45,7 +45,7 @@ class AntennaStop(FileModel):
 
 
 class ClockJump(FileModel):
-    """From ``time`` on the stamps of the reader are ``jump`` seconds later than they should be."""
+    """From ``time`` on the reader's timestamps are ``jump`` seconds late."""
 
     time: Seconds
     jump: Annotated[float, Field(ge=-60.0, le=60.0, description="s")]
@@ -59,9 +59,8 @@ class Silence(FileModel):
 
 
 class FaultSettings(FileModel):
-    """What goes wrong with RFID. ``false_reads``: share of the reads that are of a tag and in a round drawn at random, beside those
-    of the model's floor. ``dead``: share of tags that are never read. ``misplaced``: share of tags that are ``misplaced_by``
-    metres off in the map."""
+    """Faults of RFID. ``false_reads``: share of random reads, in addition to those of the model's floor. ``dead``: share of tags
+    that are never read. ``misplaced``: share of tags that are ``misplaced_by`` metres off in the map."""
 
     fading: Fading = Fading()
     false_reads: Share = 0.0

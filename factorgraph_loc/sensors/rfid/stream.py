@@ -1,4 +1,4 @@
-"""The rows of an RFID reader."""
+"""The stream of an RFID reader."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class RfidStream(Stream):
-    """One row a read of a tag, and one with an empty EPC for a round in which an antenna read nothing.
+    """One row per read of a tag, and one with an empty EPC for a round without reads.
 
-    ``t`` (N,): the end of the inventory round, when its content is known; rows of one stamp make one scan. ``round`` (N,): the
-    number of the round that a row belongs to, unique within a stamp. ``antenna`` and ``epc``: N names; ``age`` (N,) [s]: how long
-    before ``t`` the tag was read; ``rssi`` (N,) [dBm], ``phase`` (N,) [rad], ``frequency`` (N,) [Hz]: NaN where unknown.
+    ``t`` (N,): end of the inventory round; rows of one timestamp form a scan. ``round`` (N,): number of the round, unique within a
+    timestamp. ``antenna`` and ``epc``: N names; ``age`` (N,) [s]: time from the read to ``t``; ``rssi`` (N,) [dBm], ``phase`` (N,)
+    [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
     """
 
     round: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""What the reads of RFID tags in a log hold, and what looks wrong with them."""
+"""Summary of the RFID reads in a log, with warnings."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -11,15 +11,15 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.summary import Paragraph, Summary
 
-STOPPED = 10.0  # s: an antenna that is silent for longer before the end has stopped
+STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
 SHOWN = 5  # names in a line
 
 
 @dataclass(frozen=True)
 class AntennaSummary:
-    """One antenna: its reads and rounds, rounds per second from the first to the last, rounds without a read, and the last
-    stamps [s] of a round and of a read (None without)."""
+    """An antenna: numbers of reads and rounds, rounds per second, rounds without a read, and timestamps [s] of the last round and
+    read (or None)."""
 
     reads: int
     rounds: int
@@ -31,8 +31,8 @@ class AntennaSummary:
 
 @dataclass(frozen=True)
 class RfidSummary:
-    """All reads. ``known``: how many tags of the map are read; ``unread``: those that never are; ``unknown``: reads by EPC that
-    the map lacks; ``late``: rounds with a stamp older than one before, and the largest step back [s]."""
+    """All reads. ``known``: number of tags of the map that are read; ``unread``: tags that are never read; ``unknown``: reads by
+    EPC that the map lacks; ``late``: number of rounds with a timestamp older than one before, and the largest step back [s]."""
 
     reads: int
     scans: int
@@ -45,7 +45,7 @@ class RfidSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """The reads of a log: ``rfid`` is an :class:`RfidSummary`, or None where there is no stream of that name."""
+    """``rfid``: a :class:`RfidSummary`, or None if the log lacks the stream."""
     found, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
     if found is None:
         return Summary({"rfid": None}, in_map)
@@ -68,7 +68,7 @@ def _told(found: RfidSummary) -> Paragraph:
 
 
 def summarize_rfid(log: Log) -> RfidSummary | None:
-    """What the stream ``rfid`` holds; None where there is none."""
+    """Summary of the stream ``rfid``, or None."""
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         return None
@@ -108,7 +108,7 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 
 def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
-    """What looks wrong with the reads, as lines for people."""
+    """Warnings about the reads."""
     out = []
     if found.unread:
         out.append(
@@ -123,7 +123,7 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
         for name, antenna in found.antennas.items()
         if name not in carried
     ]
-    out += [f"antenna {name} of the rig never listens" for name in carried if name not in found.antennas]
+    out += [f"antenna {name} of the rig is never active" for name in carried if name not in found.antennas]
     last = max((antenna.last for antenna in found.antennas.values()), default=0.0)
     for name, antenna in found.antennas.items():
         if antenna.last < last - STOPPED:

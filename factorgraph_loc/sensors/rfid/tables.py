@@ -1,7 +1,7 @@
-"""The two RFID tables of the native format: ``rfid.csv``, a row for each read, and ``inventories.csv``, one for each round.
+"""The RFID tables of the native format: ``rfid.csv`` with a row per read, and ``inventories.csv`` with a row per round.
 
-A read belongs to the round of its antenna that holds its stamp, or to the one that it names. Without the second table the rounds
-are found from the gaps between reads; then a round that read nothing is not known of.
+A read belongs to the round of its antenna that contains its timestamp, or to the one that it names. Without the second table
+rounds are derived from the gaps between reads, and rounds without reads are unknown.
 """
 
 from collections.abc import Mapping
@@ -25,13 +25,13 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factors.se2 import Array, Integers
 
-SIGNALS = ("rssi", "phase", "frequency")  # what readers tell of a read
+SIGNALS = ("rssi", "phase", "frequency")  # optional columns of reads
 ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 
 
 @dataclass(frozen=True)
 class Rounds:
-    """N reads, each in one of R rounds: see :func:`~factorgraph_loc.sensors.rfid.rounds.make_rfid_stream`."""
+    """N reads in R rounds: see :func:`~factorgraph_loc.sensors.rfid.rounds.make_rfid_stream`."""
 
     t_ns: Integers
     number: Integers
@@ -45,7 +45,7 @@ class Rounds:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
-    """The stream of reads in the rounds of inventories, or in those that gaps between reads tell apart."""
+    """The stream of reads, in rounds from inventories or from gaps between reads."""
     settings = reading.rig.find(RfidSettings)
     gap = ROUND_GAP if settings is None else settings.round_gap
     return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
@@ -58,9 +58,9 @@ def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
 
 
 def read_rounds(reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[str]) -> Rounds:
-    """The reads in their rounds; ``gap`` [s] between rounds where there are no ``inventories``.
+    """The reads in their rounds; ``gap`` [s] separates rounds if there are no ``inventories``.
 
-    InputError names file, row and field of what is wrong; reads outside every inventory are left out, with a warning.
+    InputError names file, row and field of an invalid value; reads outside of every inventory are skipped with a warning.
     """
     if reads is not None:
         check_reads(reads)
@@ -80,7 +80,7 @@ def read_rounds(reads: TableRows | None, inventories: TableRows | None, gap: flo
 def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[str]) -> Rounds:
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
-    # a reader's clock that jumps is a fault of the recording: what it stamped in the past is for the estimators to drop
+    # a jump of the reader's clock is a fault of the recording: estimators drop the late scans
     checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
     if reads is None:
         nothing = np.zeros(0)
@@ -93,12 +93,12 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
         number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
     keep = np.flatnonzero(number != OUTSIDE)
     if left := len(number) - len(keep):
-        warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside every inventory and are left out")
+        warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside of every inventory and are skipped")
     return _rounds(reads, keep, number[keep], end_ns, antenna)
 
 
 def _told(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
-    """The rounds (N,) that the reads themselves name, by their places in the other table, from 1."""
+    """The rounds (N,) that the reads name, as row numbers of the other table, from 1."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
         bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
@@ -122,14 +122,14 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 
 def check_reads(reads: TableRows) -> None:
-    """InputError for what no radio measures, as in another unit."""
+    """InputError for physically impossible values, for example in a wrong unit."""
     for name in SIGNALS:
         if name in reads.numbers:
             RFID[name].require(reads.path, reads.rows, reads.numbers[name])
 
 
 def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
-    """The columns of both tables, rows in the order of the rounds; a round lasts from its first read to its end."""
+    """The columns of both tables, in the order of the rounds; a round lasts from its first read to its end."""
     number = _numbered(stream)
     _, first = np.unique(number, return_index=True)
     end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
@@ -157,7 +157,7 @@ def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
 
 
 def _numbered(stream: RfidStream) -> Integers:
-    """The number (N,) of each row's round among all rounds, in the order in which they come."""
+    """The number (N,) of each row's round among all rounds, in order."""
     scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0).tolist()
     numbers: dict[tuple[int, int], int] = {}
     keys = zip(scan, stream.round.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""The tags of a map as arrays, in the world's frame."""
+"""The tags of a map as arrays in the world frame."""
 
 import math
 from collections.abc import Collection
@@ -15,8 +15,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class TagMap:
-    """``names``: T EPCs; ``tags``: where they are in the world, the survey's errors corrected; ``index``: places by EPC;
-    ``sigmas`` (T,) [m]: standard deviations of their survey along an axis."""
+    """``names``: T EPCs; ``tags``: in the world frame, with the survey transform applied; ``index``: by EPC; ``sigmas`` (T,) [m]:
+    standard deviations of their survey along an axis."""
 
     names: tuple[str, ...]
     tags: TagArray
@@ -25,7 +25,7 @@ class TagMap:
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
-    """The tags of a map, or those of ``names`` that it has."""
+    """The tags of a map, or those of them in ``names``."""
     chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
     points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
     facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
@@ -36,12 +36,12 @@ def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None 
     return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)}, sigmas)
 
 
-MARGIN = 1.0  # m, how far beyond walls and tags the robot may be
-MARGIN_OF_TAGS = 3.0  # where there are no walls
+MARGIN = 1.0  # m; distance from walls and tags at which the robot may be
+MARGIN_OF_TAGS = 3.0  # m; without walls
 
 
 def extent(world: World, tags: TagArray) -> Array:
-    """Where a robot may be that hears these tags: lower and upper corner (2, 2) [m], by the walls or else by the tags."""
+    """The area of the robot: lower and upper corner (2, 2) [m], from the walls, or from the tags without walls."""
     ends = np.array(world.walls).reshape(-1, 2)
     margin = MARGIN if len(ends) else MARGIN_OF_TAGS
     points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends

@@ -5,5 +5,5 @@ from factorgraph_loc.sensors.rfid.measurement import RfidScan
 
 
 def whole_scans(log: Log) -> list[RfidScan]:
-    """All scans of tags in the order in which they arrived; none of a log without a reader."""
+    """All RFID scans in order of arrival; empty without a reader."""
     return [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]

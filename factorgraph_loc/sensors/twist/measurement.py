@@ -8,8 +8,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """Motion in space of a robot that is carried: velocity ``v`` (3,) [m/s] and turn rate ``w`` (3,) [rad/s], both in its own
-    frame, held until the next row."""
+    """Three-dimensional motion: velocity ``v`` (3,) [m/s] and turn rate ``w`` (3,) [rad/s] in the robot frame, held until the next
+    row."""
 
     sensor: ClassVar[str] = "twist"
     modality: ClassVar[str] = "twist"

@@ -1,4 +1,4 @@
-"""Motion in space that a program hands over."""
+"""Validation of pushed motion in space."""
 
 from typing import Any
 
@@ -8,5 +8,5 @@ from factorgraph_loc.sensors.twist.measurement import Twist
 
 
 def check(m: Twist, where: str) -> dict[str, Any]:
-    """The fields of a measurement, of three axes each; InputError names the first that cannot be."""
+    """The fields of a measurement, with three axes each; InputError names the first invalid one."""
     return {name: within(where, TWIST[name], getattr(m, name), (3,)) for name in ("v", "w")}

@@ -1,4 +1,4 @@
-"""Settings of measured motion in space in the rig."""
+"""Rig settings of measured motion in space."""
 
 from typing import Annotated
 
@@ -10,8 +10,8 @@ PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)
 
 
 class TwistSettings(SensorSettings):
-    """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: standard deviations of the errors of
-    position and orientation along the robot's axes, which grow with the root of time."""
+    """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: random walk of position and orientation
+    along the robot's axes."""
 
     shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
     turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]

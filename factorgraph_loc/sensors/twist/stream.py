@@ -1,4 +1,4 @@
-"""The rows of measured motion in space."""
+"""The stream of measured motion in space."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class TwistStream(Stream):
-    """``v`` (N, 3) [m/s] and ``w`` (N, 3) [rad/s] in the robot's frame, each held until the next row."""
+    """``v`` (N, 3) [m/s] and ``w`` (N, 3) [rad/s] in the robot frame, each held until the next row."""
 
     rank: ClassVar[int] = 1
     v: Array

@@ -1,4 +1,4 @@
-"""Measured motion in space, as estimators of a robot in space take it in."""
+"""Use of measured motion in space by estimators in three dimensions."""
 
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
@@ -7,10 +7,10 @@ from factorgraph_loc.sensors.twist.settings import TwistSettings
 
 
 def in_space(m: Measurement) -> Twist | None:
-    """The motion in space that a measurement tells; None for another one."""
+    """The measurement if it is a :class:`Twist`, else None."""
     return m if isinstance(m, Twist) else None
 
 
 def twist_settings(setup: Setup) -> TwistSettings | None:
-    """Those of a run; None where motion in space is not used."""
+    """The settings of a run, or None if motion in space is not used."""
     return setup.rig.find(TwistSettings) if "twist" in setup.sensors else None

@@ -161,7 +161,7 @@ def test_without_a_cache_it_works_as_well(log, tmp_path, monkeypatch):
     monkeypatch.setenv("FGLOC_CACHE", str(tmp_path / "file"))
     second, (warning,) = frames(log)
     assert all(same(a, b) for a, b in zip(first, second, strict=True))
-    assert warning == f"features are not kept, {tmp_path / 'file' / 'features'}: cannot be written: Not a directory"
+    assert warning == f"features are not cached, {tmp_path / 'file' / 'features'}: cannot be written: Not a directory"
 
 
 def test_the_cache_does_not_grow_without_end(log, cache, monkeypatch):

@@ -166,7 +166,7 @@ def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
     log = read_tags(seconds=20.0)
     with pytest.raises(InputError, match=r"reads-1: has 79 inventory rounds .* expected 100 rounds and 2 tags or more"):
         learn_rfid([log], log.rig, tmp_path / "cart")
-    with pytest.raises(InputError, match=r"its rig says nothing of RFID"):
+    with pytest.raises(InputError, match=r"its rig has no RFID antennas"):
         learn_rfid([log], log.rig.model_copy(update={"rfid": None}), tmp_path / "cart")
 
 

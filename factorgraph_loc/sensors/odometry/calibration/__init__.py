@@ -1,3 +1,3 @@
-"""What is learnt of wheel odometry from logs with a reference."""
+"""Calibration of wheel odometry from logs with a reference."""
 
 __all__ = ["calibrator", "windows"]

@@ -1,4 +1,4 @@
-"""How wheel odometry is calibrated: by the motion of the reference over short windows."""
+"""The calibrator of wheel odometry, from the motion of the reference over short windows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
 MIN_WINDOWS = 20
-ROUNDS = 2  # of constants and scatter in turn
+ROUNDS = 2  # of fitting constants and scatter in turn
 MOST_OUTLIERS = 0.05  # share of the windows
 NOISE = Unit("odometry", ("noise",))
 KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
@@ -39,7 +39,7 @@ class WheelsFit(ConstantsFound):
 
 
 class OdometryCalibrator(ConstantsCalibrator):
-    """See the module."""
+    """The calibrator of wheel odometry."""
 
     section, channel, senses = "odometry", "odometry", False
     noise = (NOISE,)
@@ -56,7 +56,7 @@ class OdometryCalibrator(ConstantsCalibrator):
     }
 
     def check_alike(self, first: Log, log: Log) -> None:
-        """InputError if one reports velocities and the other increments."""
+        """InputError if one log reports velocities and the other increments."""
         ours, theirs = (KINDS[type(odometry_of(one))] for one in (log, first))
         if ours != theirs:
             raise InputError(
@@ -64,7 +64,7 @@ class OdometryCalibrator(ConstantsCalibrator):
             )
 
     def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> WheelsFit | None:
-        """The constants of the wheels, where the reference has headings."""
+        """Fit the constants of the odometry if the reference has headings."""
         if logs[0].reference is None or not logs[0].reference.has_heading:
             return None
         windows = tuple(cut(log, odometry.WINDOW) for log in logs)
@@ -86,11 +86,11 @@ class OdometryCalibrator(ConstantsCalibrator):
         return WheelsFit(windows, everything, gain, start, denied, sigmas)
 
     def base(self, _found: WheelsFit, rig: Rig, _accepted: Collection[str] | None) -> OdometryModel:
-        """The model of the input rig."""
+        """The odometry model of the input rig."""
         return odometry_model(rig)
 
     def changed(self, base: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
-        """The model with other constants."""
+        """The model with changed constants."""
         return odometry.with_constants(base, values)
 
     def fit(
@@ -101,7 +101,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         constants: Sequence[Constant],
         start: Mapping[str, float],
     ) -> Fit:
-        """With the scatter of all constants together."""
+        """Fit with the scatter of all constants."""
         return odometry.fit_odometry(parts, base, constants, found.sigmas, start)
 
     def finished(
@@ -114,7 +114,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         *,
         by_log: bool,
     ) -> Settled:
-        """With the noise that is left."""
+        """The result with the remaining noise."""
         noise = fit_noise(logs, base)
         growth = {
             error: GrowthSettings.bounded(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
@@ -124,22 +124,22 @@ class OdometryCalibrator(ConstantsCalibrator):
         return Settled({"odometry": rig.odometry.model_copy(update=changed)}, learnt, details=noise)
 
     def doubts(self, _found: WheelsFit, details: NoiseFit | None) -> list[str]:
-        """Outliers, and noise that is too good."""
+        """Warnings about outliers and implausibly low noise."""
         doubts = []
         if details is not None and details.outliers > MOST_OUTLIERS:
             doubts.append(
-                f"{100.0 * details.outliers:.0f} % of the odometry windows are outliers: slip, collisions, or gaps in the "
-                "reference?"
+                f"{100.0 * details.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
+                "the reference."
             )
         if details is not None and details.floored:
             doubts.append(
-                f"The fitted noise of the odometry ({', '.join(details.floored)}) is below what wheels can do and was raised: "
+                f"The fitted noise of the odometry ({', '.join(details.floored)}) is lower than wheels can achieve and was raised: "
                 "the reference is probably not independent of the odometry."
             )
         return doubts
 
     def document(self, told: Told) -> dict[str, Any]:
-        """Outliers, and by how much the noise was widened."""
+        """The share of outliers, and the factor by which the noise was widened."""
         noise: NoiseFit | None = told.details
         return {
             "odometry_outliers": None if noise is None else noise.outliers,
@@ -147,13 +147,13 @@ class OdometryCalibrator(ConstantsCalibrator):
         }
 
     def told_noise(self, told: Told) -> list[str]:
-        """How each error grows."""
+        """The growth of each error."""
         noise: NoiseFit | None = told.details
         if noise is None:
             return []
         out = []
         if NOISE not in told.accepted:
-            out.append("<p>The noise of the odometry below is refused: the rig has that of the input.</p>")
+            out.append("<p>The noise of the odometry below is rejected: the rig keeps that of the input.</p>")
         rows = [
             (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
             for error, g in noise.growth.items()
@@ -161,13 +161,13 @@ class OdometryCalibrator(ConstantsCalibrator):
         header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
         out.append(table(header, rows))
         out.append(
-            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise is {noise.widened:.2f} times "
-            "that of windows up to 10 s, so that it holds for half a minute without landmarks.</p>"
+            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
+            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks.</p>"
         )
         return out
 
     def told_residuals(self, told: Told) -> list[str]:
-        """Of the windows."""
+        """Plots of the residuals of the windows."""
         if told.found is None:
             return []
         figure = odometry_figure(told.found.parts, odometry_model(told.learnt))

@@ -1,4 +1,4 @@
-"""Constants of the wheels' odometry, from the relative motion of the reference over short windows."""
+"""Fit of the odometry's constants to the relative motion of the reference over short windows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,18 +14,18 @@ from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
 WINDOW = 2.0  # s
-BLOCK = 20.0  # s; errors in one block may be correlated
-LAGGING_START = 0.05  # s; at a lag of zero the derivative says nothing
+BLOCK = 20.0  # s; errors within a block may be correlated
+LAGGING_START = 0.05  # s; at a lag of zero the derivative vanishes
 
 
-# of the reference over a window: m, m, rad; residuals are not trusted to be smaller
+# error of the reference over a window: m, m, rad; lower bound of the residuals' standard deviations
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
-MIN_STOOD = 5  # windows at rest, below which they have no say
-MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which a window says how large errors are
+MIN_STOOD = 5  # minimum number of windows at rest
+MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which a window is used for the scatter
 
 
 def scatter(windows: Sequence[Windows], model: OdometryModel) -> Array:
-    """Robust standard deviations (3,) of the residuals of windows in which the robot moves: along, lateral [m], heading [rad]."""
+    """Robust standard deviations (3,) of the residuals of windows with motion: longitudinal, lateral [m], heading [rad]."""
     each = []
     for one in windows:
         start, end = one.states(model)
@@ -36,7 +36,7 @@ def scatter(windows: Sequence[Windows], model: OdometryModel) -> Array:
 
 
 def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant, ...]:
-    """What may be fitted; neutral are the values of the rig."""
+    """The constants that may be fitted, with the rig's values as neutral ones."""
     found = [
         Constant("scale_distance", settings.scale_distance, 0.05, 0.2, 5.0),
         Constant("scale_rotation", settings.scale_rotation, 0.05, 0.2, 5.0),
@@ -55,9 +55,9 @@ def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant
 
 
 def denied_at_rest(found: Fit, windows: Sequence[Windows]) -> tuple[str, ...]:
-    """Names of biases that do not fit the windows in which the robot stood: what is reported at rest is known best there.
+    """Names of biases that contradict the windows at rest, where biases are known best.
 
-    ``found``: of all ``windows`` together. Commands, for instance, are zero at rest, whatever is wrong with them on the way.
+    ``found``: the fit to all ``windows``. Commanded velocities, for instance, are zero at rest, whatever their error in motion.
     """
     stood = np.all(np.abs(np.concatenate([one.motion for one in windows])) < REFERENCE_SIGMAS, axis=1)
     denied = []
@@ -70,7 +70,7 @@ def denied_at_rest(found: Fit, windows: Sequence[Windows]) -> tuple[str, ...]:
 
 
 def with_constants(model: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
-    """The model with some of its constants changed."""
+    """The model with some constants changed."""
     changed: dict[str, Any] = dict(values)
     return replace(model, **changed)
 
@@ -82,9 +82,9 @@ def fit_odometry(
     sigmas: Array,
     start: Mapping[str, float],
 ) -> Fit:
-    """The ``constants`` of one or several logs together, the others as in ``model``; ``sigmas`` (3,) of the residuals.
+    """Fit ``constants`` to one or several logs jointly, the others as in ``model``; ``sigmas`` (3,) of the residuals.
 
-    All windows count alike. Weights by the fitted noise would leave the choice to windows in which the robot hardly moves.
+    All windows have equal weight; weights from the fitted noise would favour windows with little motion.
     """
     names = [c.name for c in constants]
 

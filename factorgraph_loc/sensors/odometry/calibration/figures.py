@@ -1,4 +1,4 @@
-"""Plots of what the calibration of odometry left over, as PNG images."""
+"""Plots of the residuals of the odometry calibration, as PNG images."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-_VIEW = 5.0  # robust standard deviations; what lies beyond is drawn at the edge
+_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
 
 
 def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> bytes:
-    """Residuals of the odometry over windows: in time, over distance, and how they grow with the length of the window."""
+    """Residuals over windows: in time, over distance, and their growth with the length of the window."""
     figure, axes = grid(3, 3, 12.0)
     residuals = [one.residuals(model) for one in windows]
     lengths = (*LENGTHS, BLACKOUT)
@@ -43,7 +43,7 @@ def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> bytes:
 
 
 def _growth(windows: Sequence[Windows], model: OdometryModel) -> tuple[Array, Array]:
-    """Root mean squares (3,) of the residuals and of what the model says they are."""
+    """Root mean squares (3,) of the residuals and of the model's prediction for them."""
     squares = np.concatenate([one.residuals(model) for one in windows]) ** 2
     stated = np.concatenate([np.diagonal(one.covariances(model), axis1=1, axis2=2) for one in windows])
     if not len(squares):

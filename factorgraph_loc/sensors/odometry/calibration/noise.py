@@ -1,8 +1,8 @@
-"""Noise of the odometry: how fast its errors grow, by maximum likelihood.
+"""Maximum-likelihood estimation of the growth of odometry errors.
 
 The covariance of relative motion is linear in the variances of :class:`factors.odometry.model.Growth`, so the noise is a sum of
 non-negative variance components (Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several
-lengths tell errors that grow from those of the reference, which do not.
+lengths separate growing errors from the constant ones of the reference.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,18 +21,18 @@ LENGTHS = (1.0, 3.0, 10.0)  # s
 BLACKOUT = 30.0  # s
 MIN_BLACKOUTS = 10
 ERRORS = ("along", "lateral", "heading")
-STUDENT = 5.0  # degrees of freedom of the first, robust fit
-GATE = chi2.ppf(0.9999, 3)  # squared error beyond which a window is an outlier
-_SMALLEST = 1e-8  # variance per unit below which a component is none
-# No wheels are better than this, by error and driver. Less is found where the reference was made with the help of the odometry.
+STUDENT = 5.0  # degrees of freedom of the robust initial fit
+GATE = chi2.ppf(0.9999, 3)  # squared error above which a window is an outlier
+_SMALLEST = 1e-8  # variance per unit below which a component is zero
+# Lower bounds for wheels, by error and driver. A reference that depends on the odometry gives lower values.
 FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 
 
 @dataclass(frozen=True)
 class NoiseFit:
     """``growth`` by error; ``reference`` (2,): standard deviations of reference position [m] and heading [rad] at the ends of
-    windows; ``outliers``: share of windows beyond the gate; ``widened``: factor that is in the growth already, because errors of
-    wheels are correlated too and have grown more after a while than a random walk says; ``floored``: errors raised to the floor."""
+    windows; ``outliers``: share of windows outside the gate; ``widened``: factor already included in the growth, because errors
+    of wheels are correlated and grow faster than a random walk; ``floored``: errors raised to the lower bound."""
 
     growth: Mapping[str, Growth]
     reference: Array
@@ -42,15 +42,15 @@ class NoiseFit:
 
 
 def with_noise(model: OdometryModel, growth: Mapping[str, Growth]) -> OdometryModel:
-    """The model with another noise, by error."""
+    """The model with a different noise, by error."""
     return replace(model, along=growth["along"], lateral=growth["lateral"], heading=growth["heading"])
 
 
 def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
-    """Noise of the odometry ``model`` from the residuals of windows of several lengths, each length counting alike.
+    """Fit the noise of the odometry ``model`` to the residuals of windows of several lengths with equal weight.
 
-    First with the density of Student, which bears outliers; then with that of Gauss, without what lies beyond the gate. Then all is
-    widened until the median error over half a minute, the length of a blackout, is what it should be.
+    First with a Student density, which is robust to outliers; then with a Gaussian density without outliers. Finally the noise is
+    widened so that the median error over half a minute, the length of a blackout, is correct.
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
     bases = np.concatenate([_bases(one, model) for one in windows])
@@ -72,7 +72,7 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 
 
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
-    """By how much the errors over a blackout exceed those of the model; 1 where they do not, or there are too few windows."""
+    """Factor by which the errors over a blackout exceed the model; 1 if they do not or there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
     residuals = np.concatenate([one.residuals(model) for one in windows])
     if len(residuals) < MIN_BLACKOUTS:
@@ -83,12 +83,12 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
 
 
 def _growth(sigmas: Array) -> dict[str, Growth]:
-    """``sigmas`` (3, 3) of along, lateral and heading, by distance, rotation and time."""
+    """``sigmas`` (3, 3) of longitudinal, lateral and heading errors, by distance, rotation and time."""
     return {error: Growth(*row) for error, row in zip(ERRORS, sigmas.tolist(), strict=True)}
 
 
 def _bases(windows: Windows, model: OdometryModel) -> Array:
-    """Covariances (M, 11, 3, 3) by unit variances: three drivers of each error, then position and heading of the reference."""
+    """Covariances (M, 11, 3, 3) for unit variances: three drivers of each error, then position and heading of the reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
     drivers[:, 2] -= end[:, 7] - start[:, 7]
@@ -117,7 +117,7 @@ def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, A
 
 
 def _maximise(bases: Array, residuals: Array, weights: Array, start: Array, student: float | None) -> Array:
-    """Variances (11,) that maximise the likelihood, searched as logarithms with the exact gradient."""
+    """Variances (11,) that maximise the likelihood; optimised as logarithms with the exact gradient."""
 
     def cost(logs: Array) -> tuple[float, Array]:
         variances = np.exp(logs)

@@ -1,4 +1,4 @@
-"""Pieces of a log, as the reference and as the wheels saw them."""
+"""Segments of a log with the motion of reference and odometry."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from factors.odometry.chain import OdometryChain
 from factors.odometry.model import OdometryModel, relative_motion
 from factors.se2 import Array
 
-REFERENCE_GAP = 0.35  # s between reference poses that may be interpolated
-BEFORE = 1.0  # s before a window in which the odometry must be complete too: commands act late
+REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
+BEFORE = 1.0  # s before a window in which the odometry must be complete too, because of its lag
 
 
 @dataclass(frozen=True)
 class Windows:
-    """M pieces of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them."""
+    """M segments of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them."""
 
     log: Log
     begin: Array
@@ -43,13 +43,13 @@ class Windows:
         return chain.states(self.begin), chain.states(self.end)
 
     def residuals(self, model: OdometryModel) -> Array:
-        """What the reference moved beyond the odometry (M, 3): a body-frame perturbation at the end, [m, m, rad]."""
+        """Motion of the reference relative to the odometry (M, 3): a body-frame perturbation at the end, [m, m, rad]."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
 
     def covariances(self, model: OdometryModel) -> Array:
-        """What the model says about the covariances (M, 3, 3) of the residuals."""
+        """The model's covariances (M, 3, 3) of the residuals."""
         start, end = self.states(model)
         pairs = zip(start.tolist(), end.tolist(), strict=True)
         found = [relative_motion(model, ChainState(*a), ChainState(*b)).covariance for a, b in pairs]
@@ -57,7 +57,7 @@ class Windows:
 
 
 def cut(log: Log, length: float) -> Windows:
-    """The windows of ``length`` seconds, one after another, at whose ends the reference has poses, without odometry gaps."""
+    """Consecutive windows of ``length`` seconds with reference poses at both ends and without odometry gaps."""
     assert log.reference is not None
     first = max(float(log.reference.t[0]), float(odometry_of(log).t[0]) + log.rig.time_offset("odometry"))
     last = min(float(log.reference.t[-1]), float(odometry_of(log).t[-1]) + log.rig.time_offset("odometry"))
@@ -72,14 +72,14 @@ def cut(log: Log, length: float) -> Windows:
 
 
 def odometry_of(log: Log) -> VelocityStream | IncrementStream:
-    """The wheels' stream."""
+    """The odometry stream."""
     stream = log.streams["odometry"]
     assert isinstance(stream, VelocityStream | IncrementStream)
     return stream
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """The whole odometry of a log as a chain."""
+    """The integrated odometry of a log."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")

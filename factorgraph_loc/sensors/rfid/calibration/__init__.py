@@ -1,3 +1,3 @@
-"""What is learnt of RFID readers and tags from logs with a reference."""
+"""Calibration of RFID readers and tags from logs with a reference."""
 
 __all__ = ["calibrator", "phase", "rssi"]

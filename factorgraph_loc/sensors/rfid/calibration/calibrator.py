@@ -1,4 +1,4 @@
-"""How RFID is calibrated: by what was read along the reference, and by the smoother's errors."""
+"""The calibrator of RFID, from reads along the reference and the smoother's errors."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +16,13 @@ from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, default_models
 
 PLACES, MODEL, STRENGTH = Unit("rfid", ("places",)), Unit("rfid", ("models",)), Unit("rfid", ("rssi",))
-TOO_SHORT = "refused: the logs are too short to judge it"
+TOO_SHORT = "rejected: the logs are too short to judge it"
 
 
 @dataclass(frozen=True)
 class RfidFound:
-    """The ``sections`` of the rig that were learnt, and the ``knowledge``; None of some of the logs, of which ``like`` is what all
-    tell. ``grids``: where files of grids are."""
+    """The learnt ``sections`` of the rig and the ``knowledge``, which is None for a subset of the logs, with the result of all logs
+    in ``like``. ``grids``: path of grid files."""
 
     sections: Mapping[str, Any]
     knowledge: RfidKnowledge | None
@@ -31,18 +31,23 @@ class RfidFound:
 
 
 class RfidCalibrator(Calibrator):
-    """See the module."""
+    """The calibrator of RFID."""
 
-    section, channel, estimator, folds = "rfid", "rfid", "smoother", (3, 2)  # models of detection take long to fit
+    section, channel, estimator, folds = (
+        "rfid",
+        "rfid",
+        "smoother",
+        (3, 2),
+    )  # few folds, as detection models are slow to fit
     models = (MODEL,)
     is_consistent = judged_unseen = True
 
     def recordings(self, logs: Sequence[Log]) -> list[int]:
-        """Logs that hold the same reads are one."""
+        """Identifiers by content: logs with the same reads are one recording."""
         return distinct(logs)
 
     def learn(self, logs: Sequence[Log], rig: Rig, grids: Path | None, like: RfidFound | None) -> RfidFound | None:
-        """Survey, mounting and models, of logs with reads; of some of the logs in the way that is best for all."""
+        """Learn survey, mounting and models from logs with reads; for a subset with the choices made for all logs."""
         if self.channel not in logs[0].streams:
             return None
         if grids is None:
@@ -62,7 +67,7 @@ class RfidCalibrator(Calibrator):
         *,
         by_log: bool,
     ) -> Settled:
-        """Anew, with tags and antennas where the input rig has them, if their places are refused."""
+        """The result; learnt again with the input rig's tag and antenna positions if the learnt ones are rejected."""
         moved = any(offset.kept for offset in found.like.offsets)
         if accepted is None or not moved or PLACES.names[0] in accepted:
             return Settled(found.sections)
@@ -73,15 +78,15 @@ class RfidCalibrator(Calibrator):
         return Settled({"rfid": learnt.rfid, "survey": learnt.survey})
 
     def constant_units(self, found: RfidFound, _kept: Any, _learnt: Rig, _start: Rig) -> dict[Unit, float]:
-        """The places of tags and antennas come last."""
+        """No units; positions of tags and antennas are judged last."""
         return {PLACES: float("inf")} if any(offset.kept for offset in found.like.offsets) else {}
 
     def optional(self, learnt: Rig) -> tuple[Unit, ...]:
-        """The strength of reads."""
+        """The signal strength."""
         return (STRENGTH,) if learnt.rfid is not None and learnt.rfid.rssi is not None else ()
 
     def mixed(self, old: Rig, new: Rig, state: State) -> dict[str, Any]:
-        """Places, models and strength, each on its own."""
+        """Positions, models and strength, each selected separately."""
         if old.rfid is None or new.rfid is None or not state & {PLACES, MODEL, STRENGTH}:
             return {}
         models, places = (new.rfid if unit in state else old.rfid for unit in (MODEL, PLACES))
@@ -96,7 +101,7 @@ class RfidCalibrator(Calibrator):
         return {"rfid": settings.model_copy(update=update), "survey": survey}
 
     def usable(self, rig: Rig, state: State) -> Rig:
-        """The strength of reads is used where it is judged, and where the rig knows how."""
+        """The rig; signal strength is used while it is judged, if the rig has its model."""
         known = rig.rfid is not None and rig.rfid.rssi is not None
         sensors = [name for name in rig.sensors if name != "rssi" or known]
         if STRENGTH in state and "rssi" not in sensors:
@@ -104,11 +109,11 @@ class RfidCalibrator(Calibrator):
         return rig.model_copy(update={"sensors": tuple(sensors)})
 
     def is_complete(self, rig: Rig) -> bool:
-        """With the default model of detection a run tells nothing."""
+        """Whether a detection model was learnt or given, because the default model is uninformative."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def guess(self, found: RfidFound) -> float:
-        """Reads are not less alike than their scatter says, even if an estimator on these logs would bear it."""
+        """The factor of the reads' scatter, which is also the lower bound."""
         return float(found.like.share**-0.5)
 
     def least(self, found: RfidFound) -> float:
@@ -116,22 +121,22 @@ class RfidCalibrator(Calibrator):
         return self.guess(found)
 
     def inflated(self, rig: Rig, factor: float) -> Rig:
-        """By the tempering."""
+        """The rig with its tempering adjusted."""
         return tempered(rig, factor)
 
     def as_honest_as(self, rig: Rig, other: Rig) -> Rig:
-        """By the tempering."""
+        """The rig with the other's tempering."""
         return rig if rig.rfid is None or other.rfid is None else tempered(rig, other.rfid.tempering**-0.5)
 
     def honest(self, rig: Rig, _factor: float | None, other: Rig, learnt: Rig) -> Rig:
-        """With the tempering, and the share of dead tags, that all logs tell."""
+        """The rig with the tempering and the share of dead tags from all logs."""
         if rig.rfid is None or learnt.rfid is None:
             return rig
         settings = rig.rfid.model_copy(update={"dead_tags": learnt.rfid.dead_tags})
         return self.as_honest_as(rig.model_copy(update={"rfid": settings}), other)
 
     def judged(self, found: RfidFound, judgements: Mapping[str, Any]) -> RfidFound:
-        """With what an estimator says of the places."""
+        """The result with the estimator's judgement of the positions."""
         judgement = judgements.get(PLACES.names[0])
         accepted = judgement is not None and judgement.accepted
         why = TOO_SHORT if judgement is None else judgement.why
@@ -140,11 +145,12 @@ class RfidCalibrator(Calibrator):
         return replace(found, knowledge=knowledge, like=knowledge)
 
     def doubts(self, found: RfidFound | None, _details: Any) -> list[str]:
-        """Tags that seem to be elsewhere or dead."""
+        """Warnings about misplaced and dead tags."""
         if found is None:
             return []
         doubts = [
-            f"Tag {tag.name} seems to be {tag.distance:.1f} m from where the map has it." for tag in found.like.doubts
+            f"Tag {tag.name} seems to be {tag.distance:.1f} m from its position in the map."
+            for tag in found.like.doubts
         ]
         dead = found.like.dead
         if dead.tags:
@@ -153,13 +159,13 @@ class RfidCalibrator(Calibrator):
         return doubts
 
     def document(self, told: Told) -> dict[str, Any]:
-        """Everything of the report."""
+        """The content of the report."""
         if told.found is None:
             return {"rfid": None}
         return {"rfid": report.rfid_document(told.found.like, accepted=MODEL in told.accepted)}
 
     def tables(self, told: Told) -> list[Rows]:
-        """Survey and mounting, models of detection, and doubtful tags if there are any."""
+        """Survey and mounting, detection models, and doubtful tags if any."""
         if told.found is None:
             return []
         found = told.found.like
@@ -167,7 +173,7 @@ class RfidCalibrator(Calibrator):
         return [*tables, report.tags_table(found)] if found.doubts else tables
 
     def told_section(self, told: Told) -> list[str]:
-        """The tables, and how well the models predict."""
+        """The tables, and the accuracy of the models' predictions."""
         if told.found is None:
             return []
         found = told.found.like
@@ -176,11 +182,10 @@ class RfidCalibrator(Calibrator):
             f"<p>{text(report.tempering_text(found, told.rig))}</p>",
             f"<p>{text(report.dead_text(found))}</p>",
             *(table(*one) for one in self.tables(told)),
-            "<p>How often tags were read, against the probability predicted by a model that was fitted to other logs or "
-            "stretches.</p>",
+            "<p>Observed frequency of reads against the probability predicted by a model that was fitted to other logs or "
+            "segments.</p>",
             image(figures.reliability_figure(found)),
-            "<p>The probability of a read around the antenna, which is the triangle: observed on the left, beside it the "
-            "model.</p>",
+            "<p>Probability of a read around the antenna (triangle): observed on the left, the model on the right.</p>",
             image(figures.field_figure(found)),
         ]
 

@@ -1,4 +1,4 @@
-"""Which model of detection predicts best what it was not fitted to."""
+"""Selection of the detection model with the best prediction of held-out data."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,8 @@ from factors.rfid.model import DetectionModel
 from factors.se2 import Array
 
 SMOOTHNESS = (5.0, 25.0, 125.0)
-WORTH = 1e-3  # nats a pair; what helps less does not pay for itself
-BEAM_PAIRS = 20000  # are enough for its four parameters
+WORTH = 1e-3  # nats per pair; minimum gain of a more complex model
+BEAM_PAIRS = 20000  # enough for its four parameters
 
 
 PLANE = Axes()
@@ -20,8 +20,8 @@ PLANE = Axes()
 
 @dataclass(frozen=True)
 class Kind:
-    """A way to fit: ``name`` beam, logistic or grid; ``facing``: with the features that need it; ``own``: each antenna its own
-    model. ``axes`` and ``smoothness`` of a grid."""
+    """A model to fit: ``name`` beam, logistic or grid; ``facing``: whether features use the tags' facing; ``own``: one model per
+    antenna. ``axes`` and ``smoothness`` of a grid."""
 
     name: str
     facing: bool = False
@@ -43,8 +43,8 @@ class Kind:
 
 @dataclass(frozen=True)
 class Trial:
-    """Held-out negative log-likelihood [nats a pair] of a way to fit: of each fold, and over all; ``predicted`` (M,): probabilities
-    of the pairs, floor included, each by a fit to the other folds."""
+    """Held-out negative log-likelihood [nats per pair] of a model, per fold and over all; ``predicted`` (M,): probabilities of the
+    pairs, floor included, from fits to the other folds."""
 
     kind: Kind
     by_fold: tuple[float, ...]
@@ -54,7 +54,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Choice:
-    """The trial that was ``best``, and all ``trials``."""
+    """The ``best`` trial, and all ``trials``."""
 
     best: Trial
     trials: tuple[Trial, ...]
@@ -65,7 +65,7 @@ class Choice:
 
 
 def fit(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """The models of ``antennas``, and which of them each has. An antenna that never listened has that of all."""
+    """The models, and the model index of each antenna. An antenna without rounds has the common model."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     heard = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -76,9 +76,9 @@ def fit(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[De
 
 
 def choose(pairs: Pairs, floor: Floor, antennas: int, *, facing: bool) -> Choice:
-    """The best way to fit, by the likelihood of folds of ``pairs`` that had no part in the fit.
+    """Select the model by its likelihood on held-out folds of ``pairs``.
 
-    A way with more freedom has to gain :data:`WORTH` on one with less. ``facing``: whether the tags' facing is known.
+    A more complex model must gain :data:`WORTH` over a simpler one. ``facing``: whether the tags' facing is known.
     """
     trials: list[Trial] = []
 
@@ -110,7 +110,7 @@ def choose(pairs: Pairs, floor: Floor, antennas: int, *, facing: bool) -> Choice
 
 
 def held_out(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Array:
-    """Probability (M,) of a read, floor included, of each fold by a fit to the others."""
+    """Probability (M,) of a read, floor included, for each fold from a fit to the others."""
     out = np.empty(len(pairs.facing))
     for fold in np.unique(pairs.fold):
         test = pairs.fold == fold

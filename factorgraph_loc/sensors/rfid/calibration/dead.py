@@ -1,8 +1,7 @@
-"""The share of a map's tags that are dead: never read along the references of logs, though they should have been.
+"""The share of dead tags in a map: tags that are never read along the references although they should have been.
 
-How surely a tag should have been read follows from the detection model along the reference, so a tag that the robot hardly passed
-tells little. The share is the maximum of the posterior of a mixture, by EM (Dempster, Laird, Rubin, JRSS B 39(1), 1977), with a
-prior that is worth :data:`PRIOR_TAGS` tags of the usual share: a few logs of a few tags move it little.
+The detection model along the reference tells how likely a working tag would have been missed. The share maximises the posterior of
+a mixture, by EM (Dempster, Laird, Rubin, JRSS B 39(1), 1977), with a prior worth :data:`PRIOR_TAGS` tags of the usual share.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,22 +24,22 @@ ITERATIONS = 200
 
 @dataclass(frozen=True)
 class DeadTags:
-    """``share`` of the tags that are dead; ``tags``: those that no log reads, with the probability that they are dead."""
+    """``share``: of dead tags; ``tags``: those without reads in any log, with the probability that they are dead."""
 
     share: float
     tags: Mapping[str, float]
 
     @property
     def believed(self) -> tuple[str, ...]:
-        """Those that are more likely dead than not, the surest first."""
+        """Tags that are more likely dead than not, most certain first."""
         found = [name for name, dead in self.tags.items() if dead > BELIEVED]
         return tuple(sorted(found, key=lambda name: -self.tags[name]))
 
 
 def dead_tags(logs: Sequence[Log], rounds: Sequence[Rounds], rig: Rig) -> DeadTags:
-    """The share of dead tags in the maps of logs, whose ``rounds`` lie along their references, with the model of ``rig``.
+    """The share of dead tags in the maps of logs, with their ``rounds`` along the references and the model of ``rig``.
 
-    A tag of one name at two places counts as two.
+    A name with two positions counts as two tags.
     """
     assert rig.rfid is not None
     silence: dict[tuple[str, float, float], float] = {}

@@ -1,4 +1,4 @@
-"""Pictures of a learnt model of detection: how reliable its probabilities are, and its field around the antenna."""
+"""Plots of a learnt detection model: reliability of its probabilities, and its field around the antenna."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STEP = 0.1  # m
 
 
 def reliability_figure(found: RfidKnowledge) -> bytes:
-    """Held-out probabilities against how often tags were read then, and how many reads each probability stands for."""
+    """Held-out predictions against observed frequencies of reads, and the number of reads per bin."""
     figure, axes = grid(1, 2, 4.5)
     predicted, observed, low, high, count = reliability(found)
     panel, amounts = axes[0]
@@ -46,7 +46,7 @@ def reliability_figure(found: RfidKnowledge) -> bytes:
 
 
 def field_figure(found: RfidKnowledge) -> bytes:
-    """The probability of a read around the antenna: as seen, on the left, and by each model for tags that face it or not."""
+    """Probability of a read around the antenna: observed, and by each model for tags facing towards and away from it."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in found.models) else (0.0,)
     figure, axes = grid(len(found.models), 1 + len(facings), 5.0 * len(found.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, _STEP)
@@ -69,7 +69,7 @@ def field_figure(found: RfidKnowledge) -> bytes:
 
 
 def reliability(found: RfidKnowledge) -> tuple[Array, Array, Array, Array, Array]:
-    """Mean prediction, share read, Wilson's interval (low, high) and rounds, of each bin of probability that has any."""
+    """Mean prediction, observed frequency, Wilson's interval (low, high) and rounds of each non-empty bin."""
     q, pairs = found.choice.best.predicted, found.pairs
     bins = np.minimum((q * BINS).astype(np.int64), BINS - 1)
     count, weighted, hits = (
@@ -83,7 +83,7 @@ def reliability(found: RfidKnowledge) -> tuple[Array, Array, Array, Array, Array
 
 
 def _observed(found: RfidKnowledge, mine: NDArray[np.bool_], axis: Array) -> Array:
-    """Share of rounds in which a tag at each place was read; NaN where there was none."""
+    """Observed frequency of reads at each position; NaN without rounds."""
     edges = np.append(axis - 0.5 * _STEP, axis[-1] + 0.5 * _STEP)
     x, y, _ = found.pairs.points[mine].T
     bins = [edges, edges]

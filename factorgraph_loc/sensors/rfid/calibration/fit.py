@@ -1,7 +1,7 @@
-"""Parametric models of detection, fitted to pairs by penalised maximum likelihood.
+"""Penalised maximum-likelihood fits of parametric detection models.
 
 A logit that is linear in its parameters is fitted by Fisher scoring (McCullagh and Nelder, "Generalized Linear Models", 1989,
-section 2.5), with the derivatives of the likelihood with its floor; steps that do not help are halved.
+section 2.5), using the derivatives of the likelihood with its floor; unsuccessful steps are halved.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from factors.rfid.model import FEATURES, NEAR, BeamModel, LogisticModel, logits
 from factors.se2 import Array
 
 FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
-RIDGE = 1.0  # of coefficients of features with a standard deviation of 1, in nats
-EDGE = 5.0  # rounds, all around at the reach, in which nothing was read: what no log shows must not grow with distance
+RIDGE = 1.0  # penalty on coefficients of features with unit standard deviation, in nats
+EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapolations do not grow with distance
 ITERATIONS = 50
-CONVERGED = 1e-4  # of the cost, as a share: gained by the last step, after which Newton would gain far less
+CONVERGED = 1e-4  # relative decrease of the cost in the last step
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Probabilities of a false read, and of a miss whatever the place."""
+    """Probabilities of a false read, and of a miss at any position."""
 
     false_read: float = 0.02
     miss: float = 0.02
@@ -46,7 +46,7 @@ def fit_linear(
     penalty: Array | sparse.csc_array,
     floor: Floor,
 ) -> Array:
-    """Parameters (P,) of the logit ``offset + design @ p`` (M,) with the largest likelihood less ``p @ penalty @ p / 2``."""
+    """Parameters (P,) of the logit ``offset + design @ p`` (M,) that maximise the likelihood minus ``p @ penalty @ p / 2``."""
     values = np.zeros(design.shape[1])
 
     def cost(p: Array) -> tuple[float, Array, Array]:
@@ -76,7 +76,7 @@ def fit_linear(
 
 
 def fit_logistic(pairs: Pairs, floor: Floor, *, with_facing: bool) -> LogisticModel:
-    """The logistic model of pairs, with or without the features that need the facing of tags."""
+    """Fit a logistic model, with or without the features of the tags' facing."""
     edge, edge_facing = _edge()
     design = np.vstack((features(pairs.points, pairs.facing), features(edge, edge_facing)))
     hits = np.concatenate((pairs.hits, np.zeros(len(edge))))
@@ -96,7 +96,7 @@ def fit_logistic(pairs: Pairs, floor: Floor, *, with_facing: bool) -> LogisticMo
 
 
 def fit_beam(pairs: Pairs, floor: Floor) -> BeamModel:
-    """The beam model of pairs."""
+    """Fit a beam model."""
     bounds = [(-3.0, 7.0), (np.log(0.3), np.log(2.0 * REACH)), (np.log(0.05), np.log(5.0)), (np.log(0.1), np.log(9.0))]
 
     def model(p: Array) -> BeamModel:
@@ -111,7 +111,7 @@ def fit_beam(pairs: Pairs, floor: Floor) -> BeamModel:
 
 
 def _edge() -> tuple[Array, Array]:
-    """Places (E, 3) around the antenna at the reach, and facings (E,)."""
+    """Positions (E, 3) around the antenna at the maximum range, and facings (E,)."""
     bearing, height, facing = (
         a.ravel()
         for a in np.meshgrid(

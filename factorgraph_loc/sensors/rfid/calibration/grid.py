@@ -1,8 +1,8 @@
-"""The field of detection in an antenna's frame, as a grid of logits learnt from pairs.
+"""The detection field in an antenna's frame, as a grid of logits fitted to pairs.
 
-What is learnt is how the field differs from a parametric one: smoothly, by a penalty on second differences (Eilers and Marx,
-"Flexible smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and not at all where there are no data.
-Between knots the logits are interpolated as :mod:`factors.rfid.model` does it, so that what is fitted is what is used.
+The grid is fitted as a difference to a parametric field: smooth by a penalty on second differences (Eilers and Marx, "Flexible
+smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and zero where there are no data. Logits are interpolated
+as in :mod:`factors.rfid.model`.
 """
 
 import math
@@ -19,25 +19,25 @@ from factors.se2 import Array
 
 CELL = 0.5  # m
 EXTENT = 6.0  # m
-FACINGS = 5  # knots where the facing matters
+FACINGS = 5  # knots, if the facing is used
 HEIGHT_STEP = 0.5  # m
-PULL = 0.3  # to the parametric field, of a knot, in nats
-FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine, within which pairs are put together
+PULL = 0.3  # penalty of a knot's difference to the parametric field, in nats
+FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine; closer pairs are merged
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Where a field differs from the parametric one: everywhere alike, or by height, or by facing too."""
+    """Axes along which a field differs from the parametric one: x and y, also height, or also facing."""
 
     by_height: bool = False
     by_facing: bool = False
 
 
 def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: Axes, floor: Floor) -> GridModel:
-    """The grid of pairs, near to the ``parametric`` model; ``smoothness``: weight of squared second differences of logits.
+    """Fit a grid to pairs, near to the ``parametric`` model; ``smoothness``: weight of squared second differences of logits.
 
-    The grid has a height axis where the heights of ``pairs`` differ, and a facing axis where the model has. What ``axes`` leaves
-    out is as the parametric model says.
+    The grid has a height axis if the heights of ``pairs`` differ, and a facing axis if the model has one. Along axes that ``axes``
+    excludes, the difference to the parametric model is constant.
     """
     heights = _heights(pairs)
     base = bake(parametric, EXTENT, CELL, heights, FACINGS if parametric.uses_facing or axes.by_facing else 1)
@@ -52,7 +52,7 @@ def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: 
 
 
 def _heights(pairs: Pairs) -> list[float]:
-    """Evenly spaced heights over those of nearly all pairs, with zero where it lies among them; one alone where all are alike."""
+    """Evenly spaced heights over nearly all pairs, including zero if it is within; a single one if all are equal."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
         return [round(0.5 * (low + high), 3)]
@@ -60,7 +60,7 @@ def _heights(pairs: Pairs) -> list[float]:
 
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
-    """The matrix (M, knots) that makes logits at ``points`` (M, 3) with ``facing`` (M,) from the grid's knots."""
+    """The matrix (M, knots) from the grid's knots to logits at ``points`` (M, 3) with ``facing`` (M,)."""
     shape = grid.logits.shape
     axes = [
         _linear((points[:, 2] - grid.heights[0]) / _step(grid.heights), shape[0]),
@@ -81,7 +81,7 @@ def _step(heights: Array) -> float:
 
 
 def _linear(place: Array, count: int) -> tuple[Array, Array]:
-    """Knots (M, 2) and their weights; one alone where there is one."""
+    """Knots (M, 2) and weights of linear interpolation; a single knot if there is only one."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -90,7 +90,7 @@ def _linear(place: Array, count: int) -> tuple[Array, Array]:
 
 
 def _cubic(place: Array, count: int) -> tuple[Array, Array]:
-    """Knots (M, 4) and their weights, by cubic convolution (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6)."""
+    """Knots (M, 4) and weights of cubic convolution (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6)."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -105,7 +105,7 @@ def _cubic(place: Array, count: int) -> tuple[Array, Array]:
 
 
 def _roughness(shape: Sequence[int]) -> sparse.csc_array:
-    """The sum of squared second differences along each axis; first differences where an axis has two knots."""
+    """The sum of squared second differences along each axis, or first differences if an axis has two knots."""
     total = sparse.csc_array((int(np.prod(shape)),) * 2)
     for axis, size in enumerate(shape):
         if size < 2:
@@ -120,7 +120,7 @@ def _roughness(shape: Sequence[int]) -> sparse.csc_array:
 
 
 def _together(pairs: Pairs) -> Pairs:
-    """Pairs at nearly the same place as one, in their middle."""
+    """Merge pairs at nearly equal positions at their mean."""
     keys = np.floor(np.column_stack((pairs.points, pairs.facing)) / FINE).astype(np.int64)
     keys -= keys.min(axis=0)
     _, first, inverse = np.unique(

@@ -1,4 +1,4 @@
-"""What logs with reference poses tell about RFID: survey, mounting, the model of detection, doubtful tags."""
+"""Learning of RFID settings from logs with reference poses: survey, mounting, detection model, doubtful tags."""
 
 import hashlib
 from collections.abc import Sequence
@@ -38,12 +38,11 @@ DEFAULT = "default"
 
 @dataclass(frozen=True)
 class RfidKnowledge:
-    """What was learnt of RFID.
+    """The result of learning RFID.
 
-    ``models``, and ``which`` of them each antenna has; ``choice`` of the way they were fitted; ``offsets`` of survey and mounting;
-    ``phase``: the focus, where logs have phases; ``share``: exponent at which the reads' scatter along the reference is what the
-    likelihood says; ``doubts``: misplaced tags; ``dead``: how many tags are, and which may be. ``pairs``: what the models were
-    fitted to.
+    ``models``, and ``which`` of them each antenna has; ``choice`` of the model; ``offsets`` of survey and mounting; ``phase``: the
+    focus, if logs have phases; ``share``: exponent at which the likelihood matches the reads' scatter along the reference;
+    ``doubts``: misplaced tags; ``dead``: dead tags. ``pairs``: the data of the models.
     """
 
     models: tuple[DetectionModel, ...]
@@ -62,17 +61,15 @@ class RfidKnowledge:
 def learn_rfid(
     logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None, *, placed: bool = True
 ) -> tuple[Rig, RfidKnowledge | None]:
-    """The rig with what ``logs`` tell about its RFID; ``grids``: path and beginning of the names of learnt grids.
+    """Learn the RFID settings of a rig from ``logs``; ``grids``: path and name prefix of learnt grids.
 
-    Logs that hold the same reads count once. With a ``kind`` the models are fitted in that way, and that is all: no choice, no
-    doubts, and None in place of the knowledge. Unless ``placed``, tags and antennas stay where
-    ``rig`` has them. InputError if the rig has no antennas or a log has too few rounds.
+    Logs with the same reads count once. With a ``kind``, only models of that kind are fitted, and the knowledge is None. Without
+    ``placed``, tags and antennas keep the positions of ``rig``. InputError if the rig has no antennas or a log has too few
+    rounds.
     """
     settings = rig.rfid
     if settings is None:
-        raise InputError(
-            f"{logs[0].name}: its rig says nothing of RFID, expected the antennas' places in [rfid.antennas]"
-        )
+        raise InputError(f"{logs[0].name}: its rig has no RFID antennas, expected their mounting in [rfid.antennas]")
     numbers = distinct(logs)
     logs = [log for i, log in enumerate(logs) if numbers.index(numbers[i]) == i]
     floor = _floor(settings)
@@ -125,7 +122,7 @@ def _placed(
     *,
     facing: bool,
 ) -> tuple[RfidSettings, SurveySettings, tuple[Offset, ...], PhaseFit | None]:
-    """Survey and mounting: by the phases where there are any, and what these do not tell by what was read."""
+    """Survey and mounting: from phases if there are any, and the rest from reads."""
     settings = settings.model_copy(update={"antennas": dict(settings.all_antennas()), "preset": None})
     phase = _focus([log for log in logs if log.world == logs[0].world and _has_phases(log)], settings, survey)
     focused: tuple[Offset, ...] = ()
@@ -137,7 +134,7 @@ def _placed(
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """None where phases are missing, or too few of them near their tags."""
+    """The focus by phases; None if there are too few phases near their tags."""
     try:
         return fit_phase(logs, settings, survey) if logs else None
     except InputError:
@@ -151,13 +148,13 @@ def _has_phases(log: Log) -> bool:
 
 
 def _floor(settings: RfidSettings) -> Floor:
-    """Of the rig where it gives one, else what is robust against a few wrong tags and reads."""
+    """The rig's floor if given, else one that is robust to a few wrong tags and reads."""
     given = settings.model_fields_set & {"false_read", "miss"}
     return Floor(settings.false_read, settings.miss) if given else Floor()
 
 
 def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> SurveySettings:
-    """A survey that is not corrected yet turns about the middle of its tags: shift and rotation are then told apart."""
+    """The survey with its rotation about the centre of the tags, if uncorrected, to separate shift and rotation."""
     if survey != SurveySettings():
         return survey
     places = {name: point for one in rounds for name, point in zip(one.names, one.tags.points[:, :2], strict=True)}
@@ -169,7 +166,7 @@ def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
     antennas = dict(settings.all_antennas())
-    # a model of one antenna has its name
+    # a model of a single antenna has the antenna's name
     names = [DEFAULT] * len(models)
     if len(models) > 1:
         names = [next((a for a, w in zip(antennas, which, strict=True) if w == i), DEFAULT) for i in range(len(models))]
@@ -192,12 +189,12 @@ def _with_models(
 def _with_signals(
     logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings, *, focused: bool
 ) -> RfidSettings:
-    """With what estimators need for the strength of reads, where logs have it, and for their phase, where it came into focus:
-    without that the geometry is not good enough. Whether they use it is for the rig's sensors to say."""
+    """The settings with models for strength, if logs have it, and for phase, if it was focused, as the geometry is too inaccurate
+    otherwise. The rig's sensors determine whether they are used."""
     changes: dict[str, object] = {}
     try:
         strength = fit_rssi(logs, settings, survey).settings
-    except InputError:  # too few reads have one
+    except InputError:  # too few reads have a strength
         pass
     else:
         tempering = strength.tempering if settings.rssi is None else settings.rssi.tempering
@@ -225,6 +222,6 @@ def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings 
 
 
 def _safe(name: str) -> str:
-    """A name that is a file's on every system, and of two antennas never the same."""
+    """A name that is a valid file name on every system and unique per antenna."""
     safe = file_name("".join(c if c.isalnum() or c in "-_" else "-" for c in name))
     return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"

@@ -1,7 +1,7 @@
-"""Where the antennas sit and how the survey of the tags lies in the reference's frame, from what was read on the way.
+"""Estimation of antenna mounting and survey transform from reads along the reference.
 
-Fisher scoring of the likelihood of all reads along the reference. Standard errors are those of the sandwich with clusters (Liang
-and Zeger, "Longitudinal data analysis using generalized linear models", 1986): reads within a block of time go together.
+Fisher scoring of the likelihood of all reads. Standard errors are those of the sandwich estimator with clusters (Liang and Zeger,
+"Longitudinal data analysis using generalized linear models", 1986), as reads within a block of time are correlated.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,20 @@ from factors import se2
 from factors.rfid.model import DetectionModel
 from factors.se2 import Array
 
-ROUNDS = 3  # of constants and model in turn
-MOST_PAIRS = 60000  # of a log
+ROUNDS = 3  # of fitting constants and model in turn
+MOST_PAIRS = 60000  # per log
 SURVEY = ("x", "y", "heading")
 MOUNTING = ("x", "y", "yaw")
-TYPICAL = {"x": 0.3, "y": 0.3, "heading": 0.1, "yaw": 0.2}  # m, rad, standard deviations of what is wrong at first
-# what a model of detection, which is alike left and right, may mistake for a shift: m, rad
+TYPICAL = {"x": 0.3, "y": 0.3, "heading": 0.1, "yaw": 0.2}  # m, rad; prior standard deviations
+# error by confusion with the detection model, which is symmetric: m, rad
 BLIND = {"x": 0.05, "y": 0.05, "heading": 0.02, "yaw": 0.1}
 ITERATIONS = 4
-STEP = 1e-4  # m, rad, of numerical derivatives
+STEP = 1e-4  # m, rad; of numerical derivatives
 
 
 @dataclass(frozen=True)
 class Place:
-    """Which constant: of the survey (``antenna`` None), of all antennas alike (-1), or of one of them."""
+    """A constant of the survey (``antenna`` None), of all antennas jointly (-1), or of one antenna."""
 
     name: str
     antenna: int | None = None
@@ -41,7 +41,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Placing:
-    """``settings`` and ``survey`` as found; changes (P,) of ``places`` from the start with standard ``errors``; ``nll`` a round."""
+    """``settings`` and ``survey`` as found; changes (P,) of ``places`` with standard ``errors``; ``nll`` per round."""
 
     settings: RfidSettings
     survey: SurveySettings
@@ -53,8 +53,8 @@ class Placing:
 
 @dataclass(frozen=True)
 class Offset:
-    """A constant of survey or mounting for tables: change from the input with its standard ``error`` [m or rad], and ``why`` it is
-    ``kept`` or not. ``what``: survey, antennas or an antenna's name."""
+    """A change of survey or mounting, for tables: from the input, with its standard ``error`` [m or rad], whether it is ``kept``
+    and ``why``. ``what``: survey, antennas or an antenna's name."""
 
     what: str
     name: str
@@ -68,14 +68,14 @@ SURVEY_PLACES = tuple(Place(name) for name in SURVEY)
 
 
 def mounting_places(antennas: Sequence[int] = (-1,)) -> tuple[Place, ...]:
-    """Those of all antennas alike, or of each of ``antennas``."""
+    """The mounting constants of all antennas jointly, or of each of ``antennas``."""
     return tuple(Place(name, a) for a in antennas for name in MOUNTING)
 
 
 def with_focus(
     settings: RfidSettings, survey: SurveySettings, phase: PhaseFit
 ) -> tuple[RfidSettings, SurveySettings, tuple[Offset, ...]]:
-    """Survey and lever arm by the phases, if these agree better then."""
+    """Apply survey and lever arm from the phases if the phases agree better."""
     kept = phase.after > phase.before and bool(np.all(np.isfinite(phase.spread)))
     why = "kept: the phases of the reads agree" if kept else "not kept: the phases of the reads do not agree better"
     lever = phase.lever_arm
@@ -106,10 +106,10 @@ def with_offsets(
     *,
     focused: bool,
 ) -> tuple[RfidSettings, SurveySettings, tuple[Offset, ...]]:
-    """Survey and mounting by what was read. With ``focused`` the phases have told all but the antennas' yaw.
+    """Estimate survey and mounting from reads. With ``focused``, phases have determined all but the antennas' yaw.
 
-    First survey and all antennas alike, then each antenna for itself. What is not clearly beyond its error is given up, and the
-    rest is kept if it makes reads more likely that it was not fitted to.
+    First survey and all antennas jointly, then each antenna. Insignificant changes are dropped, and the others are kept if they
+    improve the likelihood of held-out reads.
     """
     logs = [_thinned(log) for log in logs]
     antennas = list(settings.all_antennas())
@@ -122,11 +122,7 @@ def with_offsets(
         kept = bool(np.sum(gain) > 0.0 and np.mean(gain > 0.0) > 0.5) and bool(clear)
         found = alternated(logs, settings, survey, clear if kept else places, kind, floor)
         if places is common or kept:
-            why = (
-                "kept: reads that it was not fitted to are more likely"
-                if kept
-                else "not kept: below what reads can tell"
-            )
+            why = "kept: held-out reads are more likely" if kept else "not kept: below the resolution of reads"
             offsets += [
                 Offset(_what(p, antennas), p.name, float(change), float(error), kept, why)
                 for p, change, error in zip(found.places, found.changes, found.errors, strict=True)
@@ -144,7 +140,7 @@ def alternated(
     kind: Kind,
     floor: Floor,
 ) -> Placing:
-    """Constants and a model of detection for all antennas, in turn."""
+    """Fit constants and a common detection model in turn."""
     changes = np.zeros(len(places))
     count = len(settings.all_antennas())
     for _ in range(ROUNDS):
@@ -155,8 +151,8 @@ def alternated(
 
 
 def _clear(found: Placing) -> tuple[Place, ...]:
-    """The constants that are clearly beyond their error, that of a model of detection included: by chance one of all of them
-    would be in one calibration of twenty."""
+    """The significant constants, including the error by the detection model. The level allows one false positive among all
+    constants in twenty calibrations."""
     blind = np.array([BLIND[p.name] for p in found.places])
     clear = np.abs(found.changes) > norm.isf(0.025 / len(blind)) * np.hypot(found.errors, blind)
     return tuple(p for p, c in zip(found.places, clear, strict=True) if c)
@@ -170,7 +166,7 @@ def _gain(
     kind: Kind,
     floor: Floor,
 ) -> Array:
-    """By how much reads of each fold are more likely, in nats, with constants and model fitted to the others."""
+    """Gain of the held-out log-likelihood per fold, in nats, with constants and model fitted to the others."""
     if len(logs) > 1:
         folds = [([log for log in logs if log is not one], [one]) for one in logs]
     else:
@@ -201,7 +197,7 @@ def _thinned(log: Rounds) -> Rounds:
 
 
 def _rounded(survey: SurveySettings) -> SurveySettings:
-    """To a millimetre and a tenth of a milliradian: nobody knows it better, and people read it."""
+    """Round to 1 mm and 0.1 mrad, for readability."""
     places = {"x": 3, "y": 3, "heading": 4, "about_x": 3, "about_y": 3}
     return survey.model_copy(update={name: round(getattr(survey, name), n) for name, n in places.items()})
 
@@ -209,7 +205,7 @@ def _rounded(survey: SurveySettings) -> SurveySettings:
 def moved(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Place], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """The rig's antennas and survey with constants changed."""
+    """The rig's antennas and survey with changed constants."""
     antennas = dict(settings.all_antennas())
     names = list(antennas)
     for place, change in zip(places, changes.tolist(), strict=True):
@@ -219,7 +215,7 @@ def moved(
         for name in names if place.antenna < 0 else [names[place.antenna]]:
             old: AntennaSettings = antennas[name]
             antennas[name] = old.model_copy(update={place.name: _added(place.name, getattr(old, place.name), change)})
-    # a preset has no places of its own to change
+    # a preset has no positions that could be changed
     return settings.model_copy(update={"antennas": antennas, "preset": None}), survey
 
 
@@ -233,7 +229,7 @@ def place(
     floor: Floor,
     start: Array | None = None,
 ) -> Placing:
-    """The constants ``places`` that make what was read most likely, with given models; weakly held by :data:`TYPICAL`."""
+    """Maximum-likelihood ``places`` with given models and the weak prior :data:`TYPICAL`."""
     typical = np.array([TYPICAL[p.name] for p in places])
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within)

@@ -1,4 +1,4 @@
-"""Pairs of an antenna that listened and a tag: where the tag was in the antenna's frame, and how often it was read."""
+"""Pairs of an active antenna and a tag: position of the tag in the antenna's frame, and number of reads."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from factors import se2
 from factors.rfid.model import NEGLIGIBLE_LOGIT, DetectionModel, logits
 from factors.se2 import Array
 
-REACH = 8.0  # m in the plane: that of a logistic model
-BLOCK = 20.0  # s; reads in one block may go together in any way
-BLOCKS = 4  # stretches of time of a single log, each predicted by the others
+REACH = 8.0  # m in the plane; the range of a logistic model
+BLOCK = 20.0  # s; reads within a block may be correlated
+BLOCKS = 4  # folds of a single log
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """M pairs. ``points`` (M, 3) [m] in the antenna's frame; ``facing`` (M,): cosine between the direction that the tag faces and
-    that to the antenna, 0 where not known; ``hits`` of ``count`` (M,) rounds; ``antenna`` (M,): place in the rig; ``tag``
-    (M,): among those of all logs; ``fold`` (M,): what is held out together; ``block`` (M,): of :data:`BLOCK` seconds."""
+    """M pairs. ``points`` (M, 3) [m] in the antenna's frame; ``facing`` (M,): cosine of the angle between the tag's facing and the
+    direction to the antenna, 0 if unknown; ``hits`` of ``count`` (M,) rounds; ``antenna`` (M,): index in the rig; ``tag`` (M,):
+    index among all logs; ``fold`` (M,): held out jointly; ``block`` (M,): of :data:`BLOCK` seconds."""
 
     points: Array
     facing: Array
@@ -35,13 +35,13 @@ class Pairs:
     block: Integers
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> Pairs:
-        """Some of the pairs."""
+        """The selected pairs."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """Of M pairs: negative log-likelihood, its derivative by the logit, and Fisher's information on the logit."""
+    """For M pairs: negative log-likelihood, its derivative by the logit, and the Fisher information on the logit."""
 
     nll: Array
     gradient: Array
@@ -51,7 +51,7 @@ class Terms:
 def pairs_of(
     logs: Sequence[Rounds], settings: RfidSettings, survey: SurveySettings, within: Sequence[Integers] | None = None
 ) -> Pairs:
-    """The pairs of several logs within :data:`REACH`, or those of ``within``: for each log, the flat places (antenna's, tag's)."""
+    """The pairs of several logs within :data:`REACH`, or those of ``within``: flat indices (antenna, tag) per log."""
     single = len(logs) == 1
     names = tag_names(logs)
     parts = []
@@ -80,17 +80,17 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Flat places (antenna's, tag's) of the pairs of a log within :data:`REACH`."""
+    """Flat indices (antenna, tag) of the pairs of a log within :data:`REACH`."""
     return np.flatnonzero(local(log, settings, survey)[2].ravel() < REACH)
 
 
 def tag_names(logs: Sequence[Rounds]) -> dict[str, int]:
-    """A number for each tag of several logs."""
+    """An index for each tag of several logs."""
     return {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
 
 
 def stretches(t: Array) -> Integers:
-    """The stretch (N,) of a single log that each time belongs to, of :data:`BLOCKS`."""
+    """The fold (N,) of each time of a single log, of :data:`BLOCKS` segments."""
     share = (t - t.min()) / max(float(np.ptp(t)), 1e-9)
     return np.asarray(np.minimum(BLOCKS * share, BLOCKS - 1).astype(np.int64))
 
@@ -114,7 +114,7 @@ def local(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> tuple[
 
 
 def terms(logit: Array, hits: Array, count: Array, false_read: float, miss: float) -> Terms:
-    """The likelihood of ``hits`` of ``count`` rounds, with a floor for false reads and misses (see :mod:`factors.rfid.model`)."""
+    """The likelihood of ``hits`` in ``count`` rounds, with a floor for false reads and misses (see :mod:`factors.rfid.model`)."""
     span = 1.0 - false_read - miss
     sigmoid = 1.0 / (1.0 + np.exp(-np.maximum(logit, NEGLIGIBLE_LOGIT)))
     q = np.clip(false_read + span * sigmoid, 1e-12, 1.0 - 1e-12)

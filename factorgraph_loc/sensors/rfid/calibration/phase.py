@@ -1,9 +1,9 @@
-"""Survey and antenna mounting from the phase of reads, which only a right geometry brings into focus.
+"""Estimation of survey transform and antenna lever arm by focusing the phases of reads.
 
-Along a reference trajectory the phases of one tag's reads within a short window agree, once twice the way of the carrier is taken
-away (:mod:`factors.rfid.phase`). How well they agree over a whole log says where the survey's frame lies in the world (shift,
-heading), and by how much the antennas sit elsewhere on the robot than the rig has it: a map that is focused, as in synthetic
-aperture radar. An error that all reads of a window share defocuses it but slowly, so a coarse grid finds the hill.
+Along a reference trajectory the phases of one tag's reads within a short window agree after subtracting the phase of the path
+(:mod:`factors.rfid.phase`), if the geometry is right. Their agreement over a log determines the survey's transform and the common
+lever arm of the antennas, as in synthetic aperture radar. The peak is wide enough for a coarse grid search, because errors common
+to a window defocus slowly.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from factors.se2 import Array
 Rows = NDArray[np.int64]
 
 WINDOW = 2.0  # s
-MAX_GAP = 0.1  # s, of the reference around a read
+MAX_GAP = 0.1  # s; longest interpolated gap of the reference
 ENOUGH_READS = 1000
-SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m, of the coarse search
+SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; coarse search
 HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad
 THINNING = 6  # of the windows, in the coarse search
-BLOCKS = 8  # of the windows, each left out once for the spread
+BLOCKS = 8  # of windows, for the jackknife
 
 
 @dataclass(frozen=True)
 class PhaseFit:
-    """``survey``: where the survey's frame lies in the world; ``lever_arm`` (2,): to be added to x and y [m] of every antenna;
-    ``spread`` (5,): standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m];
-    ``before`` and ``after``: how well the phases agree, as mean resultant lengths (0 to 1); ``reads``: how many were used.
+    """``survey``: transform of the survey; ``lever_arm`` (2,): correction of x and y [m] of every antenna; ``spread`` (5,):
+    standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m]; ``before`` and ``after``:
+    agreement of the phases, as mean resultant lengths (0 to 1); ``reads``: number of reads used.
 
-    The gain in untempered log-likelihood a read is kappa times ``after - before``.
+    The gain in untempered log-likelihood per read is kappa times ``after - before``.
     """
 
     survey: SurveySettings
@@ -56,10 +56,10 @@ class PhaseFit:
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
-    """Survey and lever arm by focusing the phases of all ``logs``, of one world; ``survey``: where the search starts.
+    """Estimate survey and lever arm by focusing the phases of all ``logs``, in one world; ``survey``: initial value.
 
-    The survey is turned about the middle of the tags. The spread is the jackknife's over blocks of time, which bears reads that
-    go together. InputError if a log has no reference, or the logs hold too few reads with a phase that are near their tags.
+    The survey is rotated about the centre of the tags. The spread is the jackknife's over blocks of time, which is robust to
+    correlated reads. InputError if a log has no reference, or there are too few reads with a phase near their tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid)
@@ -69,7 +69,7 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
         names = listed(log.name for log in logs)
         expected = f"expected at least {ENOUGH_READS} within {focus.model.max_range:g} m of their tags"
         raise InputError(f"{names}: hold {coarse.count} reads with a phase, {expected}")
-    # reads of a wrong survey are near others than the true ones
+    # select again, because other reads are near their tags after the coarse search
     fine = focus.near(coarse.climb(coarse.coarse(origin)))
     found = fine.climb(coarse.coarse(origin))
     parts = np.array([fine.without(block).climb(found) for block in range(BLOCKS)])
@@ -80,11 +80,11 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 
 @dataclass(frozen=True)
 class _Focus:
-    """Reads along references, placed around the world's origin. States (5,): x, y, heading of the survey, lever arm x, y."""
+    """Reads along references, centred at the origin. States (5,): x, y, heading of the survey, lever arm x, y."""
 
     reads: PhaseReads
     model: PhaseModel
-    tags: TagArray  # as they were surveyed
+    tags: TagArray  # as surveyed
     pivot: Array
 
     @classmethod
@@ -109,11 +109,11 @@ class _Focus:
         return SurveySettings.bounded(x=x, y=y, heading=heading, about_x=px, about_y=py)
 
     def near(self, state: Array) -> _Focus:
-        """The reads that are near their tags, and many enough in their windows."""
+        """The reads that are near their tags, in windows with enough of them."""
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """All but one of the blocks of windows."""
+        """All but one block of windows."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
@@ -123,20 +123,20 @@ class _Focus:
         return 1.0 + float(self._likelihood(state).log_likelihood(self._pose(state)[None], self.reads)[0]) / self.count
 
     def coarse(self, origin: Array) -> Array:
-        """The best survey around ``origin`` on a grid, by some of the windows."""
+        """The best survey on a grid around ``origin``, from some of the windows."""
         some = replace(self, reads=self.reads.chosen(self.reads.windows % THINNING == 0))
         states = [origin + np.array((x, y, h, 0.0, 0.0)) for x, y, h in itertools.product(SHIFTS, SHIFTS, HEADINGS)]
         return max(states, key=some.agreement)
 
     def climb(self, state: Array) -> Array:
-        """The top of the hill that ``state`` lies on."""
-        # steps in metres at the end of a lever of a few metres, so that all five weigh alike
+        """The local maximum from ``state``."""
+        # steps in metres, with a lever of a few metres for angles, to scale all five states equally
         unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
         result = minimize(lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4})
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:
-        """Of the world in the survey's frame: there the tags are where they were surveyed."""
+        """The pose of the world in the survey's frame, in which tags have their surveyed positions."""
         return se2.inverse(self.survey(state).transform())
 
     def _likelihood(self, state: Array) -> PhaseLikelihood:
@@ -148,13 +148,13 @@ class _Focus:
 def along_reference(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
 ) -> tuple[RfidStream, Rows, Array, Array, Rows, Rows]:
-    """The reads of known tags by known antennas where the reference tells the pose: the stream, R of its rows, times (R,) [s],
-    poses (R, 3) of the robot, and places (R,) of antennas and tags. InputError if the log has no reference or no reads."""
+    """The reads of known tags by known antennas within the reference: the stream, R row indices, times (R,) [s], poses (R, 3) of
+    the robot, and indices (R,) of antennas and tags. InputError if the log has no reference or no reads."""
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference trajectory, expected one to calibrate with")
+        raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
-        raise InputError(f"{log.name}: has no RFID reads, expected a log of them")
+        raise InputError(f"{log.name}: has no RFID reads, expected a log with reads")
     t = stream.t - stream.age + log.rig.time_offset("rfid")
     tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
     antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""What a calibration tells about RFID, as tables and plain values."""
+"""The report of an RFID calibration, as tables and plain values."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
 def offsets_table(found: RfidKnowledge) -> Rows:
-    """Survey and mounting: what is changed of the input rig."""
+    """Changes of survey and mounting."""
     header = ("survey and mounting", "change", "standard error", "why")
     rows: list[tuple[str, ...]] = [
         (
@@ -24,16 +24,15 @@ def offsets_table(found: RfidKnowledge) -> Rows:
 
 
 def models_table(found: RfidKnowledge, *, accepted: bool) -> Rows:
-    """The ways to model detection, by what they are worth on reads that had no part in the fit. ``accepted``: whether the rig has
-    the best."""
-    header = ("model of detection", "smoothness", "held-out nats a round and tag", "worst fold", "")
+    """Detection models by their likelihood on held-out reads. ``accepted``: whether the rig has the best one."""
+    header = ("model of detection", "smoothness", "held-out nats per round and tag", "worst fold", "")
     rows: list[tuple[str, ...]] = [
         (
             t.kind.label(),
             f"{t.kind.smoothness:g}" if t.kind.smoothness else "-",
             f"{t.nll:.4f}",
             f"{max(t.by_fold):.4f}",
-            "" if t is not found.choice.best else "in the rig" if accepted else "refused",
+            "" if t is not found.choice.best else "in the rig" if accepted else "rejected",
         )
         for t in found.choice.trials
     ]
@@ -41,8 +40,8 @@ def models_table(found: RfidKnowledge, *, accepted: bool) -> Rows:
 
 
 def tags_table(found: RfidKnowledge) -> Rows:
-    """Tags that seem to be elsewhere."""
-    header = ("tag", "distance [m]", "x [m]", "y [m]", "chance in a right map")
+    """Tags that seem to be misplaced."""
+    header = ("tag", "distance [m]", "x [m]", "y [m]", "chance in a correct map")
     rows: list[tuple[str, ...]] = [
         (d.name, f"{d.distance:.2f}", f"{d.shift[0]:.2f}", f"{d.shift[1]:.2f}", f"{d.p:.1g}") for d in found.doubts
     ]
@@ -50,24 +49,24 @@ def tags_table(found: RfidKnowledge) -> Rows:
 
 
 def tempering_text(found: RfidKnowledge, rig: Rig) -> str:
-    """How much reads go together, in two sentences."""
+    """The correlation of reads, in two sentences."""
     assert rig.rfid is not None
     return (
-        f"By their scatter along the reference, {1.0 / found.share:.0f} reads in a row tell as much as one that stands alone. "
-        f"The smoother is not too sure of itself with a tempering of {rig.rfid.tempering:.3g}, which the rig has."
+        f"By their scatter along the reference, {1.0 / found.share:.0f} consecutive reads are worth one independent read. "
+        f"The smoother is consistent with a tempering of {rig.rfid.tempering:.3g}, which the rig has."
     )
 
 
 def dead_text(found: RfidKnowledge) -> str:
-    """How many tags are dead, in a sentence."""
+    """The share of dead tags, in a sentence."""
     return (
-        f"Of the tags of the maps {100.0 * found.dead.share:.1f} % are taken for dead before anything is heard of them; "
+        f"The prior share of dead tags in the maps is {100.0 * found.dead.share:.1f} %; "
         f"{len(found.dead.tags)} were never read, of which {len(found.dead.believed)} should have been."
     )
 
 
 def rfid_document(found: RfidKnowledge, *, accepted: bool) -> dict[str, Any]:
-    """The same as plain values; ``accepted``: see :func:`models_table`."""
+    """All figures as plain values; ``accepted``: see :func:`models_table`."""
     return {
         "offsets": [
             {

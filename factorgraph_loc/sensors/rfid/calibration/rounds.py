@@ -1,6 +1,6 @@
-"""What the antennas of a robot read and did not read on the way of its reference.
+"""Reads and misses of the antennas along the reference.
 
-Rounds that an antenna made at nearly the same place are put together: reads of one place are alike, and k of n says it all.
+Rounds of an antenna at nearly the same pose are merged into k reads of n rounds, because they are correlated.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
-NEAR = 0.05  # m, within which rounds of an antenna are put together
+NEAR = 0.05  # m; closer rounds of an antenna are merged
 TURNED = 0.05  # rad
-MOST_ROUNDS = 20.0  # that a place counts: a robot that stands would otherwise outweigh all that it drove
+MOST_ROUNDS = 20.0  # weight limit per pose; otherwise a robot at rest would outweigh its whole drive
 MIN_ROUNDS = 100
 
 Integers = NDArray[np.int64]
@@ -30,11 +30,11 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Rounds:
-    """K places at which an antenna listened, and T tags of the map that were read at least once in the log.
+    """K poses with antenna rounds, and T tags of the map that were read at least once in the log.
 
-    ``t`` (K,) [s] and ``poses`` (K, 3) of the robot; ``antenna`` (K,): places among the rig's antennas; ``count`` (K,): inventory
-    rounds, weighted; ``hits`` (K, T): in how many of them each tag was read. ``tags``: as they were surveyed; ``names``: T EPCs.
-    ``silent``: tags of the map that were never read.
+    ``t`` (K,) [s] and ``poses`` (K, 3) of the robot; ``antenna`` (K,): index in the rig; ``count`` (K,): weighted number of
+    inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``tags``: as surveyed; ``names``: T EPCs. ``silent``:
+    tags of the map that were never read.
     """
 
     log: str
@@ -48,7 +48,7 @@ class Rounds:
     silent: tuple[str, ...]
 
     def part(self, keep: NDArray[np.bool_]) -> Rounds:
-        """Some of the places."""
+        """The selected poses."""
         return replace(
             self,
             t=self.t[keep],
@@ -60,10 +60,10 @@ class Rounds:
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
-    """The rounds of a log while there is a reference; unknown EPCs, and antennas that the rig lacks, are left out.
+    """The rounds of a log within the reference, without unknown EPCs and antennas.
 
-    ``merged``: rounds of nearly the same place together. The pose is that at the middle of the reads.
-    InputError if the rounds, or the tags that were read, are too few.
+    ``merged``: merge rounds at nearly the same pose. The pose is that at the middle of the reads. InputError if there are too few
+    rounds or read tags.
     """
     stream = log.streams["rfid"]
     assert isinstance(stream, RfidStream)
@@ -86,7 +86,7 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     order = order[np.isfinite(poses[:, 0]) & (antenna[order] >= 0)]
     if len(order) < MIN_ROUNDS or len(names) < 2:
         raise InputError(
-            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas while there is a reference, in which "
+            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, in which "
             f"{len(names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
         )
     tags = [log.world.tags[name] for name in names]
@@ -108,7 +108,7 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 
 def distinct(logs: Sequence[Log]) -> list[int]:
-    """For each log the number of its reads: logs that hold the same reads, with other odometry, have the same number."""
+    """An identifier of each log's reads, equal for logs with the same reads but other odometry."""
     streams: list[RfidStream] = []
     out = []
     for log in logs:
@@ -125,7 +125,7 @@ def distinct(logs: Sequence[Log]) -> list[int]:
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
-    """How long before its end each round had its middle (count,); of a round without reads that of a typical one."""
+    """Time (count,) from the middle of each round to its end; a typical one for rounds without reads."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
@@ -151,7 +151,7 @@ def _together(rounds: Rounds) -> Rounds:
     size = np.bincount(group, minlength=count).astype(float)
     hits = np.zeros((count, rounds.hits.shape[1]))
     np.add.at(hits, group, rounds.hits)
-    # poses of one group lie so close together that the one in their middle stands for all
+    # the poses of a group are close together, so its middle represents all
     order = np.argsort(group, kind="stable")
     starts = np.concatenate(([0], np.cumsum(size.astype(np.int64))[:-1]))
     middle = order[starts + size.astype(np.int64) // 2]

@@ -1,4 +1,4 @@
-"""How strong reads are received, learnt from logs with a reference: see :mod:`factors.rfid.strength`."""
+"""Fit of the signal strength model to logs with a reference: see :mod:`factors.rfid.strength`."""
 
 import math
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ DOF = (1.0, 100.0)
 
 @dataclass(frozen=True)
 class RssiFit:
-    """``settings``: the model; ``nll``: mean negative log-likelihood a read; ``nll_constant``: that of a model which knows neither
-    distance nor direction; ``reads``: how many there were."""
+    """``settings``: the model; ``nll``: mean negative log-likelihood per read; ``nll_constant``: that of a constant model;
+    ``reads``: their number."""
 
     settings: RssiSettings
     nll: float
@@ -34,9 +34,10 @@ class RssiFit:
 
 
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiFit:
-    """The RSSI of all ``logs`` by maximum likelihood. InputError if a log has no reference, or too few reads have an RSSI.
+    """Fit the RSSI model to all ``logs`` by maximum likelihood. InputError if a log has no reference, or too few reads have an
+    RSSI.
 
-    Only reads are seen, not those too weak to be heard, so the path loss comes out flatter than in free space.
+    Signals below the reader's sensitivity are missing, so the path loss is flatter than in free space.
     """
     x, y = _table(logs, rfid, survey)
     if len(y) < ENOUGH_READS:
@@ -50,7 +51,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
 
 def rssi_nll(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings, settings: RssiSettings) -> float:
-    """Mean untempered negative log-likelihood a read, of ``logs`` that may be others than those it was learnt from."""
+    """Mean untempered negative log-likelihood per read, on ``logs`` that may be held out."""
     x, y = _table(logs, rfid, survey)
     return _nll(y - x @ np.array(settings.coefficients), settings.sigma, settings.dof)
 
@@ -71,7 +72,7 @@ def _table(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> t
 
 
 def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
-    """Coefficients, sigma and degrees of freedom, by conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
+    """Coefficients, scale and degrees of freedom, by conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
     dof = 5.0
     weights = np.ones(len(y))
     for _ in range(ITERATIONS):
@@ -85,12 +86,12 @@ def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
 
 
 def _dof(residuals: Array, sigma: float) -> float:
-    """The most likely degrees of freedom."""
+    """Maximum-likelihood degrees of freedom."""
     found = minimize_scalar(lambda v: _nll(residuals, sigma, math.exp(v)), bounds=np.log(DOF), method="bounded")
     return math.exp(found.x)
 
 
 def _nll(residuals: Array, sigma: float, dof: float) -> float:
-    """Mean negative logarithm of Student's density."""
+    """Mean negative log density of the Student distribution."""
     scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi) + math.log(sigma)
     return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p((residuals / sigma) ** 2 / dof)))

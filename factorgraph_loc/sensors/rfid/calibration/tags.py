@@ -1,8 +1,8 @@
-"""Tags that seem to be elsewhere than the map says: their reads are much more likely from another place.
+"""Detection of misplaced tags, whose reads are much more likely from another position.
 
-A likelihood-ratio test of each tag. The ratio of a tag that is in its place is chi-squared with two degrees of freedom, times a
-factor for reads that go together and for what the model of detection does not know. The factor is taken from the median over tags
-(Devlin and Roeder, "Genomic control for association studies", Biometrics 55, 1999).
+A likelihood-ratio test for each tag. Without displacement the ratio is chi-squared with two degrees of freedom, times a factor for
+correlated reads and errors of the detection model. The factor is estimated from the median over tags (Devlin and Roeder, "Genomic
+control for association studies", Biometrics 55, 1999).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from factors import se2
 from factors.rfid.model import DetectionModel, logits
 from factors.se2 import Array
 
-FAMILY = 0.01  # false alarms in a map of which all tags are in their places
+FAMILY = 0.01  # probability of any false alarm in a correct map
 FARTHEST = 2.5  # m
 COARSE = 0.5  # m
-COARSE_LOOKS = 600  # of a tag in the coarse search
-LEAST_SHIFT = 0.3  # m; less is what a model of detection mistakes
-MIN_TAGS = 5  # below which a median says nothing
+COARSE_LOOKS = 600  # per tag in the coarse search
+LEAST_SHIFT = 0.3  # m; smaller shifts may be errors of the detection model
+MIN_TAGS = 5  # minimum for a median
 
 
 @dataclass(frozen=True)
 class TagDoubt:
-    """A tag that seems to lie ``shift`` (2,) [m, in the world] from where the survey has it; ``p``: probability of so large a
-    ratio for any of the tags in a map that is right. ``name``: with that of a log, where logs have it at several places."""
+    """A misplaced tag with ``shift`` (2,) [m, in the world] from its surveyed position; ``p``: probability of so large a ratio for
+    any tag in a correct map. ``name``: includes the log if positions differ between logs."""
 
     name: str
     shift: tuple[float, float]
@@ -53,7 +53,7 @@ def misplaced(
     which: Sequence[int],
     floor: Floor,
 ) -> tuple[TagDoubt, ...]:
-    """The tags of all logs that are elsewhere, the most certain first."""
+    """The misplaced tags of all logs, most certain first."""
     tags = _tags(logs)
     if len(tags) < MIN_TAGS:
         return ()
@@ -70,7 +70,7 @@ def misplaced(
 
 
 def _tags(logs: Sequence[Rounds]) -> dict[str, tuple[list[Rounds], str]]:
-    """The logs and the name of each tag, by what it is called here: in two buildings two tags may have one name."""
+    """The logs and the name of each tag, by a unique key: tags in two buildings may have the same name."""
     found: dict[tuple[str, tuple[float, ...]], list[Rounds]] = {}
     for log in logs:
         for name, point in zip(log.names, log.tags.points.tolist(), strict=True):
@@ -84,8 +84,8 @@ def _tags(logs: Sequence[Rounds]) -> dict[str, tuple[list[Rounds], str]]:
 
 @dataclass(frozen=True, eq=False)
 class _Reads:
-    """Of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height`` (K,) of
-    the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if not known."""
+    """The data of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height``
+    (K,) of the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if unknown."""
 
     hits: Array
     count: Array
@@ -136,7 +136,7 @@ _COLUMNS = ("hits", "count", "poses", "antenna", "height", "pitch")
 
 
 def _moved(reads: _Reads, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor) -> tuple[float, Array]:
-    """Twice the logarithm of the likelihood ratio of the best place, and the shift (2,) to it."""
+    """Twice the log-likelihood ratio of the best position, and the shift (2,) to it."""
     few = reads.thinned(COARSE_LOOKS)
     steps = COARSE * np.arange(-round(FARTHEST / COARSE), round(FARTHEST / COARSE) + 1)
     shifts = [np.array((x, y)) for x in steps for y in steps if np.hypot(x, y) <= FARTHEST]

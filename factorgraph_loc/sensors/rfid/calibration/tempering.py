@@ -1,8 +1,8 @@
-"""How much reads that follow each other go together: the first guess of the tempering, before an estimator runs.
+"""Initial estimate of the tempering from the correlation of consecutive reads.
 
-Were reads independent, the gradient of their log-likelihood by the pose would have Fisher's information as its covariance. Over
-windows of time it has more: by so much the likelihood is too sure (Varin, Reid and Firth, "An overview of composite likelihood
-methods", Statistica Sinica 21, 2011, section 2.2).
+For independent reads the gradient of the log-likelihood by the pose has the Fisher information as covariance. The ratio of its
+actual covariance over time windows to that is the overconfidence of the likelihood (Varin, Reid and Firth, "An overview of
+composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from factors.rfid.model import DetectionModel
 
 WINDOW = 10.0  # s
 LEAST = 1e-3  # of the tempering
-_STEP = 1e-4  # m, rad, of numerical derivatives
+_STEP = 1e-4  # m, rad; of numerical derivatives
 
 
 def tempered(rig: Rig, factor: float) -> Rig:
-    """The rig whose RFID weighs as if standard deviations were ``factor`` times those of independent reads, at least 1."""
+    """The rig with RFID weighted as if standard deviations were ``factor`` times those of independent reads, at least 1."""
     assert rig.rfid is not None
     tempering = min(1.0, max(factor**-2.0, LEAST))
     return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"tempering": tempering})})
@@ -38,7 +38,7 @@ def independent_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """The exponent, at most 1, with which the likelihood of rounds, not merged, is as sure as their scatter along the reference."""
+    """The exponent, at most 1, at which the likelihood of unmerged rounds matches their scatter along the reference."""
     outer, information = np.zeros((3, 3)), np.zeros((3, 3))
     for log in logs:
         within = [nearby(log, settings, survey)]
