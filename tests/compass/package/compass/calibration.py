@@ -1,4 +1,4 @@
-"""How the bias of a compass is learnt from the headings of a reference."""
+"""Calibration of the bias of a compass from the headings of a reference."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Headings:
-    """What was measured at ``t`` (K,), less the true headings: ``errors`` (K,) [rad]."""
+    """Measured minus true headings, ``errors`` (K,) [rad], at ``t`` (K,)."""
 
     t: Array
     errors: Array
@@ -27,18 +27,18 @@ class Headings:
         return Headings(self.t[:half], self.errors[:half]), Headings(self.t[half:], self.errors[half:])
 
     def residuals(self, settings: CompassSettings) -> Array:
-        """In standard deviations (K, 1)."""
+        """Residuals in standard deviations (K, 1)."""
         return se2.wrap(settings.bias - self.errors)[:, None] / settings.sigma
 
 
 class CompassCalibrator(ConstantsCalibrator):
-    """Learns the bias."""
+    """The calibrator of the bias."""
 
     section, channel, senses = "compass", "compass", False
     uncertain, units, first = {"bias": 1.0}, {"bias": "rad"}, CompassSettings()
 
     def part(self, log: Log) -> Headings:
-        """The headings while there is a reference."""
+        """The headings within the reference."""
         stream = log.streams["compass"]
         t = stream.t + log.rig.time_offset("compass")
         errors = se2.wrap(stream.heading - log.reference.at(t, max_gap=0.5)[:, 2])

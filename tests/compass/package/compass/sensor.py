@@ -1,4 +1,4 @@
-"""A compass as a sensor of a run: what it reports is a factor on the robot's heading, and on its bias where that is learnt."""
+"""The compass of a run: factors on the robot's heading, and on the bias if it is estimated."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from factors.update import Correction
 
 @dataclass(frozen=True, slots=True)
 class HeadingFactor:
-    """One heading, ``measured`` less the rig's bias [rad], as a factor on the pose (3,) and, where it ``learns``, on the change
-    (1,) of the bias. ``offset``: the motion from that pose to the measurement, whose error widens the noise ``sigma``."""
+    """``measured`` minus the rig's bias [rad], as a factor on the pose (3,) and, if it ``learns``, on the correction (1,) of the
+    bias. ``offset``: the motion from that pose to the measurement, whose variance is added to that of ``sigma``."""
 
     measured: float
     sigma: float
@@ -26,7 +26,7 @@ class HeadingFactor:
     learns: bool = False
 
     def errors(self, headings: Array, biases: Array | float) -> tuple[Array, float]:
-        """Predicted less measured (N,), in standard deviations, and how many of these a radian is."""
+        """Residuals, predicted minus measured (N,), in standard deviations, and their number per radian."""
         turn, variance = (0.0, 0.0) if self.offset is None else (self.offset.delta[2], self.offset.covariance[2, 2])
         scale = 1.0 / float(np.hypot(self.sigma, np.sqrt(variance)))
         return scale * se2.wrap(headings + turn + biases - self.measured), scale
@@ -47,27 +47,27 @@ class HeadingFactor:
         return 0.5 * float(self.whitened(values)[0][0, 0]) ** 2
 
     def weight(self, squared: Array) -> Array:
-        """No robust loss."""
+        """Constant, as there is no robust loss."""
         return np.ones_like(squared)
 
     def dof(self) -> int:
-        """One number."""
+        """Number of measured values."""
         return 1
 
 
 @dataclass(frozen=True)
 class HeadingObservation(ResidualObservation):
-    """One heading; all particles are weighed at once."""
+    """One heading; weighs all particles at once."""
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
-        """That of the headings of ``poses`` (N, 3), each with a bias of its own where these are given."""
+        """Log-likelihood (N,) of ``poses`` (N, 3), each with its own bias if given."""
         (factor,) = self.factors
         biases = values[self.blocks[0]][:, 0] if self.blocks and self.blocks[0] in values else 0.0
         return -0.5 * factor.errors(poses[:, 2], biases)[0] ** 2
 
 
 class CompassSensor(Sensor):
-    """A compass as all estimators take it in."""
+    """The compass of a run."""
 
     modality = "compass"
 
@@ -88,7 +88,7 @@ class CompassSensor(Sensor):
 
 
 def bind(binding: Binding) -> CompassSensor | None:
-    """The sensor of a run; None where it is not used."""
+    """The sensor of a run, or None if it is not used."""
     settings = binding.setup.rig.find(CompassSettings)
     used = settings is not None and CompassSensor.modality in binding.setup.sensors
     return CompassSensor(binding, settings) if used else None

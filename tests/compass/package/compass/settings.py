@@ -1,4 +1,4 @@
-"""The compass of a rig."""
+"""Settings of a compass."""
 
 from typing import Annotated, ClassVar
 
@@ -11,13 +11,13 @@ from factorgraph_loc.model.units import Angle
 
 
 class CompassUncertainty(FileModel):
-    """Standard deviation of the bias; above 0 it is estimated on the way."""
+    """Standard deviation of the bias, which is estimated if it is above 0."""
 
     bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
 
 
 class CompassSettings(SensorSettings):
-    """A compass. ``bias``: reported less true heading; ``sigma``: of one measurement."""
+    """A compass. ``bias``: reported minus true heading; ``sigma``: noise of one measurement."""
 
     constants: ClassVar[tuple[str, ...]] = ("bias",)
     bias: Angle = 0.0
@@ -26,6 +26,6 @@ class CompassSettings(SensorSettings):
 
 
 class CompassSimulation(FileModel):
-    """``rate``: headings per second."""
+    """``rate``: measurements per second."""
 
     rate: Hertz = 2.0

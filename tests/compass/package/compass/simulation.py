@@ -1,4 +1,4 @@
-"""What a compass reports on a simulated drive."""
+"""Simulation of a compass."""
 
 from compass.settings import CompassSettings
 from compass.stream import HeadingStream
@@ -7,7 +7,7 @@ from factors import se2
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Headings with the bias that the rig says, one drawn from its uncertainty beside it, and noise."""
+    """Headings with the rig's bias, a random bias from its uncertainty, and noise."""
     compass = ride.rig.find(CompassSettings)
     if compass is None:
         return Simulated()

@@ -1,4 +1,4 @@
-"""What a compass reports, its rows in a log, and the table that holds them."""
+"""Measurement, stream and table of a compass."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -9,7 +9,7 @@ from factors.se2 import Array
 
 HEADINGS = Table(
     "compass",
-    (STAMP, within("heading", ANGLE, FULL_TURN, "direction of the robot's x axis, with the compass's bias")),
+    (STAMP, within("heading", ANGLE, FULL_TURN, "heading including the compass's bias")),
     "one each",
     stream="compass.stream:HeadingStream",
 )
@@ -17,7 +17,7 @@ HEADINGS = Table(
 
 @dataclass(frozen=True, slots=True)
 class Heading:
-    """The direction of the robot's x axis in the world, ``heading`` [rad], with the compass's bias."""
+    """The robot's ``heading`` [rad] in the world, including the compass's bias."""
 
     sensor: ClassVar[str] = "compass"
     modality: ClassVar[str] = "compass"

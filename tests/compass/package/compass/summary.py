@@ -1,4 +1,4 @@
-"""What a log holds of a compass."""
+"""Summary of a compass in a log."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from factors import se2
 
 
 def summarize(log: Log) -> Summary:
-    """How far its headings are from the reference's, in the middle."""
+    """The median difference of its headings to the reference."""
     stream = log.streams.get("compass")
     if stream is None or log.reference is None or not log.reference.has_heading:
         return Summary()
