@@ -72,6 +72,15 @@ def arrivals(
         warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
 
 
+def images_in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
+    """Indices (M,) of the images to keep, in order of arrival: the last one of equal timestamps (N,)."""
+    arrivals(source, rows, t_ns, warnings)
+    last = {t: i for i, t in enumerate(t_ns.tolist())}
+    if dropped := len(t_ns) - len(last):
+        warnings.append(f"{source}: {dropped} rows have the timestamp of a later row and are skipped")
+    return np.array(sorted(last.values()), dtype=np.int64)
+
+
 def sightings_in_order(
     source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
 ) -> Integers:

@@ -25,7 +25,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.feature_cache import cache_folder
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -112,7 +112,7 @@ class Images:
                     self._written.rename(self._folder)
             self.discard()
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
-        keep = _last_of_each(self._source, rows, t_ns, warnings)
+        keep = checks.images_in_order(self._source, rows, t_ns, warnings)
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
 
     def discard(self) -> None:
@@ -179,11 +179,6 @@ def netpbm(image: Any, where: str) -> tuple[bytes, str]:
     pixels = np.ascontiguousarray(convert(packed[:, :, 0] if channels == 1 else packed))
     mark, suffix = ("P5", ".pgm") if pixels.ndim == 2 else ("P6", ".ppm")
     return f"{mark}\n{width} {height}\n{np.iinfo(kind).max}\n".encode() + pixels.tobytes(), suffix
-
-
-def _last_of_each(source: str, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
-    """Indices of the images in order of arrival, the last one of equal timestamps."""
-    return checks.sightings_in_order(source, rows, t_ns, ["image"] * len(rows), warnings)
 
 
 def _key(path: Path, topic: str) -> str:

@@ -125,14 +125,10 @@ def as_nanoseconds(value: Any, unit: int) -> int:
 
 
 def _getter(path: str) -> Callable[[Any], Any]:
-    return attrgetter(path) if path else _itself
+    return attrgetter(path) if path else lambda value: value
 
 
 def _list_getters(path: str) -> tuple[Callable[[Any], Sequence[Any]], Callable[[Any], Any]]:
     """Getters of the list, and of a field of its elements."""
     outer, _, inner = path.partition(LIST)
     return attrgetter(outer), _getter(inner.lstrip("."))
-
-
-def _itself(value: Any) -> Any:
-    return value

@@ -47,7 +47,7 @@ def read(path: Path | None, options: Options) -> Log:
     if path is None:
         raise InputError("sevenscenes: the path of the folder with frame-*.color.jpg is missing")
     images = _frames(path)
-    poses = np.array([_pose(inside(path, _pose_file(image).name, path)) for image in images])
+    poses = np.array([_pose(inside(path, f"{image.name.split('.')[0]}.{POSE}", path)) for image in images])
     for image in images:
         _check_image(image)
     t = np.arange(len(images)) / options.rate
@@ -66,10 +66,6 @@ def _frames(folder: Path) -> list[Path]:
     if not images:
         raise InputError(f"{folder}: contains no images frame-*.color.jpg or frame-*.color.png")
     return [inside(folder, image.name, folder) for image in images]
-
-
-def _pose_file(image: Path) -> Path:
-    return image.with_name(f"{image.name.split('.')[0]}.{POSE}")
 
 
 def _pose(path: Path) -> Array:

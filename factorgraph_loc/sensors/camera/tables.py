@@ -24,14 +24,10 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path 
 
     InputError if a path leaves the folder or is no regular file, or a timestamp is late by more than 0.5 s.
     """
-    checks.arrivals(table.path, table.rows, table.t_ns, warnings)
+    latest = checks.images_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
     named = zip(table.rows.tolist(), table.names["file"], strict=True)
     paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]
-    last = {t: i for i, t in enumerate(table.t_ns.tolist())}
-    if dropped := len(paths) - len(last):
-        warnings.append(f"{table.path}: {dropped} rows have the timestamp of a later row and are skipped")
-    latest = sorted(last.values())
     keep = [i for i in latest if paths[i] is not None]
     if missing := [i for i in latest if paths[i] is None]:
         first = f"{table.names['file'][missing[0]]} of row {table.rows[missing[0]]}"
