@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -182,7 +183,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cell
         header = named if in_comment else first
     _require_columns(path, needed, header, first_row)
     rows, table = [], []
-    body = parsed if header is first else _chained((first_row, first), parsed)
+    body = parsed if header is first else chain([(first_row, first)], parsed)
     for row, parts in body:
         if len(parts) != len(header):
             raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
@@ -210,11 +211,6 @@ def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> I
             yield lines[reader.line_num - 1][0], [part.strip() for part in parts]
     except csv.Error as error:
         raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
-
-
-def _chained(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
-    yield first
-    yield from rest
 
 
 def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], row: int) -> None:

@@ -98,12 +98,9 @@ class Diagnostics:
     def mark(self) -> Mark:
         """The current sizes, for :meth:`since`."""
         if self._mark is None:
-            self._mark = self._counted()
+            rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
+            self._mark = Mark(rows, values, dict(self.ignored), dict(self.rejected))
         return self._mark
-
-    def _counted(self) -> Mark:
-        rows, values = ({name: len(found) for name, found in lists.items()} for lists in (self.nis, self.residuals))
-        return Mark(rows, values, dict(self.ignored), dict(self.rejected))
 
     def since(self, mark: Mark) -> Written:
         """What was added since ``mark``."""
