@@ -41,7 +41,7 @@ class Correction:
 
     At the prediction: the whitened ``residual`` (K, g), predicted minus measured, and its normalised square (``nis``) with degrees
     of freedom. For a likelihood without residuals: the excess of its negative logarithm over the expected value (``excess_nll``),
-    the ``variance`` of that, and the ``evidence``, its log-probability by Laplace's method.
+    the ``variance`` of that, and the ``evidence``, its log-probability by Laplace's method, None where it was not computed.
     """
 
     delta: Array
@@ -51,7 +51,7 @@ class Correction:
     dof: int
     excess_nll: float = 0.0
     variance: float = 0.0
-    evidence: float = 0.0
+    evidence: float | None = None
 
 
 def robust_update(

@@ -21,6 +21,7 @@ from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
@@ -135,8 +136,8 @@ class Ekf(Filter):
 
     _state: _State
 
-    def __init__(self, setup: Setup, settings: EkfSettings) -> None:
-        super().__init__(setup, settings)
+    def __init__(self, setup: Setup, settings: EkfSettings, diagnostics: Diagnostics | None = None) -> None:
+        super().__init__(setup, settings, diagnostics)
         self._iterations = settings.iterations
         calibration: Calibration = "all" if settings.self_calibration else "none"
         self._sensors = bound_sensors(

@@ -29,6 +29,7 @@ from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, Setup
@@ -108,8 +109,8 @@ class ParticleFilter(Filter):
     _state: Cloud
     _rng: np.random.Generator
 
-    def __init__(self, setup: Setup, settings: ParticleFilterSettings) -> None:
-        super().__init__(setup, settings)
+    def __init__(self, setup: Setup, settings: ParticleFilterSettings, diagnostics: Diagnostics | None = None) -> None:
+        super().__init__(setup, settings, diagnostics)
         self._settings = settings
         self._rng = setup.rng
         # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time

@@ -253,7 +253,7 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
     """The log of the probability of an observation of the pose alone, by Laplace's method: at its correction of a Gaussian, with
     ``pose`` (3,) and body-frame ``covariance`` (3, 3)."""
-    if correction.evidence:
+    if correction.evidence is not None:
         return correction.evidence
     delta = correction.delta[:3]
     at = se2.compose(pose, se2.exp(delta))

@@ -6,7 +6,7 @@ constants of the odometry which are uncertain count as noise in both. The final 
 (Rauch, Tung, Striebel, 1965), from what was believed at each time.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -23,7 +23,6 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.binding import bound_motion
-from factorgraph_loc.sensors.registry import moving
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
@@ -66,16 +65,12 @@ class Switching:
         of_tags = ParticleFilterSettings(
             max_delay=delay, smooth=False, self_calibration=False, particles=settings.particles
         )
-        self._tags: Filter = ParticleFilter(by_tags, of_tags)
-        self._vision: Filter = Ekf(by_sight, EkfSettings(max_delay=delay, smooth=False, self_calibration=False))
+        of_sight = EkfSettings(max_delay=delay, smooth=False, self_calibration=False)
+        self._tags: Filter = ParticleFilter(by_tags, of_tags, self.diagnostics)
+        self._vision: Filter = Ekf(by_sight, of_sight, self.diagnostics)
         by_scans = TAG_SENSORS[0] in setup.sensors
         self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
         self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
-        for part in (self._tags, self._vision):
-            for shared in fields(Diagnostics):
-                setattr(part.diagnostics, shared.name, getattr(self.diagnostics, shared.name))
-        # both filters take the odometry: the second would count what is late once more
-        self._vision.diagnostics.late = {}
         self._motion = bound_motion(setup, Diagnostics())
         self._active: Filter = self._tags if by_scans else self._vision
         self._newest_scan = -np.inf
@@ -89,8 +84,10 @@ class Switching:
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
         if measurement.is_motion:
-            for part in (self._tags, self._vision):
-                part.process(measurement)
+            self._tags.process(measurement)
+            late = dict(self.diagnostics.late)
+            self._vision.process(measurement)
+            self.diagnostics.late = late  # the second filter counted the same row
             self._motion.add(measurement)
             return
         if measurement.modality == TAGS and measurement.t >= self._newest_scan:
@@ -101,8 +98,6 @@ class Switching:
             self._ticks.append(measurement.t)
         if isinstance(measurement, Tick) or (measurement.modality == TAGS) == (self._active is self._tags):
             self._active.process(measurement)
-            late = self._vision.diagnostics.late
-            self.diagnostics.late |= {sensor: count for sensor, count in late.items() if not moving((sensor,), "floor")}
             self._record()
         elif measurement.modality == TAGS:
             self.diagnostics.ignore("rfid while no tag is read", measurement.count)

@@ -58,8 +58,8 @@ class Filter(ABC):
     supports_unknown_start = False
     modalities: Container[str] = EVERY  # of measurements that may update it; others are counted as ignored
 
-    def __init__(self, setup: Setup, settings: FilterSettings) -> None:
-        self.diagnostics = Diagnostics()
+    def __init__(self, setup: Setup, settings: FilterSettings, diagnostics: Diagnostics | None = None) -> None:
+        self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
         self._max_delay = settings.max_delay
         self._smooth = settings.smooth
         calibrates = getattr(settings, "self_calibration", False)

@@ -1,5 +1,7 @@
 """The paper's rule: who has the word, what is handed over, and what is made of it afterwards."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,3 +107,21 @@ def test_an_unknown_start_needs_tags(office):
     result = run(office, RunConfig("switching", {"particles": 2000}, sensors=BOTH, prior="unknown", seed=1))
     assert result.status[-1] == "localized"
     assert np.hypot(*(result.poses[-1] - office.reference.at(result.t[-1:])[0])[:2]) < 0.5
+
+
+def test_what_one_filter_takes_back_the_other_keeps(office):
+    # a landmark that comes late, after the word went to and fro, takes none of the scans' innovations away
+    estimator = made(office)
+    read = next(m for m in office.measurements(("rfid",)) if m.tags)
+    landmark = next(iter(office.measurements(("bearing_range",))))
+    start = PosePrior(0.0, office.reference.poses[0], np.diag((0.1, 0.2, 0.05)) ** 2)
+    estimator.initialize(start)
+    estimator.process(scan(0.0))
+    estimator.process(Tick(0.0))
+    estimator.process(replace(read, t=0.1))
+    estimator.process(scan(0.2))
+    innovations = list(estimator.diagnostics.nis["rfid"])
+    for t in (0.3, 0.25):
+        estimator.process(replace(landmark, t=t))
+    assert len(estimator.diagnostics.nis["bearing_range"]) == 2
+    assert estimator.diagnostics.nis["rfid"] == innovations

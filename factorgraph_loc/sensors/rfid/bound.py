@@ -139,6 +139,7 @@ class TagSensor(Sensor):
     def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
         looks, t = observation.factor.seen, observation.t
         assert isinstance(looks, TagReadCounts)
+        assert correction.evidence is not None
         self._diagnostics.innovation("rfid", t, correction.nis, correction.dof)
         if view.newest and not self._is_evidence(observation, correction.evidence):
             self._diagnostics.reject(Silence.REJECTED, observation.rounds)
