@@ -3,6 +3,7 @@ files."""
 
 __all__ = [
     "camera",
+    "chain",
     "compressed",
     "graph",
     "landmarks",

@@ -1,23 +1,23 @@
 """Conversion of this package's factors to GTSAM's.
 
 A factor has ``linearize(values)``, whose values are arrays: poses (3,), vectors (P,). It returns the whitened, robustly weighted
-residual and one Jacobian per variable, by body-frame perturbation. The functions here validate both, because GTSAM silently accepts
-Jacobians of wrong shape, and an exception in a callback leaves iSAM2 in an inconsistent state.
+residual and one Jacobian per variable, by body-frame perturbation. GTSAM gets it as a linear factor: callbacks would copy all
+variables, and an exception in a callback leaves iSAM2 in an inconsistent state.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import gtsam
 import numpy as np
 
 from factors import positive, se2
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 
 class Factor(Protocol):
-    """A factor that :func:`custom_factor` and :func:`jacobian_factor` accept."""
+    """A factor that :func:`jacobian_factor` accepts."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, weighted residual (m,) and a Jacobian (m, d) for each variable."""
@@ -26,47 +26,44 @@ class Factor(Protocol):
         """The loss, robust if the factor is."""
 
 
+class Stack(Protocol):
+    """Factors of one kind on N poses in a row and on P parameters that all have in common, linearised by one call."""
+
+    rows: int
+
+    @property
+    def first(self) -> Integers:
+        """The number (M,) of the first pose that each of the ``rows`` residuals depends on."""
+
+    def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
+        """Fill ``residual`` (M,) and ``jacobian`` (M, 6 + P), see :mod:`factors.chain`, at ``poses`` (N, 3) and ``parameters``."""
+
+    def cost(self, poses: Array, parameters: Array) -> float:
+        """The loss of all."""
+
+
+@runtime_checkable
+class Stackable(Factor, Protocol):
+    """A factor on one pose or on two that follow one another, and perhaps on one vector, many of which become a stack."""
+
+    @property
+    def kind(self) -> Hashable:
+        """What those that go into one stack have in common beside their type and their vector; None for one that goes into none."""
+
+    def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
+        """``factors`` of this type and kind as one, each on the pose with its number; ``column``: of the vector among the
+        parameters."""
+
+
 def pose_array(pose: gtsam.Pose2) -> Array:
     """A ``gtsam.Pose2`` as (x, y, heading)."""
     return np.array((pose.x(), pose.y(), pose.theta()))
 
 
-def read_pose(values: gtsam.Values, key: int) -> Array:
-    """The pose (3,) of a variable."""
-    return pose_array(values.atPose2(key))
-
-
-def read_vector(values: gtsam.Values, key: int) -> Array:
-    """The vector of a variable."""
-    return np.asarray(values.atVector(key), dtype=float)
-
-
-def custom_factor(
-    factor: Factor,
-    keys: Sequence[int],
-    readers: Sequence[Callable[[gtsam.Values, int], Array]],
-    dimensions: Sequence[int],
-    rows: int,
-    on_failure: Callable[[str], None],
-) -> gtsam.NonlinearFactor:
-    """``factor`` on the variables ``keys``, read by ``readers``, with tangent ``dimensions`` and ``rows`` residuals.
-
-    A residual or Jacobian that is not finite or has a wrong shape is replaced by zeros and reported to ``on_failure``.
-    """
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Array:
-        try:
-            residual, blocks = factor.linearize([read(values, key) for read, key in zip(readers, keys, strict=True)])
-            _check(residual, blocks, rows, dimensions)
-        except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
-            on_failure(str(failure))
-            residual, blocks = np.zeros(rows), [np.zeros((rows, d)) for d in dimensions]
-        if jacobians is not None:
-            for i, block in enumerate(blocks):
-                jacobians[i] = block
-        return residual
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), list(keys), error)
+def silenced(factor: Factor, rows: int, on_failure: Callable[[str], None]) -> Factor:
+    """``factor`` with ``rows`` residuals; a residual or Jacobian that is not finite or has a wrong shape is replaced by zeros and
+    reported to ``on_failure``."""
+    return _Silenced(factor, rows, on_failure)
 
 
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.JacobianFactor:
@@ -109,6 +106,21 @@ class VectorPriorFactor:
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""
         return 0.5 * float(np.sum((self._whitener @ (values[0] - self._mean)) ** 2))
+
+
+class _Silenced:
+    def __init__(self, factor: Factor, rows: int, on_failure: Callable[[str], None]) -> None:
+        self._factor, self._rows, self._on_failure = factor, rows, on_failure
+        self.cost = factor.cost
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        try:
+            residual, blocks = self._factor.linearize(values)
+            _check(residual, blocks, self._rows, [len(value) for value in values])
+        except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
+            self._on_failure(str(failure))
+            return np.zeros(self._rows), [np.zeros((self._rows, len(value))) for value in values]
+        return residual, blocks
 
 
 def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:

@@ -7,8 +7,10 @@ Well-conditioned covariances are used unchanged.
 
 from __future__ import annotations
 
+import math
+
+import numba
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from factors.se2 import Array
 
@@ -26,15 +28,37 @@ def nearest(covariances: Array) -> Array:
 
 def sound(covariance: Array) -> Array:
     """The covariance (D, D) itself if it is invertible, else the :func:`nearest` invertible one."""
+    if is_clear(covariance):
+        return covariance
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if not np.all(sigmas > 0.0):
         return nearest(covariance)
     shares = covariance / sigmas[:, None] / sigmas
-    root, failed = dpotrf(shares, lower=1)
-    # the smallest eigenvalue of a correlation matrix with this determinant is far above LEAST: det < e * smallest
-    if not failed and np.prod(root.diagonal()) ** 2 > CLEAR:
-        return covariance
     return covariance if np.linalg.eigvalsh(shares)[0] > LEAST else nearest(covariance)
+
+
+@numba.njit(cache=True)
+def is_clear(covariance: Array) -> bool:
+    """Whether a covariance (D, D) is finite and far from singular, so that it is its own :func:`sound` covariance."""
+    size, left = len(covariance), np.empty(covariance.shape)
+    determinant = 1.0
+    for i in range(size):
+        if not 0.0 < covariance[i, i] < np.inf:
+            return False
+    for i in range(size):
+        # the lower root of the correlations, row by row
+        for j in range(i + 1):
+            rest = covariance[i, j] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
+            for k in range(j):
+                rest -= left[i, k] * left[j, k]
+            if j < i:
+                left[i, j] = rest / left[j, j]
+            elif not rest > 0.0:
+                return False
+            else:
+                left[i, i], determinant = math.sqrt(rest), determinant * rest
+    # with such a determinant the smallest eigenvalue of a correlation matrix is far above LEAST: det < e * smallest
+    return determinant > CLEAR
 
 
 def whitener(covariances: Array) -> Array:

@@ -104,6 +104,8 @@ class Graph:
 
     def before(self, t: float) -> Keyframe:
         """The last keyframe at or before ``t``."""
+        if self.newest.t <= t:
+            return self.newest
         return self.keyframes[bisect.bisect_right(self.times, t, self.times.first) - 1]
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -34,11 +34,13 @@ class GraphSettings(FileModel):
 
 
 class SmootherSettings(GraphSettings):
-    """``lag`` [s]: length of the window, none for the full history. ``relinearize_*``: how far a variable may move (m and rad;
-    for the odometry's constants in their units) before its factors are linearised anew, and after how many updates that is
-    checked. ``smooth`` off: the final trajectory repeats the causal one."""
+    """``lag`` [s]: length of a window, behind which poses are final. By default causal estimates come from a window of 10 s and
+    the final trajectory from the whole problem, solved at the end; ``all`` keeps the full history solved all the time, as is
+    always done where landmarks or points are estimated. ``relinearize_*``: how far a variable may move (m and rad; for the
+    odometry's constants in their units) before its factors are linearised anew, and after how many updates that is checked.
+    ``smooth`` off: the final trajectory repeats the causal one."""
 
-    lag: Annotated[float, Field(ge=0.1, le=3600.0)] | None = None
+    lag: Annotated[float, Field(ge=0.1, le=3600.0)] | Literal["all"] | None = None
     relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
     smooth: bool = True

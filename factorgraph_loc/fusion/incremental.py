@@ -37,6 +37,7 @@ NOWHERE: Mapping[int, Array] = {}
 # Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
 JUMPED = 50.0
 ITERATIONS_AFTER_FAILURE = 10
+LAG = 10.0  # s of the window that causal estimates come from, where none is set
 # m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
 NEAR_POINTS = 0.02
 
@@ -47,11 +48,16 @@ class Incremental:
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
+        self._maps = any(mapper.estimates for mapper in graph.mappers)
+        # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
+        self._is_whole = settings.lag is None or settings.lag == "all"
+        self._lag = None if isinstance(settings.lag, str) else settings.lag
+        if settings.lag is None and not (self._waits or self._maps):
+            self._lag = LAG
         # how long observations may wait for the solver
         every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
-        defers = not self._waits and (settings.lag is None or settings.lag >= 2.0 * every)
+        defers = not self._waits and (self._lag is None or self._lag >= 2.0 * every)
         self._solve_every = every if defers else 0.0
-        self._maps = any(mapper.estimates for mapper in graph.mappers)
         self._failed: list[str] = []
         # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
         self._factorization = "CHOLESKY" if self._maps else "QR"
@@ -65,7 +71,10 @@ class Incremental:
         self._left: Kept[Guess] = Kept()
 
     def forget(self, before: float) -> None:
-        """Forget keyframes before then, as far as they have left the window; a full history keeps all."""
+        """Forget keyframes before then, as far as they have left the window; where the whole problem is solved at the end, all are
+        kept."""
+        if self._is_whole:
+            return
         graph = self._graph
         count = bisect.bisect_right(graph.times, before, graph.times.first) - 1
         # points that wait are looked for in the newest ones
@@ -78,12 +87,12 @@ class Incremental:
         graph.ticks = [tick for tick in graph.ticks if tick.keyframe >= graph.keyframes.first]
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """Full history: the whole graph, solved to the end. With a window: each pose as it left that, the others as they are
-        now; those that wait for the solver as they were expected."""
+        """The whole graph, solved to the end. With a set lag: each pose as it left the window, the others as they are now; those
+        that wait for the solver as they were expected."""
         waiting = self._waiting.values
         if not self._settings.smooth:
             estimates = list(self._filtered)
-        elif self._settings.lag is None:
+        elif self._is_whole:
             return self._optimum(graph, self.solved(graph))
         else:
             stalled, open_ones = isinstance(self._solver, Stalled), graph.keyframes[len(self._left) :]
@@ -103,9 +112,10 @@ class Incremental:
 
     def solved(self, graph: Graph) -> Values:
         """The newest estimates of all variables of a copy of the graph."""
+        left = {k.key: guess[0] for k, guess in zip(graph.keyframes, self._left, strict=False)}
+        known = self._waiting.values | left
         keys = [*(k.key for k in graph.keyframes), *graph.values]
-        waiting = self._waiting.values
-        return waiting | {key: self._solver.value(key) for key in keys if key not in waiting}
+        return known | {key: self._solver.value(key) for key in keys if key not in known}
 
     @staticmethod
     def _optimum(graph: Graph, start: Values) -> tuple[Array, Array]:
@@ -209,22 +219,25 @@ class Incremental:
         self._filtered[newest.index] = (self._graph.pose, self._graph.covariance)
         for key in touched:
             if not is_landmark(key) and key not in followed:
-                value = self._solver.value(key)
-                if not np.all(np.isfinite(value)):
-                    raise IndeterminateError(key)
-                self._graph.values[key] = value
+                self._graph.values[key] = self._value(key)
             else:
                 self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
 
+    def _value(self, key: int) -> Array:
+        value = self._solver.value(key)
+        if not all(map(math.isfinite, value.tolist())):
+            raise IndeterminateError(key)
+        return value
+
     def _marginal(self, key: int, graph: Graph | None = None) -> tuple[Array, Array]:
         """Estimate and covariance of a variable; ``graph``: where to report, of a copy."""
-        value = self._solver.value(key)
-        if not np.all(np.isfinite(value)):
-            raise IndeterminateError(key)
+        value = self._value(key)
         try:
             covariance = self._solver.covariance(key)
         except RuntimeError:
             covariance = np.full((1, 1), np.nan)
+        if positive.is_clear(covariance):
+            return value, covariance
         if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
             found = covariances(*self._solver.linear(), (key,))
             (graph or self._graph).report_damping(found.damping)
@@ -236,9 +249,9 @@ class Incremental:
 
         ``constants``: those that are in the solver by now, which are brought up to date.
         """
-        if not isinstance(self._solver, Window) or self._settings.lag is None:
+        if not isinstance(self._solver, Window) or self._lag is None:
             return
-        lag, count = self._settings.lag, len(self._left)
+        lag, count = self._lag, len(self._left)
         if self._graph.keyframes[count].t >= now - lag - MARGIN:
             return
         end = count
@@ -246,8 +259,10 @@ class Incremental:
             end += 1
         leaving = self._graph.keyframes[count:end]
         try:
-            covariances = self._solver.covariances([k.key for k in leaving])
-            self._left += [(self._solver.value(k.key), c) for k, c in zip(leaving, covariances, strict=True)]
+            for k in leaving:
+                # of a start of the whole problem the covariance is not asked
+                known = (self._value(k.key), self._filtered[k.index][1]) if self._is_whole else self._marginal(k.key)
+                self._left.append(known)
             for key in constants:
                 self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
         except RuntimeError:
@@ -364,7 +379,7 @@ class Incremental:
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
         """The time of each variable of a window that begins; points are as if they were seen now."""
         now = keyframes[-1].t
-        oldest = -math.inf if self._settings.lag is None else now - self._settings.lag - MARGIN
+        oldest = -math.inf if self._lag is None else now - self._lag - MARGIN
         stamps = {key: now if key in self._graph.values else oldest for key in values}
         return stamps | {k.key: k.t for k in keyframes}
 
@@ -380,9 +395,9 @@ class Incremental:
         parameters.setFactorization(factorization or self._factorization)
         # far from where a point was first taken to be its factors mean nothing
         parameters.relinearizeSkip = 1 if self._maps else self._settings.relinearize_skip
-        if self._settings.lag is None:
-            return FullHistory(parameters, self._settings.relinearize_threshold)
         threshold = self._settings.relinearize_threshold
-        parameters.setRelinearizeThreshold(min(threshold, NEAR_POINTS) if self._maps else threshold)
+        if self._lag is None:
+            return FullHistory(parameters, threshold)
         parameters.findUnusedFactorSlots = True
-        return Window(parameters, self._settings.lag, self._failed.append)
+        threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
+        return Window(parameters, threshold, self._lag, self._failed.append)

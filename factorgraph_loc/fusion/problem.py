@@ -1,16 +1,19 @@
 """The whole run as one nonlinear least-squares problem, solved at once.
 
-Levenberg-Marquardt in Python with GTSAM's sparse elimination: our factors are linearised here, where the values are at hand,
-because each callback from GTSAM would copy all of them.
+Levenberg-Marquardt in Python. Our factors are linearised here, where the values are at hand, because each callback from GTSAM would
+copy all of them. A row of poses is solved by compiled code, anything else with GTSAM's sparse elimination.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
 
 import gtsam
 import numpy as np
 
+from factorgraph_loc.fusion.chained import Chained
 from factorgraph_loc.fusion.marginals import Covariances, covariances
 from factorgraph_loc.fusion.variables import Values, gather, gtsam_errors, retract, to_gtsam
 from factors.graph import Factor, jacobian_factor
@@ -46,35 +49,35 @@ class Problem:
         for _, _, native in natives:
             self._graph.add(native)
 
+    @cached_property
+    def _chain(self) -> Chained | None:
+        """The problem as a row of poses, None where it is none."""
+        chain = Chained(self._factors)
+        return chain if not self._natives and chain.fits else None
+
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
         """The optimum found from a guess, or where ``max_iterations`` lead."""
-        damping, cost = INITIAL_DAMPING, self.cost(values)
-        if not math.isfinite(cost) and len(self._natives):
+        chain = self._chain
+        begin = None if chain is None else chain.begin(values)
+        if chain is not None and begin is not None:
+            state, cost, iterations = _optimum(chain.cost, chain.moved, begin, max_iterations)
+            return Solution(values | chain.values(state), cost, iterations)
+        if not math.isfinite(self.cost(values)) and len(self._natives):
             self._replace_natives()
-            cost = self.cost(values)
-        iteration = 0
-        while iteration < max_iterations and damping < MAX_DAMPING:
-            iteration += 1
-            graph = self.linearize(values)
-            for key, value in values.items():
-                size = len(value)
-                graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
-            try:
-                with gtsam_errors():
-                    step = graph.optimize()
-            except RuntimeError:  # nearly singular
-                damping *= 10.0
-                continue
-            moved = {key: retract(key, value, step.at(key)) for key, value in values.items()}
-            new_cost = self.cost(moved)
-            if not (math.isfinite(new_cost) and new_cost <= cost):
-                damping *= 10.0
-                continue
-            gained = cost - new_cost
-            values, cost, damping = moved, new_cost, damping / 10.0
-            if gained < CONVERGED_GAIN * cost:
-                break
-        return Solution(values, cost, iteration)
+        return Solution(*_optimum(self.cost, self._moved, values, max_iterations))
+
+    def _moved(self, values: Values, damping: float) -> Values | None:
+        """A step of Levenberg and Marquardt; None where the problem is nearly singular."""
+        graph = self.linearize(values)
+        for key, value in values.items():
+            size = len(value)
+            graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
+        try:
+            with gtsam_errors():
+                step = graph.optimize()
+        except RuntimeError:
+            return None
+        return {key: retract(key, value, step.at(key)) for key, value in values.items()}
 
     def cost(self, values: Values) -> float:
         """The robust cost, infinite where one of GTSAM's factors throws and where it is not a number."""
@@ -106,4 +109,29 @@ class Problem:
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
         """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""
+        found = None if self._chain is None else self._chain.covariances(values)
+        if found is not None:
+            return found
         return covariances(self.linearize(values), {key: len(value) for key, value in values.items()}, list(keys))
+
+
+State = TypeVar("State")
+
+
+def _optimum(
+    cost_of: Callable[[State], float], moved: Callable[[State, float], State | None], state: State, max_iterations: int
+) -> tuple[State, float, int]:
+    """The optimum by Levenberg and Marquardt's steps, its cost, and how many there were."""
+    damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
+    while iteration < max_iterations and damping < MAX_DAMPING:
+        iteration += 1
+        new = moved(state, damping)
+        new_cost = math.inf if new is None else cost_of(new)
+        if new is None or not (math.isfinite(new_cost) and new_cost <= cost):
+            damping *= 10.0
+            continue
+        gained = cost - new_cost
+        state, cost, damping = new, new_cost, damping / 10.0
+        if gained < CONVERGED_GAIN * cost:
+            break
+    return state, cost, iteration

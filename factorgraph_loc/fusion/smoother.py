@@ -1,7 +1,9 @@
 """The main estimator: one factor graph over the run, kept solved by iSAM2.
 
-By default the whole history stays in the graph; with ``lag`` poses older than that are marginalised out, each with the estimate
-that it left the window with.
+By default causal estimates come from a window, from which poses older than 10 s are marginalised out, and the whole problem is
+solved at the end. With ``lag = "all"`` the whole history stays in iSAM2; with a number of seconds each pose keeps the estimate
+that it left the window with. Where landmarks or points are estimated, which loops may close at any time, the default is the whole
+history.
 """
 
 from __future__ import annotations
@@ -25,5 +27,5 @@ class Smoother(GraphEstimator):
         return self._incremental
 
     def forget(self, before: float) -> None:
-        """Forget the trajectory before then, as far as it has left the window; a full history keeps all."""
+        """Forget the trajectory before then, as far as it has left a window whose ``lag`` is set; else all is kept."""
         self._incremental.forget(min(before, self._graph.t - self._settings.max_delay))

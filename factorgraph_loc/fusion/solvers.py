@@ -1,10 +1,10 @@
 """iSAM2 with the full history, and with a window that poses leave, behind one set of methods.
 
-In the full history our own factors are linearised here and given to iSAM2 as linear ones: a callback from GTSAM copies all
-variables, so its cost would grow with the run. A factor is linearised where iSAM2 linearises its variables, and replaced in the
+Our own factors are linearised here and given to iSAM2 as linear ones: a callback from GTSAM copies all variables, and returns to
+Python for each factor. A factor is linearised where iSAM2 linearises its variables, and replaced in the
 update that moves these: were it left behind, the factors would no longer agree on what a turn of the whole graph does to the poses,
 and would seem to tell of the heading what nothing measured (Huang, Mourikis, Roumeliotis, International Journal of Robotics
-Research 29(5), 2010). In a window there are few variables, and callbacks are cheap.
+Research 29(5), 2010).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.summary import Summary, oldest_pose
 from factorgraph_loc.fusion.variables import Node, Values, gather, gtsam_errors, is_point, is_pose, read, to_gtsam
-from factors.graph import custom_factor, jacobian_factor, pose_array, read_pose, read_vector
+from factors.graph import jacobian_factor, pose_array, silenced
 from factors.se2 import Array
 
 MARGIN = 1.0  # s that a pose stays longer in a window
@@ -66,42 +66,10 @@ class FullHistory:
     def __init__(self, parameters: gtsam.ISAM2Params, threshold: float) -> None:
         parameters.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(parameters)
-        self._threshold, self._skip = threshold, parameters.relinearizeSkip
-        self._updates = 0
-        self._at: Values = {}  # where ISAM2 linearises each variable
-        self._keys: list[int] = []  # of all variables
-        self._starts: list[int] = [0]  # of each of them in a vector of all, and its length
-        self._linear: defaultdict[int, list[_Linear]] = defaultdict(list)  # our factors on each variable
+        self._ours = _Ours(threshold, parameters.relinearizeSkip, None)
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        with gtsam_errors():
-            self._update(nodes, values)
-
-    def _update(self, nodes: Sequence[Node], values: Values) -> None:
-        ours = self._relinearized()
-        old = [linear.slot for linear in ours]
-        self._at |= values
-        for key, value in values.items():
-            self._keys.append(key)
-            self._starts.append(self._starts[-1] + len(value))
-        graph = gtsam.NonlinearFactorGraph()
-        for linear in ours:
-            graph.add(linear.at(self._at))
-        for node in nodes:
-            if node.native is not None:
-                graph.add(node.native)
-                continue
-            linear = _Linear(node, graph.size())
-            graph.add(linear.at(self._at))
-            ours.append(linear)
-            for key in node.keys:
-                self._linear[key].append(linear)
-        for i in range(len(old)):
-            ours[i].slot = i
-        slots = self._isam.update(graph, to_gtsam(values), old).getNewFactorsIndices()
-        for linear in ours:
-            linear.slot = slots[linear.slot]
-        self._updates += 1
+        self.begin((), nodes, values, {})
 
     def begin(
         self,
@@ -110,8 +78,9 @@ class FullHistory:
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
-        natives = [Node(tuple(factor.keys()), native=factor) for factor in factors]
-        self.update([*natives, *nodes], values, 0.0)
+        with gtsam_errors():
+            graph, removed = self._ours.added(self._isam, factors, nodes, values)
+            self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
 
     @property
     def oldest(self) -> int:
@@ -134,33 +103,25 @@ class FullHistory:
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
         return _linear(self._isam)
 
-    def _relinearized(self) -> list[_Linear]:
-        """Our factors on those variables that the next update will linearise elsewhere."""
-        if not self._keys or (self._updates + 1) % self._skip:
-            return []
-        change = np.abs(self._isam.getDelta().vector(self._keys))
-        moved = np.flatnonzero(np.maximum.reduceat(change, self._starts[:-1]) >= self._threshold)
-        found: dict[int, _Linear] = {}
-        for key in (self._keys[i] for i in moved.tolist()):
-            self._at[key] = read(self._isam, key)
-            found |= {id(linear): linear for linear in self._linear.get(key, ())}
-        return list(found.values())
-
 
 class Window:
     """Poses older than ``lag``, and a margin so that they can be read several at a time, are marginalised out."""
 
-    def __init__(self, parameters: gtsam.ISAM2Params, lag: float, on_failure: Callable[[str], None]) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(lag + MARGIN, parameters)
-        self._sizes: dict[int, int] = {}  # of the variables that are no poses
-        self._on_failure = on_failure
-        # before the last update: all factors, and where they were linearised
-        self._before = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    def __init__(
+        self, parameters: gtsam.ISAM2Params, threshold: float, lag: float, on_failure: Callable[[str], None]
+    ) -> None:
+        parameters.setRelinearizeThreshold(threshold)
+        self._lag = lag + MARGIN
+        self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag, parameters)
+        self._ours = _Ours(threshold, parameters.relinearizeSkip, on_failure)
+        self._stamps: dict[int, float] = {}  # of the variables in the window
+        # before the last update: all factors, where they were linearised, and which of them are ours
+        self._before = gtsam.NonlinearFactorGraph(), gtsam.Values(), frozenset[int]()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         stamps: dict[int, float] = dict.fromkeys(values, t)
         # what is constant never leaves the window, points do when they are seen no more
-        stamps |= dict.fromkeys((key for key in self._sizes if not is_point(key)), t)
+        stamps |= dict.fromkeys((key for key in self._stamps if not is_pose(key) and not is_point(key)), t)
         stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
         self.begin((), nodes, values, stamps)
 
@@ -171,15 +132,16 @@ class Window:
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
-        self._sizes |= {key: len(value) for key, value in values.items() if not is_pose(key)}
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in factors:
-            graph.add(factor)
-        for node in nodes:
-            graph.add(node.native if node.native is not None else self._custom(node))
-        self._before = self._smoother.getFactors(), self._smoother.getLinearizationPoint()
+        self._before = self._state()
         with gtsam_errors():
-            self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps))
+            graph, removed = self._ours.added(self._smoother, factors, nodes, values)
+            self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps), removed)
+            self._ours.place(self._smoother.getISAM2Result().getNewFactorsIndices())
+        self._stamps |= stamps
+        oldest = max(self._stamps.values()) - self._lag
+        for key in [key for key, t in self._stamps.items() if t < oldest]:
+            del self._stamps[key]
+            self._ours.forget(key)
 
     def value(self, key: int) -> Array:
         with gtsam_errors():
@@ -200,35 +162,108 @@ class Window:
         return oldest_pose(self._before[0].keyVector())
 
     def summary(self, *, failed: bool) -> Summary | None:
-        graph, at = self._before if failed else (self._smoother.getFactors(), self._smoother.getLinearizationPoint())
-        return Summary.of(graph, at) if graph.size() else None
+        graph, at, ours = self._before if failed else self._state()
+        return Summary.of(graph, at, ours) if graph.size() else None
 
-    def covariances(self, keys: Sequence[int]) -> list[Array]:
-        """Marginal covariances of neighbouring poses, together: they share most of the work."""
-        with gtsam_errors():
-            joint = self._smoother.getISAM2().jointMarginalCovariance(list(keys))
-            return [np.asarray(joint.at(key, key)) for key in keys]
+    def _state(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, frozenset[int]]:
+        return self._smoother.getFactors(), self._smoother.getLinearizationPoint(), self._ours.slots
 
-    def _custom(self, node: Node) -> gtsam.NonlinearFactor:
-        assert node.factor is not None
-        readers = [read_pose if is_pose(key) else read_vector for key in node.keys]
-        dimensions = [3 if is_pose(key) else self._sizes[key] for key in node.keys]
-        return custom_factor(node.factor, node.keys, readers, dimensions, node.rows, self._on_failure)
+
+class _Ours:
+    """Our factors in a solver of GTSAM's, and where that linearises its variables: those that moved as far as ``threshold``, at
+    each update whose number ``skip`` divides. ``on_failure`` is told of a factor that cannot be linearised, which then says
+    nothing; without it that is an error."""
+
+    def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None] | None) -> None:
+        self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
+        self._updates = 0
+        self.at: Values = {}  # where each variable is linearised
+        self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
+        self._slots: set[int] = set()
+        self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
+
+    def added(
+        self,
+        solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother,
+        factors: Iterable[gtsam.NonlinearFactor],
+        nodes: Sequence[Node],
+        values: Values,
+    ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
+        """All that the next update is to add, which is to be told by :meth:`place`, and the slots of what it is to remove: factors
+        on variables that it will linearise elsewhere are replaced."""
+        self._added = self._moved(solver)
+        removed = [linear.slot for linear in self._added]
+        self._slots.difference_update(removed)
+        self.at |= values
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        for node in nodes:
+            if node.native is not None:
+                graph.add(node.native)
+                continue
+            linear = _Linear(node)
+            self._added.append(linear)
+            for key in node.keys:
+                self._on[key][id(linear)] = linear
+        for linear in self._added:
+            linear.slot = graph.size()
+            graph.add(linear.on(self.at, self._on_failure))
+        return graph, removed
+
+    def place(self, slots: Sequence[int]) -> None:
+        """Take where the solver has put what was added."""
+        for linear in self._added:
+            linear.slot = slots[linear.slot]
+            self._slots.add(linear.slot)
+
+    def forget(self, key: int) -> None:
+        """A variable has left the solver, with all factors on it."""
+        del self.at[key]
+        for linear in self._on.pop(key, {}).values():
+            self._slots.discard(linear.slot)
+            for other in linear.node.keys:
+                if other != key:
+                    self._on[other].pop(id(linear), None)
+
+    @property
+    def slots(self) -> frozenset[int]:
+        """Where they are in the solver."""
+        return frozenset(self._slots)
+
+    def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
+        """Those on variables that the next update will linearise elsewhere."""
+        self._updates += 1
+        if not self.at or self._updates % self._skip:
+            return []
+        keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
+        change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
+        moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
+        if not moved:
+            return []
+        isam = solver if isinstance(solver, gtsam.ISAM2) else solver.getISAM2()
+        fixed = isam.getFixedVariables()  # what marginal factors are on
+        found: dict[int, _Linear] = {}
+        for key in moved:
+            if not fixed.count(key):
+                self.at[key] = read(solver, key)
+                found |= self._on.get(key, {})
+        return list(found.values())
 
 
 class _Linear:
-    """One of our factors in the full history, and which slot of iSAM2 it has."""
+    """One of our factors, and its slot in the solver."""
 
-    def __init__(self, node: Node, slot: int) -> None:
-        self.node = node
-        self.slot = slot
+    def __init__(self, node: Node) -> None:
+        self.node, self.slot = node, -1
 
-    def at(self, values: Values) -> gtsam.LinearContainerFactor:
-        """The factor, linearised at ``values``."""
-        assert self.node.factor is not None
-        point = gather(values, self.node.keys)
-        here = to_gtsam(dict(zip(self.node.keys, point, strict=True)))
-        return gtsam.LinearContainerFactor(jacobian_factor(self.node.factor, self.node.keys, point), here)
+    def on(self, values: Values, on_failure: Callable[[str], None] | None) -> gtsam.LinearContainerFactor:
+        """The factor, linearised at ``values``. It does without a point that it is linearised at: the solver never leaves that."""
+        factor, keys = self.node.factor, self.node.keys
+        assert factor is not None
+        if on_failure is not None:
+            factor = silenced(factor, self.node.rows, on_failure)
+        return gtsam.LinearContainerFactor(jacobian_factor(factor, keys, gather(values, keys)))
 
 
 def _linear(isam: gtsam.ISAM2) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:

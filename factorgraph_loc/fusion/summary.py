@@ -31,8 +31,9 @@ class Summary:
     at: gtsam.Values
 
     @classmethod
-    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> Summary:
-        every = (graph.at(i) for i in range(graph.size()))
+    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, ours: Collection[int] = ()) -> Summary:
+        """Of a graph that is linearised ``at`` there. ``ours``: places of factors of our own, which are not marginal ones."""
+        every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         kept = tuple(
             # iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one
             gtsam.LinearContainerFactor(f.factor(), at) if isinstance(f, gtsam.LinearContainerFactor) else f

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factors import se2
 from factors.displaced import carried, common_error, delayed, displaced
+from factors.landmarks import kernels
 from factors.landmarks.model import (
+    EXACT,
     PARAMETERS,
     TIME_OFFSET,
     BearingRangeModel,
@@ -18,11 +20,12 @@ from factors.landmarks.model import (
     recalibrated,
     robust_loss,
     robust_weight,
-    whitened,
     whitened_all,
 )
+from factors.landmarks.stack import BearingRangeStack
 from factors.se2 import Array
 
+_NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
 
@@ -53,10 +56,58 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        if not self.free:
+            found = self._compiled(values)
+            kernels.weigh(*found, self.model.robust)
+            error, *blocks = self._of_values(*found)
+            return error.ravel(), [block.reshape(-1, block.shape[2]) for block in blocks]
         error, blocks = self.whitened(values)
         weight = np.sqrt(robust_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
         return (weight[:, None] * error).ravel(), weighted
+
+    @property
+    def kind(self) -> Hashable:
+        """What looks have in common that are linearised together; None for one of a free landmark."""
+        return None if self.free else (self.estimated, self.model)
+
+    def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
+        """Looks of this kind as one: see :class:`~factors.graph.Stackable`."""
+        return BearingRangeStack(factors, numbers, column)
+
+    def _compiled(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
+        """Whitened residual (K, 2) of a factor without a free landmark, and its Jacobians by the pose (K, 2, 3) and by
+        :data:`PARAMETERS` (K, 2, 6)."""
+        changes, count = np.zeros(len(PARAMETERS)), len(self.points)
+        if self.estimated:
+            changes[list(self.estimated)] = values[1]
+        found = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, len(PARAMETERS)))
+        spreads = EXACT if self.point_covariances is None else self.point_covariances
+        seen = self.points, self.ranges, self.bearings
+        kernels.linearize(self.packed_model, values[0], changes, *seen, self.carried, spreads, *found)
+        return found
+
+    def _of_values(self, error: Array, by_pose: Array, by_sensor: Array) -> list[Array]:
+        """The residual, and the Jacobians by the values of the factor."""
+        return [error, by_pose, by_sensor[..., list(self.estimated)]] if self.estimated else [error, by_pose]
+
+    @property
+    def packed_model(self) -> kernels.Model:
+        """The model for compiled code."""
+        m = self.model
+        sensor = m.range_scale, m.range_sigma, m.range_sigma_relative, m.bearing_bias, m.bearing_sigma
+        return m.mounting, sensor, m.depth, m.depth_axis, m.robust
+
+    @property
+    def carried(self) -> kernels.Carried:
+        """Offset, its covariance and the velocity for compiled code, each with whether there is one."""
+        offset, spread, twist = self.offset, self.offset_covariance, self.twist
+        count = float(len(self.points) if self.in_look is None else self.in_look)
+        return (
+            *(offset is not None, _NOWHERE if offset is None else offset),
+            *(spread is not None, _EXACTLY if spread is None else spread, count),
+            *(twist is not None, _NOWHERE if twist is None else twist),
+        )
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
@@ -79,21 +130,20 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
-        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+        if not self.free:
+            error, *blocks = self._of_values(*self._compiled(values))
+            return error, blocks
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1])
         offset = here.offset
         at = values[0] if offset is None else se2.compose(values[0], offset)
         arguments = (here.model, at, here.points, self.ranges, self.bearings)
-        if self.estimated or self.free or self.point_covariances is not None:
-            error, by_pose, by_point, by_sensor = whitened_all(*arguments)
-        else:
-            error, by_pose = whitened(*arguments)
+        error, by_pose, by_point, by_sensor = whitened_all(*arguments)
         blocks = [by_pose]
         if self.estimated:
             if self.twist is not None:
                 by_sensor[..., TIME_OFFSET] = by_pose @ self.twist
             blocks.append(by_sensor[..., list(self.estimated)])
-        if self.free:
-            blocks.append(by_point)
+        blocks.append(by_point)
         spread = None
         if self.point_covariances is not None:
             spread = carried(by_point, self.point_covariances)

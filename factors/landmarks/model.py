@@ -142,29 +142,18 @@ def _constants(model: BearingRangeModel, parameters: Array) -> Array:
     return out
 
 
-def whitened(
-    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
-) -> tuple[Array, Array]:
-    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, 3) by its body-frame perturbation. Compiled; equal to
-    :func:`residuals` and :func:`jacobians`."""
-    error, by_pose, _, _ = _evaluate(model, pose, points, ranges, bearings, 0)
-    return error, by_pose
-
-
 def whitened_all(
     model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """As :func:`whitened`, with the Jacobians by the points (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6)."""
-    return _evaluate(model, pose, points, ranges, bearings, len(points))
+    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobians by its body-frame perturbation (K, 2, 3), by the points
+    (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6), that by the time offset zero.
 
-
-def _evaluate(
-    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array, more: int
-) -> tuple[Array, Array, Array, Array]:
+    Compiled; equal to :func:`residuals` and :func:`jacobians`.
+    """
     count = len(points)
     error, by_pose = np.zeros((count, 2)), np.zeros((count, 2, 3))
-    by_point, by_sensor = np.zeros((more, 2, 2)), np.zeros((more, 2, len(PARAMETERS)))
-    _whitened(
+    by_point, by_sensor = np.zeros((count, 2, 2)), np.zeros((count, 2, len(PARAMETERS)))
+    whitened_into(
         pose,
         model.mounting,
         (model.range_scale, model.range_sigma, model.range_sigma_relative, model.bearing_bias, model.bearing_sigma),
@@ -182,7 +171,7 @@ def _evaluate(
 
 
 @numba.njit(cache=True)
-def _whitened(
+def whitened_into(
     pose: Array,
     mounting: tuple[float, float, float],
     model: tuple[float, float, float, float, float],
@@ -196,10 +185,10 @@ def _whitened(
     by_point: Array,
     by_sensor: Array,
 ) -> None:
+    """:func:`whitened_all` into arrays that hold zeros."""
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)
-    more = len(by_point) > 0
     for k in range(len(points)):
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
         px, py = c * dx + s * dy, c * dy - s * dx  # in the robot frame
@@ -212,21 +201,18 @@ def _whitened(
             weight *= range_scale
             by_pose[k, 0, 0], by_pose[k, 0, 1] = -vx * weight, -vy * weight
             by_pose[k, 0, 2] = (vx * py - vy * px) * weight
-            if more:
-                by_sensor[k, 0, 3] = (vx * sx + vy * sy) * weight
-                by_sensor[k, 0, 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
+            by_sensor[k, 0, 3] = (vx * sx + vy * sy) * weight
+            by_sensor[k, 0, 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
         if not math.isnan(bearings[k]):
             weight = 1.0 / (distance * bearing_sigma)
             by_pose[k, 1, 0], by_pose[k, 1, 1] = uy * weight, -ux * weight
             by_pose[k, 1, 2] = (-uy * py - ux * px) * weight
-            if more:
-                by_sensor[k, 1, 2] = 1.0 / bearing_sigma
-        if more:
-            for i in range(2):
-                # moving the sensor is moving the robot; moving the point is the opposite, in the world frame
-                by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
-                by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
-                by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
+            by_sensor[k, 1, 2] = 1.0 / bearing_sigma
+        for i in range(2):
+            # moving the sensor is moving the robot; moving the point is the opposite, in the world frame
+            by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
+            by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
+            by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
 
 
 @numba.njit(cache=True)

@@ -181,3 +181,64 @@ def _inverse(j: Array) -> Array:
             (0.0, 0.0, 1.0),
         )
     )
+
+
+@numba.njit(cache=True)
+def linearize_changed(
+    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """:func:`linearize` of an increment whose logarithm is ``twist`` (3,), under changed ``constants``: see :func:`changed`."""
+    delta, by_changes = changed(twist, moving, constants, indices)
+    return linearize(start, end, delta, by_changes, whitener)
+
+
+@numba.njit(cache=True)
+def linearize_all(
+    poses: Array,
+    first: Integers,
+    deltas: Array,
+    twists: Array,
+    moving: Array,
+    constants: Array,
+    indices: Integers,
+    whiteners: Array,
+    jacobian: Array,
+    residual: Array,
+    column: int,
+) -> None:
+    """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
+    and those that follow; ``column``: of the constants."""
+    for k in range(len(first)):
+        start, end, rows = poses[first[k]], poses[first[k] + 1], slice(3 * k, 3 * k + 3)
+        if len(indices):
+            found = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
+            jacobian[rows, column : column + len(indices)] = found[3]
+        else:
+            found = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
+        residual[rows], jacobian[rows, :3], jacobian[rows, 3:6] = found[0], found[1], found[2]
+
+
+@numba.njit(cache=True)
+def cost_of_all(
+    poses: Array,
+    first: Integers,
+    deltas: Array,
+    twists: Array,
+    moving: Array,
+    constants: Array,
+    indices: Integers,
+    whiteners: Array,
+) -> float:
+    """Half the sum of the squared residuals of :func:`linearize_all`."""
+    total = 0.0
+    for k in range(len(first)):
+        delta = deltas[k]
+        if len(indices):
+            delta, _ = recalibrate(twists[k], moving[k], _full(constants, indices))
+        rx, ry, turned = _between(poses[first[k]], poses[first[k] + 1])
+        ex, ey, angle = _between(delta, np.array((rx, ry, turned)))
+        x, y, angle = log(ex, ey, angle)
+        w = whiteners[k]
+        total += (w[0, 0] * x) ** 2 + (w[1, 0] * x + w[1, 1] * y) ** 2
+        total += (w[2, 0] * x + w[2, 1] * y + w[2, 2] * angle) ** 2
+    return 0.5 * total

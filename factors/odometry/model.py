@@ -10,7 +10,7 @@ applies to all odometry, because an increment without noise would make a graph s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry.kernels import Noise, linearize, recalibrate, relative, whitener
+from factors.odometry.kernels import Noise, linearize, linearize_changed, recalibrate, relative, whitener
+from factors.odometry.stack import OdometryStack
 from factors.se2 import Array
 
 # minimum noise of an increment without duration, whose covariance must be invertible
@@ -148,23 +149,35 @@ class OdometryFactor:
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
         self._increment = increment
         self._arc = se2.log(increment.delta)
-        self._estimated = list(estimated)
+        self.estimated = tuple(estimated)
+        self._indices = np.array(estimated, dtype=np.int64)
         self._whitener = whitener(increment.covariance)
+
+    @property
+    def packed(self) -> tuple[Array, Array, float, Array]:
+        """The increment (3,), its logarithm (3,), how long the robot moved, and what whitens it (3, 3)."""
+        return self._increment.delta, self._arc, self._increment.moving, self._whitener
+
+    @property
+    def kind(self) -> Hashable:
+        """What increments have in common that are linearised together."""
+        return self.estimated
+
+    def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
+        """Increments of this kind as one: see :class:`~factors.graph.Stackable`."""
+        return OdometryStack(factors, numbers, column)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
-        residual, *blocks = linearize(values[0], values[1], *self._delta(values), self._whitener)
-        return residual, blocks if self._estimated else blocks[:2]
+        start, end, *constants = values
+        if constants:
+            changed = self._arc, self._increment.moving, constants[0], self._indices
+            residual, *blocks = linearize_changed(start, end, *changed, self._whitener)
+            return residual, blocks
+        residual, *blocks = linearize(start, end, self._increment.delta, np.zeros((3, 0)), self._whitener)
+        return residual, blocks[:2]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""
-        error = self._whitener @ se2.log(se2.between(self._delta(values)[0], se2.between(values[0], values[1])))
-        return 0.5 * float(error @ error)
-
-    def _delta(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        if not self._estimated:
-            return self._increment.delta, np.zeros((3, 0))
-        parameters = np.zeros(len(PARAMETERS))
-        parameters[self._estimated] = values[2]
-        delta, jacobian = recalibrate(self._arc, self._increment.moving, parameters)
-        return delta, np.ascontiguousarray(jacobian[:, self._estimated])
+        residual, _ = self.linearize(values)
+        return 0.5 * float(residual @ residual)

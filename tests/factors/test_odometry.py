@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.graph import read_pose
+from factors.graph import pose_array
 from factors.motion import Increment
 from factors.odometry.chain import OdometryChain
 from factors.odometry.model import (
@@ -330,7 +330,7 @@ def test_the_factor_without_parameters_is_gtsams(delta, start, moved, seed):
     values = gtsam.Values()
     values.insert(0, gtsam.Pose2(*start))
     values.insert(1, gtsam.Pose2(*se2.compose(start, moved)))
-    ours = OdometryFactor(increment).cost([read_pose(values, 0), read_pose(values, 1)])
+    ours = OdometryFactor(increment).cost([pose_array(values.atPose2(key)) for key in (0, 1)])
     assert ours == pytest.approx(between_factor(0, 1, increment).error(values), rel=1e-6, abs=1e-9)
 
 

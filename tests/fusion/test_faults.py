@@ -19,6 +19,7 @@ CONFIGS = {
     "ekf": RunConfig("ekf"),
     "particle_filter": RunConfig("particle_filter", {"particles": 500}),
     "smoother": RunConfig("smoother"),
+    "smoother_all": RunConfig("smoother", {"lag": "all"}),
     "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
     "batch": RunConfig("batch"),
 }
@@ -311,7 +312,8 @@ def test_particle_filter_repeats_with_its_seed(log, clean):
 
 
 @pytest.mark.parametrize(
-    ("name", "solver", "tolerance"), [("smoother", FullHistory, 1e-3), ("smoother_lag", Window, 0.02)]
+    ("name", "solver", "tolerance"),
+    [("smoother_all", FullHistory, 1e-3), ("smoother", Window, 0.02), ("smoother_lag", Window, 0.02)],
 )
 def test_solver_fails_in_mid_run(name, solver, tolerance, log, clean, monkeypatch):
     """The failing update has been applied when it raises."""

@@ -87,20 +87,26 @@ def test_what_is_absent_is_marginalised_out_of_a_summary():
     assert np.allclose(np.linalg.inv(left.linearize(at).information()), marginal, rtol=1e-6)
 
 
+@pytest.mark.parametrize("lag", [None, 8.0])
 @pytest.mark.parametrize("skip", [1, 10])
-def test_our_factors_are_linearised_where_isam2_linearises(skip, log):
+def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
     moved = set()
 
     def watch(_, estimator):
         solver = estimator._incremental._solver
-        assert isinstance(solver, FullHistory)
-        at = read_all(solver._isam.getLinearizationPoint(), solver._keys)
-        for key, value in solver._at.items():
+        assert isinstance(solver, FullHistory if lag is None else Window)
+        isam = solver._isam if lag is None else solver._smoother.getISAM2()
+        assert set(isam.getLinearizationPoint().keys()) == set(solver._ours.at)
+        factors = isam.getFactorsUnsafe()
+        for slot in solver._ours.slots:
+            assert isinstance(factors.at(slot), gtsam.LinearContainerFactor)
+        at = read_all(isam.getLinearizationPoint(), solver._ours.at)
+        for key, value in solver._ours.at.items():
             assert np.allclose(at[key], value, atol=1e-12)
             if not np.array_equal(value, first.setdefault(key, value)):
                 moved.add(key)
 
     first = {}
-    settings = {"landmarks": "unknown", "relinearize_threshold": 0.02, "relinearize_skip": skip}
+    settings = {"landmarks": "unknown", "relinearize_threshold": 0.02, "relinearize_skip": skip, "lag": lag}
     run(log, RunConfig("smoother", settings, prior=START), watch=watch)
     assert len(moved) > 5
