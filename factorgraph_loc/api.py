@@ -28,6 +28,7 @@ from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_
 from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.files.temporary import of_system, temporary_folder
 from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.native.rig_file import write_rig
@@ -181,13 +182,11 @@ def simulate(
     if out is None:
         return log
     folder = Path(out)
-    try:
+    with writing(folder):
         if images:
             _write_with_images(log, settings, seed, folder, progress)
         else:
             write_native(log, folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
     return _one(folder) if images else log
 
 
@@ -205,12 +204,9 @@ def calibrate(
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / rig.name.removesuffix(RIG)
         found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
-        try:
-            with replacing(page) as temporary:  # write both files or none
-                temporary.write_text(rig_report.page(found), encoding="utf-8")
-                write_rig(found.rig, rig)
-        except OSError as error:
-            raise InputError(f"{rig}: cannot be written: {error.strerror}") from error
+        with writing(rig), replacing(page) as temporary:  # write both files or none
+            temporary.write_text(rig_report.page(found), encoding="utf-8")
+            write_rig(found.rig, rig)
     return found
 
 

@@ -29,7 +29,7 @@ Number = tuple[str, type, float, float]
 
 
 def numbers_of(model: type[BaseModel], prefix: str = "") -> list[Number]:
-    """Key, kind and bounds of all numbers in settings; ``*`` stands for a name that the user chooses."""
+    """Key, kind and bounds of all numbers in settings; ``*`` stands for a user-defined name."""
     found: dict[str, Number] = {}
     for name, field in model.model_fields.items():
         for number in _numbers(field.annotation, tuple(field.metadata), f"{prefix}{name}"):
@@ -84,7 +84,7 @@ def _of_columns(table: Table) -> list[str]:
 
 
 def written(value: float) -> str:
-    """A bound as a person writes it: multiples of pi so, the neighbour of a round number as that number."""
+    """A bound in readable form: as a multiple of pi, or rounded."""
     for times, name in ((2.0, "2 pi"), (1.0, "pi"), (0.5, "pi / 2")):
         if math.isclose(abs(value), times * math.pi, rel_tol=1e-12):
             return name if value > 0.0 else f"-{name}"

@@ -1,4 +1,4 @@
-"""The command line of scripts that print tables, or put them into a page of the docs."""
+"""The command line of scripts that print tables, or insert them into a page of the docs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MARK = "<!-- tables -->"
 
 
 def main(about: str, tables: Callable[[], Iterable[str]]) -> None:
-    """Print the lines of ``tables``, or put them into a page below :data:`MARK`."""
+    """Print the lines of ``tables``, or insert them into a page below :data:`MARK`."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--docs", type=Path, metavar="PAGE", help=f"the page to put them into, below {MARK}")
     page = parser.parse_args().docs

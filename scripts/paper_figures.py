@@ -47,7 +47,7 @@ def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
 def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
     """Figure 5: the trajectories from prediction, from single sensors and fused, and with a reference their errors over time.
 
-    Causal ones; of an estimator that has none the final one, and its label says so.
+    Causal trajectories, or the final one of an estimator without, with a label that says so.
     """
     figure = empty(8.0, f"{log.name}: trajectories from each sensor and fused")
     axes = figure.subplot_mosaic([["map", "errors"]], width_ratios=(1.1, 1.0))

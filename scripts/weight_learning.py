@@ -1,4 +1,4 @@
-"""Learns the weights of the 35 values from images of flat scenes with known homographies."""
+"""Learning of the weights of the 35 values from images of planar scenes with known homographies."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from factorgraph_loc.vision.colour_features import ColourExtractor, Weights
 from factorgraph_loc.vision.descriptor import OWN_SCALE, VALUES, values
 from factors.se2 import Array
 
-COUNT = 1000  # points of an image
-SHARE = 0.04  # of the mean variance, that is added to all: what few pairs say of a direction is not certain
+COUNT = 1000  # points per image
+SHARE = 0.04  # of the mean variance, added to all as a regularisation
 
 
 def learn_weights(sequences: Several[Sequence]) -> Weights:
-    """Weights from all pairs of images of each sequence: from points that lie, by the homographies, at the same place
-    and scale."""
+    """Weights from all pairs of images of each sequence, from points with equal position and scale by the homographies."""
     pairs = [pair for sequence in sequences for pair in matched_values(sequence)]
     return learn(np.vstack([first for first, _ in pairs]), np.vstack([second for _, second in pairs]))
 
 
 def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
-    """Of each pair of images the values (N, 35) of the N points that both show."""
+    """For each pair of images the values (N, 35) of the N points in both."""
     features = ColourExtractor(COUNT)
     described = []
     for image in (sequence.first, *sequence.others):

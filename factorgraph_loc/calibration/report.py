@@ -181,9 +181,9 @@ def _judgements(calibration: Calibration) -> list[str]:
     whose = "the other logs" if len(set(calibration.logs)) > 1 else "the other parts of the log"
     return [
         "<h2>Selection</h2>",
-        f"<p>The {_estimator(calibration)} ran on stretches with what {whose} tell of each parameter (new), and without (old). The "
-        "rig has what makes its score, which holds errors and consistency, better by more nats a pose than chance would, and no "
-        "error larger by more than 2 %. What is refused has the value of the input rig.</p>",
+        f"<p>The {_estimator(calibration)} ran on held-out stretches with each parameter as learnt from {whose} (new), and without "
+        "it (old). A parameter is accepted if it improves the score, which combines accuracy and consistency [nats per pose], "
+        "significantly, and increases no error by more than 2 %. Otherwise the rig keeps the input value.</p>",
         table(*judgements_table(calibration)),
     ]
 

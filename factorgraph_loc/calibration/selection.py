@@ -1,9 +1,9 @@
-"""Which of the learnt parameters pay: an estimator runs with and without each on stretches that had no part in what was learnt.
+"""Selection of the learnt parameters that improve an estimator, in runs with and without each on held-out stretches.
 
-The search is greedy. It begins with all that was learnt, or, where that is no better than the input rig, with the input rig and
-what is learnt of one sensor after the other. Then the parameters are tried one after another, with and without, those first that
-the fits gain least by, and last what depends on them: noise, uncertainty, models of detection, learnt anew for the constants that
-remain.
+The search is greedy. It begins with all that was learnt or, if that is no better than the input rig, with the input rig, to which
+sensors are added one after the other. Then the parameters are tested one by one, with and without, first those with the least
+gain in the fits, last those that depend on them: noise, uncertainty and detection models, learnt again for the remaining
+constants.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,7 +22,7 @@ from factorgraph_loc.sensors.calibrating import State, Unit
 
 
 def constants_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
-    """Of the constants that the fits would keep, those that gain least in the fits first; then what no fit can tell the gain of."""
+    """The constants that the fits would keep, by increasing gain in the fits; then those whose gain no fit can determine."""
     units: dict[Unit, float] = {}
     for name, found in knowledge.found.items():
         calibrator = calibrators()[name]
@@ -32,7 +32,7 @@ def constants_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
 
 
 def dependents_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
-    """What is learnt for the constants that remain, without what is tried last."""
+    """What is learnt for the remaining constants, except what is tested last."""
     used = [calibrators()[name] for name in knowledge.found]
     units = [unit for one in used for unit in one.noise]
     for one in used:
@@ -43,7 +43,7 @@ def dependents_of(knowledge: Knowledge, start: Rig) -> list[Unit]:
 
 
 def mixed(old: Rig, new: Rig, state: State) -> Rig:
-    """The rig with what is ``new`` of the parameters in ``state``, and ``old`` of the others."""
+    """The rig with the parameters in ``state`` from ``new``, and the others from ``old``."""
     changes: dict[str, Any] = {}
     for calibrator in calibrators().values():
         changes |= calibrator.mixed(old, new, state)
@@ -51,10 +51,10 @@ def mixed(old: Rig, new: Rig, state: State) -> Rig:
 
 
 class Learner:
-    """What some logs tell, with all parameters free or with some of them held at the values of ``start``.
+    """What is learnt from some logs, with all parameters free or with some of them held at the values of ``start``.
 
-    ``grids``: see :func:`~factorgraph_loc.calibration.learn.learn`; ``shared``: what all logs tell, also for the uncertainties,
-    which a single log does not tell. Learns nothing from logs that are too short.
+    ``grids``: see :func:`~factorgraph_loc.calibration.learn.learn`; ``shared``: learnt from all logs, used for the uncertainties
+    too, which a single log does not determine. Nothing is learnt from logs that are too short.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Learner:
         shared: Knowledge | None = None,
     ) -> None:
         self._logs, self._start = list(logs), start
-        # a single log, and one recording without a part of it, do not tell what differs between runs
+        # a single log, and one recording without a part of it, do not determine differences between runs
         self._by_log = shared is None or len(logs) > 1
         self._shared = None if self._by_log else shared
         self._all: Knowledge | None = None
@@ -76,16 +76,16 @@ class Learner:
         self._change: Callable[[Rig], Rig] = lambda rig: rig
 
     def settle(self, accepted: Iterable[str]) -> None:
-        """Learn anew with these constants alone."""
+        """Learn again with only these constants."""
         if self._all is not None:
             self.knowledge = settled(self._all, self._logs, self._start, frozenset(accepted), by_log=self._by_log)
 
     def noisy(self, change: Callable[[Rig], Rig]) -> None:
-        """From now on with the noise that ``change`` makes of what is learnt."""
+        """Use the noise changed by ``change`` from now on."""
         self._change = change
 
     def rig(self, state: State) -> Rig:
-        """The input rig with what was learnt of the parameters in ``state``."""
+        """The input rig with the learnt values of the parameters in ``state``."""
         if self.knowledge is None:
             return self._start
         new = self.knowledge.rig
@@ -106,7 +106,7 @@ def _with_uncertainty(rig: Rig, other: Rig) -> Rig:
 
 
 class Bench:
-    """Runs an estimator on the stretches of ``folds``, each with what its learner tells of some parameters."""
+    """Runs an estimator on the stretches of ``folds``, each with the parameters of its learner."""
 
     def __init__(
         self, folds: Sequence[Fold], learners: Sequence[Learner], evaluate: Callable[[Log], Mapping[str, Any]]
@@ -116,11 +116,11 @@ class Bench:
         self.judgements: dict[Unit, Judgement] = {}
 
     def forget(self) -> None:
-        """What was learnt has changed."""
+        """Discard outcomes after a change of what was learnt."""
         self._known = {}
 
     def outcome(self, state: State) -> Outcome:
-        """With the parameters of ``state``."""
+        """The outcome with the parameters of ``state``."""
         if state not in self._known:
             tests = [
                 replace(test, rig=_usable(learner.rig(state), state))
@@ -136,14 +136,14 @@ class Bench:
         return state != others and judged((), self.outcome(state), self.outcome(others)).accepted
 
     def tried(self, state: State, unit: Unit) -> State:
-        """``state`` with ``unit``, if it pays, else without."""
+        """``state`` with ``unit`` if that is better, else without."""
         with_it, without = state | {unit}, state - {unit}
         found = judged(unit.names, self.outcome(with_it), self.outcome(without))
         self.judgements[unit] = found
         return with_it if found.accepted else without
 
     def begun(self, everything: State, forced: State) -> State:
-        """All parameters, if they pay as a whole, else those of the sensors that do."""
+        """All parameters if they are better together, else those of the sensors that are."""
         if self.better(everything, forced):
             return everything
         state = forced
@@ -162,7 +162,7 @@ class Bench:
 
 
 def _usable(rig: Rig, state: State) -> Rig:
-    """The rig whose sensors are those that it can use."""
+    """The rig with only the sensors that it can use."""
     for calibrator in calibrators().values():
         rig = calibrator.usable(rig, state)
     return rig

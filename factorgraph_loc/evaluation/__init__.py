@@ -1,4 +1,4 @@
-"""What results are judged by: metrics, statistics, tables and plots."""
+"""Evaluation of results: metrics, statistics, tables and plots."""
 
 __all__ = [
     "active",

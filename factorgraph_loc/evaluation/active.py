@@ -1,6 +1,6 @@
-"""What runs of a robot that seeks its place say together: how far it drove, policy beside policy on the same seeds.
+"""Summaries and paired comparisons of active localization runs, policy by policy on the same seeds.
 
-A run that did not end localized, or did not end well at all, counts as one that never comes there: its metres are infinite.
+A run that failed or did not end localized counts with an infinite distance.
 """
 
 import math
@@ -16,7 +16,7 @@ from factors.se2 import Array
 Row = Mapping[str, Any]
 Case = tuple[str, str]  # world, estimator
 
-# columns of a difference, with their types, because there may be none
+# columns of a difference, with their types, as there may be no rows
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("world", "estimator", "a", "b"), str),
     "pairs": int,
@@ -28,12 +28,12 @@ NEVER = "never"
 
 
 def cases(rows: Sequence[Row]) -> list[Case]:
-    """World and estimator of the runs, in their order."""
+    """World and estimator of the runs, in order of appearance."""
     return list(dict.fromkeys((row["world"], row["estimator"]) for row in rows))
 
 
 def policies(rows: Sequence[Row]) -> list[str]:
-    """The policies of the runs, in their order."""
+    """The policies of the runs, in order of appearance."""
     return list(dict.fromkeys(row["policy"] for row in rows))
 
 
@@ -43,15 +43,17 @@ def runs_of(rows: Sequence[Row], case: Case, policy: str) -> list[Row]:
 
 
 def metres(rows: Sequence[Row]) -> Array:
-    """Metres driven until localized (N,), infinite where that never came."""
+    """Metres driven until localized (N,), infinite for runs that never were."""
     return np.array([row["metres"] if row["localized"] else math.inf for row in rows], dtype=float)
 
 
 def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """For each world, estimator and policy: ``runs``; of the metres until localized the ``median`` and the 90th percentile ``p90``;
-    ``failures`` and their 95 % interval; ``claimed_wrong``: runs that once said that they are localized and were not; the median
-    errors ``error_position`` [m] and ``error_heading`` [rad] of those that ended localized; ``seconds`` (simulated, median of
-    those); ``planning_ms``: the median over runs of a planning step's median."""
+    """Statistics for each world, estimator and policy.
+
+    ``runs``; ``median`` and 90th percentile ``p90`` of the metres until localized; ``failures`` and their 95 % interval;
+    ``claimed_wrong``: runs that at some time claimed wrongly to be localized; median errors ``error_position`` [m] and
+    ``error_heading`` [rad] and median ``seconds`` (simulated) of those that ended localized; ``planning_ms``: median over runs of
+    the median time of a planning step."""
     found = []
     for case in cases(rows):
         for policy in policies(rows):
@@ -82,10 +84,11 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The first policy ``a`` against each other one ``b``, on the seeds that both ran, for each world and estimator.
+    """The first policy ``a`` compared with each other one ``b``, on common seeds, for each world and estimator.
 
-    ``difference`` [m] of the medians, a less b, with the 95 % interval ``low`` to ``high``; their ``ratio``, a over b, with its
-    own; on how many seeds ``failed_only_a`` and ``failed_only_b``, and ``p`` of McNemar's exact test that both fail as often.
+    ``difference`` [m] of the medians, a minus b, with 95 % interval ``low`` to ``high``; their ``ratio``, a over b, with its
+    interval; the numbers of seeds ``failed_only_a`` and ``failed_only_b``, and ``p`` of McNemar's exact test for equal failure
+    rates.
     """
     found = []
     first, *others = policies(rows)
@@ -109,7 +112,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of the table of :func:`summaries`."""
+    """Header and rows of the table of :func:`summaries`."""
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
     header += ["error [m]", "[deg]", "time [s]", "planning [ms]"]
     lines = []
@@ -129,7 +132,7 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of the table of :func:`differences`."""
+    """Header and rows of the table of :func:`differences`."""
     header = ["world", "policies", "estimator", "pairs", "difference [m] (95 %)", "ratio (95 %)"]
     header += ["failed only first / second", "p (McNemar)"]
     lines = []
@@ -147,7 +150,6 @@ def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def metres_text(value: float) -> str:
-    """Metres, or that it never came there."""
     return NEVER if math.isinf(value) else _text(value, 1)
 
 

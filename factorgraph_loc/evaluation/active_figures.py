@@ -1,4 +1,4 @@
-"""Pictures of a robot that seeks its place: policies beside each other, and one run with what was proposed and chosen."""
+"""Plots of active localization: policies compared, and the decisions of one run."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN = 6  # decisions of a run that have a panel
+SHOWN = 6  # decisions of a run that are plotted
 COLUMNS = 3
 ARROW = 0.7  # m
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What was known and proposed after ``metres`` [m]: where the robot truly was, ``pose`` (3,), its belief as equally likely
-    ``particles`` (M, 3), and from that pose the ``candidates`` (S, 3), of which ``chosen`` (S, 3) was taken, if any."""
+    """The state at a choice after ``metres`` [m]: the true ``pose`` (3,), the belief as equally weighted ``particles`` (M, 3),
+    and from that pose the ``candidates`` (S, 3), and the ``chosen`` one (S, 3) if any."""
 
     metres: float
     pose: Array
@@ -36,13 +36,13 @@ class Decision:
 
     @property
     def spread(self) -> float:
-        """The root of the belief's variance in x plus that in y [m]."""
+        """Root of the sum of the belief's variances in x and y [m]."""
         return float(np.sqrt(np.sum(np.var(self.particles[:, :2], axis=0))))
 
 
 @dataclass(frozen=True)
 class SeekingTrack:
-    """One run: its ``world``, the true poses ``truth`` (N, 3), and the decisions on the way. It ended after ``metres`` [m]."""
+    """One run: its ``world``, the true poses ``truth`` (N, 3), and the decisions. It ended after ``metres`` [m]."""
 
     title: str
     world: World
@@ -52,7 +52,7 @@ class SeekingTrack:
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """For each world and estimator, side by side: a box for each policy, and the share of runs that were localized by then."""
+    """For each world and estimator: a box plot per policy, and the fraction of runs localized over distance."""
     found = cases(rows)
     seeds = len({row["seed"] for row in rows})
     figure, axes = grid(len(found), 2, 4.2 * len(found) + 1.0, f"metres driven until localized, {seeds} runs of each")
@@ -66,7 +66,7 @@ def comparison(rows: Sequence[Row]) -> Figure:
 
 
 def run_picture(track: SeekingTrack) -> Figure:
-    """Where the robot may be, what it could do and what it chose, at some decisions of a run; and how the belief shrank."""
+    """Belief, candidates and choice at some decisions of a run; and the spread of the belief over distance."""
     chosen = np.unique(np.linspace(0, len(track.decisions) - 1, SHOWN).round().astype(int)) if track.decisions else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
     width, depth = np.ptp(_outline(track).reshape(-1, 2), axis=0)
@@ -91,10 +91,10 @@ def run_picture(track: SeekingTrack) -> Figure:
 
 
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Boxes of all runs, a dot for each; those that never came there are as far up as the farthest drove, and counted."""
+    """Box plots with a dot for each run; runs that were never localized are at the upper end, and counted."""
     names = policies(rows)
     top = _farthest(rows, case)
-    rng = np.random.default_rng(0)  # sideways, so that dots do not cover each other
+    rng = np.random.default_rng(0)  # horizontal jitter, so that dots do not cover each other
     for i, policy in enumerate(names):
         driven = metres(runs_of(rows, case, policy))
         shown = np.minimum(driven, top)
@@ -109,7 +109,7 @@ def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
             axis.text(i, 0.98, text, ha="center", va="top", fontsize=11, transform=axis.get_xaxis_transform())
     axis.set_xticks(range(len(names)), names)
     axis.set_xlim(-0.6, len(names) - 0.4)
-    axis.set_ylim(-0.02 * top, 1.25 * top)  # room for the counts
+    axis.set_ylim(-0.02 * top, 1.25 * top)  # space for the counts
     axis.set_ylabel("metres (box: quartiles, 10 and 90 %)")
 
 
@@ -127,7 +127,7 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
-    """The most metres of a run in this world, 1 if none drove."""
+    """The largest distance of a run in this world, 1 if there is none."""
     return max((row["metres"] or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
 
 
@@ -158,6 +158,6 @@ def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
 
 
 def _outline(track: SeekingTrack) -> Array:
-    """The ends (K, 2) of all walls; without any, the way."""
+    """The ends (K, 2) of all walls, or the trajectory if there are none."""
     walls = np.array(track.world.walls).reshape(-1, 2)
     return walls if len(walls) else track.truth[:, :2]

@@ -1,7 +1,7 @@
-"""Scores of a run whose map was free: its frame is its own, so the estimate is first brought onto the reference.
+"""Scores of a run that estimated its map: its frame is arbitrary, so the estimate is aligned with the reference first.
 
-The alignment is that of Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991,
-equations 40 to 42 with the scale kept at 1. In the plane its rotation is one angle, and no reflection can come out.
+Alignment: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, equations 40 to 42
+with scale 1. In the plane the rotation is one angle, and reflections cannot occur.
 """
 
 from collections.abc import Mapping
@@ -21,16 +21,16 @@ FIGURES = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "
 
 
 def align(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Array:
-    """The pose (3,) of the estimate's frame in the reference's: composed with the estimated poses, it brings their positions onto
-    the reference in least squares, at the stamps that are scored. NaN if there are none."""
+    """The pose (3,) of the estimate's frame in the reference's, by least squares on the positions at the scored stamps; NaN if
+    there are none."""
     pair = pairs(trajectory, reference, max_gap)
     return align_points(pair.poses[:, :2], pair.truth[:, :2])
 
 
 def align_points(points: Array, targets: Array) -> Array:
-    """The pose (3,) that brings ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are left out.
+    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are ignored.
 
-    NaN without a pair. Points that all coincide leave the rotation open; it is then 0.
+    NaN without a pair. For coincident points the rotation is 0.
     """
     known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
     if not known.any():
@@ -45,12 +45,12 @@ def align_points(points: Array, targets: Array) -> Array:
 def free_map_figures(
     trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
 ) -> dict[str, Any]:
-    """``FIGURES`` of a run with a free map.
+    """``FIGURES`` of a run that estimated its map.
 
     ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
-    learnt landmarks that the log's map also has, after the same alignment: their ``count``, root mean square distance ``rmse`` [m]
-    and mean NEES ``anees``, ideally 2. The covariances also hold how uncertain the start was, which the alignment takes away, so
-    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where there is nothing to say.
+    learnt landmarks that are also in the log's map, after the same alignment: their ``count``, root mean square distance ``rmse``
+    [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty of the start, which the alignment removes, so
+    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where a figure is undefined.
     """
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     names = [name for name in landmarks if name in log.world.landmarks]
@@ -67,7 +67,7 @@ def free_map_figures(
         if log.reference.has_heading:
             figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))
     if names and np.isfinite(pose).all():
-        # in the estimate's own frame, where the covariances are
+        # in the estimate's own frame, as the covariances
         error = positions - se2.transform_to(pose, truth)
         figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
         figures["landmarks.anees"] = _anees(error, np.array([landmarks[name].covariance for name in names]))
@@ -75,13 +75,13 @@ def free_map_figures(
 
 
 def rms(values: Array) -> float | None:
-    """Root of the mean of the squares of those that are finite, None without any."""
+    """Root mean square of the finite values, None without any."""
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
 def _anees(errors: Array, covariances: Array) -> float | None:
-    """Mean of the squared errors (N, 2) in units of their covariances (N, 2, 2), of those that are positive definite."""
+    """Mean NEES of errors (N, 2) with covariances (N, 2, 2), of those that are positive definite."""
     good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
     good[good] = np.linalg.eigvalsh(covariances[good])[:, 0] > 0.0
     if not good.any():

@@ -1,8 +1,8 @@
-"""Whether an estimator's covariances are right, over the time of a log: NEES of its poses, NIS of its predictions.
+"""Consistency of an estimator over the time of a log: NEES of its poses, NIS of its predictions.
 
-Both are chi-square distributed where they are (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
-Navigation", 2001, section 5.4). Errors of successive poses go together, so the NEES is held against the interval of a single
-value. Innovations are independent, so the running mean of the NIS is held against the interval of the mean.
+Both are chi-square distributed for a consistent estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
+and Navigation", 2001, section 5.4). Errors of consecutive poses are correlated, so the NEES is compared with the interval of a
+single value. Innovations are independent, so the running mean of the NIS is compared with the interval of the mean.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WINDOW = 20.0  # s, of the running means
+WINDOW = 20.0  # s, of running means
 _TAILS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 _BAND: dict[str, Any] = {
     "color": COLOURS[5],
@@ -39,7 +39,7 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
     None if there is neither.
     """
-    # innovations that tell of nothing have no degrees of freedom
+    # empty innovations have no degrees of freedom
     told = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
     sensors = sorted(sensor for sensor, values in told.items() if len(values))
     rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
@@ -67,7 +67,8 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
 
 def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
-    """Sums of ``values`` over sums of ``weights`` within ``WINDOW`` seconds around each ``t`` (N,), ascending; and the latter sums.
+    """Weighted running mean of ``values`` (sums of ``values`` over sums of ``weights``) within ``WINDOW`` seconds around each
+    ``t`` (N,), ascending; and the sums of weights.
 
     NaN where a window has no weight.
     """
@@ -105,7 +106,7 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
     axis.set_title(f"innovations of {sensor}")
     axis.set_ylabel("NIS per degree of freedom")
     axis.set_yscale("log")
-    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a blackout
+    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a gap
     low, high = (np.where(np.isnan(mean), np.nan, chi2.ppf(tail, total) / total) for tail in _TAILS)
     axis.fill_between(t, low, high, **_BAND)
     axis.axhline(1.0, **_IDEAL)
@@ -115,5 +116,5 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
 def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
     axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
-    # how small the smallest are says nothing
+    # cut off the smallest values
     axis.set_ylim(low / 4.0, 2.0 * max(float(np.nanmax(single)), 20.0 * low))

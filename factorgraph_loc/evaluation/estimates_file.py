@@ -1,5 +1,4 @@
-"""``estimates.parquet`` of a run, read with the types that it is written with; see
-:func:`~factorgraph_loc.experiments.output.write_run`."""
+"""Reader of a run's ``estimates.parquet``; see :func:`~factorgraph_loc.experiments.output.write_run`."""
 
 from collections.abc import Sequence
 
@@ -21,7 +20,7 @@ COLUMNS = (STAMP, *TEXTS, *NUMBERS)
 def parse_estimates(content: bytes, source: object, columns: Sequence[str] = COLUMNS) -> pl.DataFrame:
     """Some ``columns`` of the table in the bytes of the file, numbers as floats, null where unknown.
 
-    InputError names ``source`` and what is not as it is written."""
+    Raises InputError with ``source`` if the file is damaged."""
     table = parse_parquet(content, source, columns)
     for name in columns:
         kind = table.schema[name]

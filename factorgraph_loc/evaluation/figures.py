@@ -1,6 +1,6 @@
-"""What all plots share: the data of a run that is plotted, colours, legends, and PNG files 1600 px wide.
+"""Common parts of all plots: the plotted data of a run, colours, legends, and PNG files 1600 px wide.
 
-Colours: Okabe and Ito, "Color Universal Design", 2008, which colour-blind readers can tell apart.
+Colours: Okabe and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Track:
-    """What is plotted of one run.
+    """The plotted data of one run.
 
-    ``causal`` (None if it never was localized), ``final`` (empty if nothing told the pose); ``update_ms`` (M,) of each update;
-    ``nis``: by sensor, rows (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text;
-    ``max_gap`` [s]: between estimates that are interpolated where errors are shown.
+    ``causal`` (None if never localized), ``final`` (may be empty); ``update_ms`` (M,) of each update; ``nis``: by sensor, rows
+    (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text; ``max_gap`` [s]: largest
+    interval between estimates that is interpolated for errors.
     """
 
     causal: Trajectory | None
@@ -46,23 +46,23 @@ class Track:
         return cls(result.causal(), result.final, result.timings.update_ms, nis, events, result.max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
-        """Both trajectories by name, None where there is nothing to plot."""
+        """Both trajectories by name, None if there is nothing to plot."""
         return ("causal", self.causal), ("final", self.final if len(self.final) else None)
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
-    """Events as dashed vertical lines over the time axis."""
+    """Mark events by dashed vertical lines."""
     for i, (t, _) in enumerate(events):
         label = "event (see events.csv)" if i == 0 else None
         axis.axvline(t, color=COLOURS[3], linestyle="--", linewidth=1.0, label=label, zorder=1.5)
 
 
 def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
-    """Times (N,) and values (N, ...) with a row of NaN in each pause, so that no line is drawn across it."""
+    """Times (N,) and values (N, ...) with a row of NaN in each gap, which interrupts the line."""
     breaks = pauses(t)
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
 def way(trajectory: Trajectory) -> Array:
-    """The places (N, 2) of a trajectory as one line, broken in each pause by a row of NaN."""
+    """The positions (N, 2) of a trajectory, with a row of NaN in each gap."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]

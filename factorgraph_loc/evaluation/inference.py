@@ -1,15 +1,15 @@
-"""What scores say of many runs: pooled figures, differences, whether they could be chance, and how large they are.
+"""Statistical inference on the scores of many runs: pooled figures, differences, significance and effect size.
 
-Runs are paired by log and seed, and logs are what a statement is made of: with six logs or more there is an interval and a test
-over logs. With one log and six seeds or more both are over its seeds, and say something of this log only. Between these the logs
-stand side by side and nothing is tested.
+Runs are paired by log and seed, and logs are the units: with six logs or more there is an interval and a test over logs. With one
+log and six seeds or more both are over its seeds, and hold for this log only. In between, the results of each log are listed
+without a test.
 
 Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin 1(6), 1945, with zeros as of Pratt, "Remarks on
-zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation, Kerby,
-"The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons: Holm, "A simple sequentially rejective multiple
-test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of the NEES: Bar-Shalom, Li, Kirubarajan, "Estimation with
-Applications to Tracking and Navigation", 2001, section 5.4, for as many values as are independent (Geyer, "Practical Markov chain
-Monte Carlo", Statistical Science 7(4), 1992, section 3.3).
+zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation,
+Kerby, "The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons: Holm, "A simple sequentially rejective
+multiple test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of the NEES: Bar-Shalom, Li, Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, section 5.4, for the effective number of independent values
+(Geyer, "Practical Markov chain Monte Carlo", Statistical Science 7(4), 1992, section 3.3).
 """
 
 import math
@@ -25,7 +25,7 @@ from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pool
 from factors.se2 import Array
 
 SIGNIFICANT = 1.0 - CONFIDENCE
-_EXACT = 60  # pairs up to which the signed-rank distribution is counted out
+_EXACT = 60  # pairs up to which the distribution is computed exactly
 
 Seeds = Mapping[int, float | None]  # the score of each seed, None where a run has none
 ByLog = Mapping[str, Seeds]
@@ -34,8 +34,8 @@ Units = Literal["logs", "seeds"]
 
 @dataclass(frozen=True)
 class Pooled:
-    """A figure over logs. ``low`` and ``high``: 95 % interval over ``units``, None where these are too few; ``least`` and ``most``:
-    the range over its ``count`` units, the logs, or the seeds where there is one log."""
+    """A figure over logs. ``low`` and ``high``: 95 % interval over ``units``, None if these are too few; ``least`` and ``most``:
+    the range over its ``count`` units, which are the logs, or the seeds of a single log."""
 
     value: float
     low: float | None
@@ -49,11 +49,11 @@ class Pooled:
 
 @dataclass(frozen=True)
 class Contrast:
-    """``a`` minus ``b``: below 0, the scores of ``a`` are the lower.
+    """``a`` minus ``b``: negative if the scores of ``a`` are lower.
 
-    ``difference`` of the pooled figures, with the 95 % interval ``low`` to ``high``; ``p`` (two-sided) and ``effect`` (-1 to 1) of
-    the signed-rank test. Interval and test are over ``count`` ``units``, None where these are too few. ``by_log``: both figures of
-    each log, (value_a, value_b). ``pairs``: how many runs of each are compared; ``left_out``: how many lack a partner.
+    ``difference`` of the pooled figures, with 95 % interval ``low`` to ``high``; ``p`` (two-sided) and ``effect`` (-1 to 1) of
+    the signed-rank test. Interval and test are over ``count`` ``units``, None if these are too few. ``by_log``: both figures of
+    each log, (value_a, value_b). ``pairs``: number of runs compared; ``left_out``: number without a partner.
     """
 
     difference: float
@@ -69,7 +69,7 @@ class Contrast:
 
 
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
-    """A figure pooled over seeds, then over logs, each log counted once: root mean square, or else the mean. None without any.
+    """A figure pooled over seeds, then over logs with equal weight: root mean square, or else the mean. None without any.
 
     ``alike``: for logs that are variations of one, its name; together they count as one log.
     """
@@ -88,10 +88,10 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
 def contrast(
     a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
 ) -> Contrast | None:
-    """Compare two sets of runs by the logs and seeds that both have; None if they have none in common.
+    """Compare two sets of runs by their common logs and seeds; None if they have none in common.
 
-    One that ran with one seed is paired with each seed of the other. Without ``interval`` there is none, which saves its time.
-    ``alike``: see :func:`pooled`; ``by_log`` tells these logs apart.
+    One that ran with one seed is paired with each seed of the other. ``interval``: whether to compute the interval, which takes
+    time. ``alike``: see :func:`pooled`; ``by_log`` lists these logs separately.
     """
     found = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in found.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -126,16 +126,16 @@ def contrast(
 
 
 def signed_rank(differences: Array) -> float:
-    """Two-sided p of Wilcoxon's signed-rank test that differences (N,) lie symmetrically around 0; exact up to 60."""
+    """Two-sided p of Wilcoxon's signed-rank test that differences (N,) are symmetric about 0; exact up to 60."""
     ranks = _ranks(differences)
-    doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(int)  # ranks of ties are halves
+    doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(int)  # ranks of ties are multiples of a half
     if not len(doubled):
         return 1.0
     total = int(doubled.sum())
     positive = int(np.rint(2.0 * ranks[differences > 0.0].sum()))
     extreme = min(positive, total - positive)
     if len(doubled) > _EXACT:
-        # the continuity correction is half a step of the sum of ranks, which here is doubled
+        # the continuity correction is half a step of the rank sum, which is doubled here
         z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
         return min(1.0, 2.0 * float(norm.cdf(z)))
     ways = np.zeros(total + 1)
@@ -146,14 +146,14 @@ def signed_rank(differences: Array) -> float:
 
 
 def rank_biserial(differences: Array) -> float:
-    """Matched-pairs rank-biserial correlation of differences (N,): 1 if all are above 0, -1 if all are below, 0 if they balance."""
+    """Matched-pairs rank-biserial correlation of differences (N,): 1 if all are positive, -1 if all are negative."""
     ranks = _ranks(differences)
     total = float(ranks[differences != 0.0].sum())
     return float(ranks[differences > 0.0].sum() - ranks[differences < 0.0].sum()) / total if total else 0.0
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """p values corrected for their number as of Holm: those below 0.05 are significant together. None is not tested, and stays."""
+    """Holm's corrected p values: those below 0.05 are significant together. None is not tested, and stays."""
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -164,14 +164,14 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def least_p(count: int) -> float:
-    """The smallest p that :func:`signed_rank` can give with ``count`` differences."""
+    """The smallest p that :func:`signed_rank` can return for ``count`` differences."""
     return float(2.0 ** (1 - count))
 
 
 def independent_count(values: Array) -> float:
-    """As how many independent values a series (N,) counts in its mean: N over its integrated autocorrelation time, at least 1.
+    """The effective number of independent values in a series (N,): N over its integrated autocorrelation time, at least 1.
 
-    The autocorrelations are summed over pairs of lags until a pair is no longer positive (Geyer's initial positive sequence).
+    Autocorrelations are summed over pairs of lags until a pair is no longer positive (Geyer's initial positive sequence).
     """
     n = len(values)
     centred = values - np.mean(values)
@@ -187,10 +187,10 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
-    """The 95 % band of the mean over logs of their mean NEES per degree of freedom, where covariances are right.
+    """The 95 % band of the mean over logs of their mean NEES per degree of freedom, for a consistent estimator.
 
-    ``counts``: how many independent values each log has. The mean over logs has the variance of a chi-square with as many degrees
-    of freedom as match it.
+    ``counts``: effective number of independent values of each log. The mean over logs is approximated by a chi-square
+    distribution with matched variance.
     """
     matched = dof * len(counts) ** 2 / float(np.sum(1.0 / np.asarray(counts, dtype=float)))
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -198,17 +198,17 @@ def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
 
 
 def _ranks(differences: Array) -> Array:
-    """Ranks of the sizes; zeros take the lowest and count for no side."""
+    """Ranks of the absolute values; zeros get the lowest and count for neither side."""
     return np.asarray(rankdata(np.abs(differences)))
 
 
 def _average(scores: Array, rms: bool) -> Array:
-    """Over the rows of ``scores`` (K, C)."""
+    """Pooled figure over the rows of ``scores`` (K, C)."""
     return np.asarray(np.sqrt(np.mean(np.square(scores), axis=0)) if rms else np.mean(scores, axis=0))
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """The scores (K, C) of each log that has any; of logs that are alike together."""
+    """The scores (K, C) of each log that has any, with those of ``alike`` logs merged."""
     merged: dict[str, list[Array]] = {}
     for log, found in scores.items():
         if len(found):
@@ -217,7 +217,7 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """What a statement is made of, and whether it is enough."""
+    """The statistical units, and whether there are enough."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

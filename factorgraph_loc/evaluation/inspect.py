@@ -1,4 +1,4 @@
-"""What a log holds and what looks wrong with it, before any estimator sees it."""
+"""Inspection of a log: its content and its problems."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from factorgraph_loc.sensors.summary import Summary
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
-_ROUNDING = 1e-6  # s, by which a difference of stamps may be too long
+_ROUNDING = 1e-6  # s, tolerance of differences between stamps
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,9 @@ class StreamSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a log holds: its streams and reference, what each sensor's package says of it (``sensors``, by name), and everything
-    that looks wrong, as lines for people. What the sensors found is an attribute too, by its key (``unseen``, ``rfid``, ...)."""
+    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems as lines of text.
+
+    The sensors' results are also attributes, by key (``unseen``, ``rfid``, ...)."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
@@ -38,23 +39,23 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """What all sensors found, by its key."""
+        """The results of all sensors, by key."""
         return {key: value for summary in self.sensors.values() for key, value in summary.found.items()}
 
     @property
     def in_map(self) -> dict[str, int]:
-        """How many things of each layer of the map there are."""
+        """The number of objects in each layer of the map."""
         return {layer: count for summary in self.sensors.values() for layer, count in summary.in_map.items()}
 
     def __getattr__(self, name: str) -> Any:
-        found = self.found if "sensors" in self.__dict__ else {}  # which it lacks while it is unpickled
+        found = self.found if "sensors" in self.__dict__ else {}  # missing while being unpickled
         if name in found:
             return found[name]
         raise AttributeError(f"an inspection has no {name!r}")
 
 
 def inspect(log: Log) -> Inspection:
-    """Summaries of a log's streams, and everything about it that looks wrong, as lines for people in ``problems``."""
+    """Inspect a log: summaries of its streams, and problems as lines of text."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = _summary(log.reference.t) if log.reference is not None else None
     problems = list(log.warnings)
@@ -69,7 +70,7 @@ def inspect(log: Log) -> Inspection:
 
 
 def _summary(t: Array) -> StreamSummary:
-    """Of a stream's stamps (N,) in order of arrival."""
+    """Summary of a stream with stamps (N,) in order of arrival."""
     if len(t) == 0:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)

@@ -1,9 +1,9 @@
-"""How far a trajectory is from the reference, and whether its covariances say so.
+"""Accuracy of a trajectory against the reference, and consistency of its covariances.
 
-No alignment, as the map's frame is known; where the map was free, aligned figures stand beside the others. What is compared with
-what, see :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
-Applications to Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of
-RGB-D SLAM systems", 2012, section IV.A, taken over path length instead of time.
+There is no alignment, as the map's frame is known; for runs that estimated the map, aligned figures are added. Pairing of poses:
+:mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
+Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
+systems", 2012, section IV.A, over path length instead of time.
 """
 
 import itertools
@@ -28,10 +28,10 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factors import positive, se2
 from factors.se2 import Array, Integers
 
-FEWEST_SCORED = 10  # poses: figures of fewer tell nothing of a run
+FEWEST_SCORED = 10  # least number of poses for meaningful figures
 RPE_DISTANCE = 1.0  # m
 CONFIDENCE = 0.95
-FREE_MAP = "unknown"  # of an estimator's setting ``landmarks``: their positions are estimated
+FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map
 
 _ACCURACY = (
     *(f"{what}_{how}" for what in ("position", "heading") for how in ("rmse", "median", "p95", "max")),
@@ -50,11 +50,11 @@ _ACCURACY = (
 class Errors:
     """Errors at N stamps ``t`` (N,) of the reference, from the first pose to the last; NaN in gaps of the trajectory.
 
-    ``poses`` and ``reference`` (N, 3): what is compared with what. ``difference`` (N, 3): estimate minus reference in x, y [m,
-    world's frame] and heading [rad, wrapped]. ``position`` (N,): Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the
-    reference has no heading. ``nees`` (N,): squared error in units of the stated covariance, of x, y and heading, or of x and y if
-    the reference has no heading (``dof`` 3 or 2). ``nees_position`` (N,): that of x and y alone. Both are NaN where the covariance
-    is missing or not positive definite; ``invalid`` (N,) marks the latter.
+    ``poses`` and ``reference`` (N, 3): the compared poses. ``difference`` (N, 3): estimate minus reference in x, y [m, world
+    frame] and heading [rad, wrapped]. ``position`` (N,): Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the reference
+    has no heading. ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no
+    heading (``dof`` 3 or 2). ``nees_position`` (N,): of x and y. Both are NaN if the covariance is missing or not positive
+    definite; ``invalid`` (N,) marks the latter.
     """
 
     t: Array
@@ -70,7 +70,7 @@ class Errors:
 
 
 def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Errors:
-    """The errors of ``trajectory`` at the stamps of ``reference`` that are scored, without alignment; see
+    """The errors of ``trajectory`` at the scored stamps of ``reference``, without alignment; see
     :func:`~factorgraph_loc.evaluation.pairing.pairs`."""
     if trajectory.covariances is not None:
         unsound = ~_positive_definite(trajectory.covariances)
@@ -104,17 +104,17 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 
 
 def score(result: RunResult, log: Log) -> dict[str, Any]:
-    """All figures of a run, by dotted key; metres, radians, None where there is nothing to say.
+    """All figures of a run, by dotted key; metres, radians, None where undefined.
 
-    ``scoring.rule`` and ``scoring.max_gap`` [s]: by which the rest is comparable. ``causal.*`` and ``final.*`` (see
-    :func:`accuracy`) are scored from the first localized causal estimate, and but for ``scored`` are None without a reference, or
-    with fewer than :data:`FEWEST_SCORED` poses to score. ``causal.*`` is None if the run never was localized; ``final.*`` is then
-    scored from its beginning.
-    ``causal.space_*`` and ``final.space_*`` (see :func:`~factorgraph_loc.evaluation.space.accuracy`) are None but for estimators
-    that know the robot in space. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
-    :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was free. ``learnt.NAME.value`` and
-    ``learnt.NAME.sigma`` are there for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
-    ``timing.*`` are always there, as are ``warnings``, a list of texts.
+    ``scoring.rule`` and ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
+    :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
+    or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
+    is scored from its beginning. ``causal.space_*`` and ``final.space_*`` (see
+    :func:`~factorgraph_loc.evaluation.space.accuracy`) are None except for estimators of poses in space. ``time_to_localized``
+    [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
+    :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
+    and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
+    ``timing.*`` always exist, as do ``warnings``, a list of texts.
     """
     causal = result.causal()
     final = result.final
@@ -143,11 +143,10 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
 
     ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
     :func:`relative_errors` over ``rpe_pieces`` of path. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading).
-    ``nees_bounds``: between these an average of as many *independent* NEES lies with 95 %; errors along a trajectory are
-    correlated, so a consistent estimator leaves them more often. ``coverage_95``: share of the times at which the true (x, y)
-    lies in the 95 % ellipse.
-    ``invalid_covariances``: of how many poses that are scored the covariance is not positive definite; they are in none of these
-    three. ``scored``: how many poses of the reference have an estimate.
+    ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so a
+    consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
+    ellipse. ``invalid_covariances``: number of scored poses whose covariance is not positive definite, excluded from these three.
+    ``scored``: number of poses of the reference with an estimate.
     """
     figures: dict[str, Any] = dict.fromkeys(_ACCURACY)
     if reference is None:
@@ -175,10 +174,10 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
 def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Integers = ()) -> tuple[Array, Array]:
     """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
 
-    ``poses`` and ``reference`` (N, 3) at the same times, NaN where there is none; ``breaks``: poses before which the reference
-    paused. A piece begins at the first pose, or at the end of the piece before, and ends at the first pose for which the path of
-    the reference since then is 1 m or more; a NaN or a break ends a piece unused. With Q and P the motion of reference and
-    estimate over a piece, the error is the translation and rotation of ``Q^-1 P``; it is not divided by the length. Without gaps
+    ``poses`` and ``reference`` (N, 3) at the same times, NaN where missing; ``breaks``: indices of the poses after a gap of the
+    reference. A piece begins at the first pose, or at the end of the previous piece, and ends at the first pose for which the
+    reference has moved 1 m or more along its path; a NaN or a break discards the piece. With the motions Q of the reference and P
+    of the estimate over a piece, the error is the translation and rotation of ``Q^-1 P``, not divided by the length. Without gaps
     this is evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
     """
     ends_of_pieces: list[tuple[int, int]] = []
@@ -196,7 +195,7 @@ def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Inte
 
 
 def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> list[tuple[int, int]]:
-    """The half-open ranges of indices in which ``valid`` holds throughout, parted at ``breaks`` too."""
+    """The half-open ranges of indices in which ``valid`` holds throughout, also split at ``breaks``."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
     found = []
     for start, stop in edges.reshape(-1, 2).tolist():
@@ -242,8 +241,8 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
-    """NIS by sensor (total NIS over total degrees of freedom, ideally 1; share beyond the 95 % bound), residuals at the
-    prediction (m, rad), what was left out, and the tags that are believed dead, with the probability of it."""
+    """Diagnostics as figures: NIS by sensor (total NIS over total degrees of freedom, ideally 1; fraction above the 95 % bound),
+    residuals at the prediction (m, rad), numbers of unused measurements, and tags believed dead with their probability."""
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:

@@ -1,9 +1,9 @@
-"""Two ways of doing something, tried on the same cases: what differs between them, and how sure that is.
+"""Paired comparison of two methods on the same cases, with intervals.
 
-McNemar's exact test of shares: McNemar, "Note on the sampling error of the difference between correlated proportions or
-percentages", Psychometrika 12(2), 1947, with the binomial distribution in place of its approximation. Medians: percentile
-bootstrap over the cases (Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, section 13.3). What never came about is
-infinite: a median is known as long as more than half of the cases are finite.
+McNemar's exact test of proportions: McNemar, "Note on the sampling error of the difference between correlated proportions or
+percentages", Psychometrika 12(2), 1947, with the exact binomial distribution. Medians: percentile bootstrap over the cases (Efron
+and Tibshirani, "An Introduction to the Bootstrap", 1993, section 13.3). A case that never succeeds has an infinite value: the
+median exists if more than half of the cases are finite.
 """
 
 import math
@@ -18,12 +18,12 @@ from factorgraph_loc.evaluation.metrics import CONFIDENCE
 from factors.se2 import Array
 
 DRAWS = 4000
-_SEED = 0  # of the bootstrap: the same results give the same intervals
+_SEED = 0  # of the bootstrap, for reproducible intervals
 
 
 @dataclass(frozen=True)
 class McNemar:
-    """In how many cases it happened ``only_a`` and ``only_b``, and the two-sided ``p`` of so uneven a split if both were alike."""
+    """The number of cases with the event ``only_a`` and ``only_b``, and the two-sided ``p`` value for equal rates."""
 
     only_a: int
     only_b: int
@@ -32,7 +32,7 @@ class McNemar:
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and its 95 % interval. The figure is NaN where it is not known; bounds may be infinite."""
+    """A figure and its 95 % interval. The figure is NaN if undefined; bounds may be infinite."""
 
     value: float
     low: float
@@ -40,7 +40,7 @@ class Interval:
 
 
 def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
-    """Whether something happened (N,) with ``a`` and with ``b``, in the same N cases: McNemar's exact test."""
+    """McNemar's exact test for an event that occurred (N,) with ``a`` and with ``b`` in the same N cases."""
     first, second = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     only_a, only_b = int(np.sum(first & ~second)), int(np.sum(second & ~first))
     uneven = only_a + only_b
@@ -48,18 +48,20 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """The least of the values (N,) that at least this share of them does not exceed; values may be infinite. NaN of none."""
+    """The least of the values (N,) that is at least as large as this ``share`` of them; values may be infinite. NaN without
+    values.
+    """
     known = np.asarray(values, dtype=float)
     return float(np.quantile(known, share, method="inverted_cdf")) if len(known) else math.nan
 
 
 def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Median of ``a`` (N,) less that of ``b`` (N,) of the same N cases; values may be infinite."""
+    """Median of ``a`` (N,) minus that of ``b`` (N,) in the same N cases; values may be infinite."""
     return _of_medians(np.subtract, a, b, lowest=-math.inf)
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Median of ``a`` (N,) over that of ``b`` (N,) of the same N cases; no value is below 0, some may be infinite."""
+    """Median of ``a`` (N,) over that of ``b`` (N,) in the same N cases; values must not be negative and may be infinite."""
     return _of_medians(np.divide, a, b, lowest=0.0)
 
 
@@ -70,12 +72,12 @@ def _of_medians(
     if not len(first):
         return Interval(math.nan, lowest, math.inf)
     drawn = np.random.default_rng(_SEED).integers(len(first), size=(DRAWS, len(first)))
-    # the cases as they are go first: their figure is the value
+    # the original cases come first: their figure is the value
     cases = np.vstack((np.arange(len(first)), drawn))
     with np.errstate(invalid="ignore", divide="ignore"):
         found = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
     tail = (1.0 - CONFIDENCE) / 2.0
-    # a draw in which both medians are infinite may be anything, which widens the interval to both sides
+    # a draw in which both medians are infinite extends the interval to both sides
     unknown = np.isnan(found[1:])
     low = quantile(np.where(unknown, lowest, found[1:]), tail)
     high = quantile(np.where(unknown, math.inf, found[1:]), 1.0 - tail)

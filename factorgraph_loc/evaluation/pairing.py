@@ -1,12 +1,12 @@
-"""Which poses are compared with the reference: those at its own stamps, at most ten a second.
+"""Pairing of estimates and reference poses, at the reference's own stamps, at most ten per second.
 
-The estimate is interpolated, the reference never is: whoever measured it says where the robot was at its stamps and nowhere else,
-and a gap of it holds no stamp. Estimates stand on a grid of 10 Hz, so the one that is scored lies between two that are less than
-0.1 s away; the later of them may know a measurement that the robot did not yet have at the stamp.
+The estimate is interpolated, the reference never is: it is defined at its stamps only, and a gap contains no stamp. Estimates are
+on a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away; the later of them may use a
+measurement that had not arrived at the stamp.
 
-Poses go along the arc between neighbours. Covariances are averaged, weighted as the poses are: for errors ``a`` and ``b`` of the
-neighbours, the error ``(1 - f) a + f b`` has no greater covariance than ``(1 - f) E[a a'] + f E[b b']``, however they are
-correlated, and just this one where both are the same.
+Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights: for errors ``a`` and
+``b`` of the neighbours, the covariance of ``(1 - f) a + f b`` is at most ``(1 - f) E[a a'] + f E[b b']``, for any correlation,
+and equal for identical errors.
 """
 
 import bisect
@@ -21,15 +21,15 @@ from factors.se2 import Array, Integers
 
 RATE = 10.0  # Hz, of poses that are scored
 TOLERANCE = 1e-3  # s, of stamps
-_PAUSE = 1.0  # s between neighbours of a reference that are no pause, however dense it is elsewhere
-_USUAL = 3.0  # times the usual distance in time: neighbours that far apart are no pause either
+_PAUSE = 1.0  # s between neighbours of a reference that is never a gap
+_USUAL = 3.0  # times the median interval that is never a gap
 
 
 @dataclass(frozen=True)
 class Pairs:
     """M estimates and true poses at the times ``t`` (M,), stamps of the reference from the first estimate to the last.
 
-    ``poses`` (M, 3) and ``covariances`` (M, 3, 3), if there are any: of the estimate, NaN in its gaps. ``truth`` (M, 3).
+    ``poses`` (M, 3) and ``covariances`` (M, 3, 3) or None: of the estimate, NaN in its gaps. ``truth`` (M, 3).
     """
 
     t: Array
@@ -39,7 +39,7 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Which of the stamps ``t`` (N,), ascending, are scored: the first, and each that comes 0.1 s or more after the one before."""
+    """Which of the stamps ``t`` (N,), ascending, are scored: the first, and each at least 0.1 s after the previous one."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):
@@ -49,7 +49,7 @@ def thinned(t: Array) -> Integers:
 
 
 def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Pairs:
-    """The estimates at the reference's stamps, where the trajectory's neighbours lie at most ``max_gap`` [s] apart."""
+    """The estimates at the reference's stamps, where neighbouring estimates are at most ``max_gap`` [s] apart."""
     rows = thinned(reference.t)
     at = _within(reference.t[rows], trajectory.t)
     rows, at = rows[np.isfinite(at)], at[np.isfinite(at)]
@@ -60,7 +60,7 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
 def pairs_in_space(
     found: Trajectory3, reference: Trajectory3, max_gap: float = MAX_GAP
 ) -> tuple[Trajectory3, Trajectory3]:
-    """The same in space: estimates with their covariances, and true poses; only those that have both."""
+    """The same in space: estimates with covariances, and true poses; only where both exist."""
     rows = thinned(reference.t)
     at = _within(reference.t[rows], found.t)
     valid = found.spans(at, max_gap=max_gap)
@@ -68,7 +68,7 @@ def pairs_in_space(
 
 
 def pauses(t: Array) -> Integers:
-    """Before which of the stamps ``t`` (N,) there is a pause: of more than 1 s, and more than three times the usual time."""
+    """The stamps ``t`` (N,) that follow a gap: more than 1 s, and more than three times the median interval."""
     if len(t) < 2:
         return np.empty(0, dtype=np.int64)
     steps = np.diff(t)
@@ -76,7 +76,7 @@ def pauses(t: Array) -> Integers:
 
 
 def _within(t: Array, stamps: Array) -> Array:
-    """Times ``t``, those that lie outside ``stamps`` by no more than the tolerance moved to its first or last, others made NaN."""
+    """Times ``t`` clipped to the range of ``stamps`` if outside by at most the tolerance, else NaN."""
     if not len(stamps):
         return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])

@@ -1,4 +1,4 @@
-"""Plots of one log run by several estimators, or by one."""
+"""Plots of the runs of one or several estimators on a log."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _FILES = (
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
     """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
 
-    Those of :func:`plot_run` for each estimator, but with all trajectories in one plot, and ``NAME-update-time.png``; with a
+    Those of :func:`plot_run` for each estimator, with all trajectories in one plot, and ``NAME-update-time.png``; with a
     reference also ``NAME-error-distribution.png``.
     """
     figures = {"trajectories": trajectories(log, tracks), "update-time": update_times(log, tracks)}
@@ -48,15 +48,15 @@ def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> 
 def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) -> list[Path]:
     """Write the plots of one run into ``folder`` and return their paths.
 
-    ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or where the estimator tells innovations;
-    with a reference ``NAME-errors-ESTIMATOR.png``. Where nothing told the pose only the first.
+    ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
+    ``NAME-errors-ESTIMATOR.png``. Without a trajectory only the first.
     """
     figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
     return _write(figures, folder, name)
 
 
 def remove_plots(folder: Path) -> None:
-    """Remove the plots of an earlier run or comparison, and nothing else."""
+    """Remove the plots of a previous run or comparison, and nothing else."""
     for pattern in _FILES:
         for plot in folder.glob(pattern):
             plot.unlink()
@@ -86,8 +86,7 @@ def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Causal and final trajectories over walls, what sensors draw of the map, and reference; the view is that of the map and the
-    reference."""
+    """Causal and final trajectories with walls, map objects and reference; the axes fit map and reference."""
     walls, layers = np.array(log.world.walls).reshape(-1, 2, 2), [m for m in marks(log) if not m.dense]
     view = _view(np.concatenate((*(m.positions[:, :2] for m in layers), walls.reshape(-1, 2))), log.reference)
     height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
@@ -114,12 +113,12 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
             axis.set_xlim(view[0, 0], view[1, 0])
             axis.set_ylim(view[0, 1], view[1, 1])
     legend(figure, axes[0])
-    lay_out(figure)  # after the first pass the axes change, and their labels reach below the legend
+    lay_out(figure)  # the first layout changes the axes, and their labels would overlap the legend
     return figure
 
 
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
-    """Signed errors in x, y and heading over time, causal and final, with bands of two stated standard deviations."""
+    """Signed errors in x, y and heading over time, causal and final, with two-sigma bands."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
     figure, axes = grid(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
     found = [None if one is None else errors(one, reference, track.max_gap) for _, one in track.kinds()]
@@ -171,7 +170,7 @@ def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
     figure, axes = grid(1, 1, 6.0, f"{log.name}: time per update")
     axis = axes[0, 0]
     for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
-        if track.causal is None:  # nothing is estimated while the log runs: its updates only collect
+        if track.causal is None:  # an offline estimator only collects in its updates
             axis.plot([], [], label=f"{estimator} (offline)", **style)
         else:
             _distribution(axis, track.update_ms, label=estimator, **style)
@@ -187,7 +186,7 @@ def _joined(segments: Array) -> Array:
 
 
 def _view(places: Array, reference: Trajectory | None) -> Array | None:
-    """Lower and upper corner (2, 2) of map and reference: dead reckoning may run far away. None without a reference."""
+    """Lower and upper corner (2, 2) of map and reference, as dead reckoning may drift far away. None without a reference."""
     if reference is None or not len(reference):
         return None
     points = np.concatenate((places, reference.poses[:, :2]))
@@ -209,7 +208,7 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Half the height of a panel: all but the most extreme half percent of errors and bands is in view."""
+    """Half the height of a panel, which shows all but the largest half percent of errors and bands."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))
@@ -222,12 +221,12 @@ def _distribution(axis: Axes, values: Array, **style: Any) -> None:
     axis.set_xscale("log")
     axis.set_ylim(0.0, 1.0)
     if len(values):
-        # an error of exactly 0 has no place on a logarithmic axis
+        # an error of exactly 0 is not on a logarithmic axis
         axis.plot(np.maximum(values, 1e-6), np.arange(1, len(values) + 1) / len(values), linewidth=2.0, **style)
 
 
 def _same_range(axes: Any) -> None:
-    """The same x axis for causal and final, from the smallest hundredth on: how small the smallest are says nothing."""
+    """The same x axis for causal and final, without the smallest hundredth of the errors."""
     drawn = [line.get_xdata() for axis in axes for line in axis.lines]
     if drawn:
         low = min(float(np.percentile(x, 1.0)) for x in drawn)

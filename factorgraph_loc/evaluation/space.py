@@ -1,4 +1,4 @@
-"""How far poses in space are from the reference, and whether their covariances say so."""
+"""Accuracy of poses in space against the reference, and consistency of their covariances."""
 
 from typing import Any
 
@@ -28,11 +28,10 @@ FIGURES = (
 def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
     """:data:`FIGURES` of a trajectory in space against the reference, without alignment; all None without either.
 
-    What is compared with what, see :func:`~factorgraph_loc.evaluation.pairing.pairs_in_space`.
-
-    ``space_position_*`` [m]; ``space_rotation_rmse`` [rad]: of the angle between estimated and true orientation. ``space_anees``:
-    mean squared error of the pose in units of its covariance, ideally 6; ``space_coverage_95``: share of the times at which that
-    is below the 95 % quantile. ``space_scored``: how many poses of the reference have an estimate.
+    Pairing: see :func:`~factorgraph_loc.evaluation.pairing.pairs_in_space`. ``space_position_*`` [m]; ``space_rotation_rmse``
+    [rad]: of the angle between estimated and true orientation. ``space_anees``: mean NEES of the pose, ideally 6;
+    ``space_coverage_95``: fraction of the times at which it is below the 95 % quantile. ``space_scored``: number of poses of the
+    reference with an estimate.
     """
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     if found is None or reference is None or not len(found):
@@ -56,8 +55,7 @@ def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: 
 
 
 def pose_errors(found: Trajectory3, truth: Trajectory3) -> Array:
-    """The perturbations (N, 6), turn first, then shift, in the estimate's frame, that lead from estimated to true poses at the same
-    times."""
+    """The perturbations (N, 6) from estimated to true poses, rotation first, in the estimate's frame."""
     back = found.rotations.transpose(0, 2, 1)
     turns = Rotation.from_matrix(back @ truth.rotations).as_rotvec()
     return np.column_stack((turns, np.einsum("nij,nj->ni", back, truth.positions - found.positions)))

@@ -1,6 +1,6 @@
 """Pooled figures, and differences between estimators with intervals.
 
-Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap that draws logs and, within each, seeds
+Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap over logs and, within each, over seeds
 (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
 """
 
@@ -14,12 +14,12 @@ import numpy as np
 from factors.se2 import Array
 
 COMPARED = tuple(f"{kind}.{what}_rmse" for kind in ("causal", "final") for what in ("position", "heading"))
-ENOUGH_LOGS = 6  # with fewer, a bootstrap over logs says nothing
+ENOUGH_LOGS = 6  # needed for a bootstrap over logs
 DRAWS = 4000
 CONFIDENCE = 0.95
-_SEED = 0  # of the bootstrap: the same results give the same intervals
+_SEED = 0  # of the bootstrap, for reproducible intervals
 
-# the columns of a difference; with their types, because there may be none
+# columns of a difference, with their types, as there may be no rows
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("metric", "a", "b", "log"), str),
     **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
@@ -30,17 +30,17 @@ Row = Mapping[str, Any]
 
 
 def pooled_rms(values: Sequence[float]) -> float:
-    """Root of the mean of the squares: RMSEs of several logs or seeds, each counted once whatever its length."""
+    """Root mean square of RMSEs of several logs or seeds, with equal weights."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: below 0, ``a`` is the better.
+    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: negative if ``a`` is better.
 
     ``rows`` are runs with log, estimator, seed and scores; an estimator that ran with one seed is paired with each seed of the
     other. For each log: RMSE pooled over the pairs. With 6 logs or more also ``log`` = "(all)": RMSE pooled over logs and seeds,
-    with ``low`` and ``high`` of the 95 % interval. ``pairs``: how many (log, seed) are compared; ``left_out``: how many are not,
-    because a run failed or has no such score. Without any pair the values are None.
+    with 95 % interval ``low`` to ``high``. ``pairs``: number of compared (log, seed); ``left_out``: number without a score in one
+    of the two. Without any pair the values are None.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -71,13 +71,11 @@ def _pairs(rows: Sequence[Row], log: str, a: str, b: str, metric: str) -> tuple[
 
 
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
-    """Scores (K, 2) of ``a`` and ``b`` by common seed, and how many pairs are missing; None: a run that has no score."""
+    """Scores (K, 2) of ``a`` and ``b`` by common seed, and the number of missing pairs; None: a run without a score."""
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
     both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
-    if any(
-        len(s) == 1 for s in by_seed
-    ):  # paired with each seed of the other; its own seed is one of these only by chance
+    if any(len(s) == 1 for s in by_seed):  # paired with each seed of the other, whatever its own seed
         longer = max(by_seed, key=len)
         both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
     complete = [pair for pair in both if None not in pair]
@@ -85,7 +83,7 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
 
 
 def _difference(scores: Array) -> dict[str, Any]:
-    """``scores`` (L, K, 2) of L logs and K seeds."""
+    """The difference for ``scores`` (L, K, 2) of L logs and K seeds."""
     if not scores.size:
         return dict.fromkeys(("value_a", "value_b", "difference", "low", "high"))
     a, b = np.sqrt(np.mean(np.square(scores), axis=(0, 1))).tolist()
@@ -93,7 +91,7 @@ def _difference(scores: Array) -> dict[str, Any]:
 
 
 def bounds(figures: Array) -> tuple[float, float]:
-    """The 95 % interval of a figure, from what a bootstrap drew of it (D,)."""
+    """The 95 % interval of a figure from its bootstrap draws (D,)."""
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
     low, high = np.percentile(figures, (tail, 100.0 - tail))
     return float(low), float(high)
@@ -102,8 +100,8 @@ def bounds(figures: Array) -> tuple[float, float]:
 def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     """Bootstrap of C pooled figures, (DRAWS, C): logs are drawn, and seeds within each.
 
-    ``clusters``: for each log, the scores (K, C) of its K seeds. Pooled is the root mean square over logs of that over seeds, each
-    log counted once, or without ``rms`` the mean of the means.
+    ``clusters``: for each log, the scores (K, C) of its K seeds. A pooled figure is the root mean square over seeds, then over
+    logs with equal weights, or without ``rms`` the mean of the means.
     """
     scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
     drawn = _weights(tuple(map(len, clusters))) @ scores
@@ -112,7 +110,7 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
 
 @lru_cache(maxsize=2)
 def _weights(seeds: tuple[int, ...]) -> Array:
-    """How much each of all N scores counts in each draw, (DRAWS, N), for logs with so many seeds."""
+    """The weight of each of all N scores in each draw, (DRAWS, N), for logs with these numbers of seeds."""
     rng = np.random.default_rng(_SEED)
     sizes = np.array(seeds)
     logs = rng.integers(len(sizes), size=(DRAWS, len(sizes)))

@@ -1,4 +1,4 @@
-"""The table of a comparison: a line for each log and estimator, then each estimator over all logs."""
+"""The table of a comparison: a row for each log and estimator, then each estimator over all logs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from factorgraph_loc.text import MESSAGE, plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-# column: figure of the scores, digits, whether RMSEs are pooled (else the mean is taken)
+# column: key of the score, digits, whether it is pooled as a root mean square (else averaged)
 COLUMNS = {
     "causal pos [m]": ("causal.position_rmse", 3, True),
     "causal head [rad]": ("causal.heading_rmse", 4, True),
@@ -29,19 +29,18 @@ SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
 SCORED = "poses scored"
 BASELINE = "dead_reckoning"
-ALIKE = 0.01  # share by which errors may differ without one being called the least alone
+ALIKE = 0.01  # relative difference of errors within which estimators are equally good
 
 Row = Mapping[str, Any]
 
 
 def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of the table, from the rows of a comparison.
+    """Header and rows of the table, from the rows of a comparison.
 
-    RMSEs are pooled over seeds (root of the mean square), the rest is averaged; with several seeds the standard deviation over them
-    follows after ±. The last lines pool each estimator over the logs, each log counted once; ``runs`` says how many of
-    the runs went well, and a pooled line with fewer than all says nothing about the others. ``scored`` is how many poses these
-    figures are from: of one run, or least to most of several; over all logs their sum. How long it took to find the place is
-    a column where that took any time.
+    RMSEs are pooled over seeds (root mean square), the rest is averaged; with several seeds the standard deviation follows after
+    ±. The last rows pool each estimator over the logs with equal weights; ``runs`` is the number of successful runs of all, and a
+    pooled row with failures is not comparable with the others. ``scored``: number of scored poses, as a range over runs, and
+    summed over logs. The time to localization is a column if it is not 0 throughout.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -71,7 +70,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     header, lines = comparison_cells(rows)
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     for i, name in enumerate(header):
-        # a word a line, so that the table is narrow; folded or cut numbers would be worse than broken lines
+        # wrap words to keep the table narrow; folded or truncated numbers would be worse
         table.add_column(Text(name.replace(" ", "\n")), justify="left" if i < 2 else "right", no_wrap=True)
     for line, after in zip(lines, [*lines[1:], None], strict=True):
         table.add_row(*(plain(cell, MESSAGE) for cell in line), end_section=after is None or after[0] != line[0])
@@ -79,10 +78,9 @@ def comparison_table(rows: Sequence[Row]) -> Table:
 
 
 def verdict(rows: Sequence[Row]) -> list[str]:
-    """In words: the estimator with the least position error, causal and final, beside dead reckoning where that ran.
+    """In words: the estimator with the least position error, causal and final, compared with dead reckoning if that ran.
 
-    Pooled over logs and seeds; those nearly as good are named too. An estimator of which a run failed, or has no such score,
-    is out: it cannot be compared.
+    Pooled over logs and seeds; those nearly as good are named too. Estimators with a failed run or a missing score are excluded.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -110,7 +108,7 @@ def verdict(rows: Sequence[Row]) -> list[str]:
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table that also reads well as plain text."""
+    """A Markdown table that is aligned as plain text."""
     texts = [list(header), *map(list, lines)]
     widths = [max(len(text[i]) for text in texts) for i in range(len(header))]
     padded = [
@@ -122,13 +120,13 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def scored_of(row: Row) -> float | None:
-    """How many poses of a run were scored: of its causal trajectory, else of the final one; None where there is no reference."""
+    """Number of scored poses of a run's causal trajectory, else of the final one; None without a reference."""
     found = (row.get(f"{kind}.{what}") for kind in ("causal", "final") for what in ("scored", "space_scored"))
     return next((count for count in found if count is not None), None)
 
 
 def _figure(row: Row, key: str) -> float | None:
-    # an estimator that waits for the end of the log (never localized before) only collects: its update times mean nothing
+    # an offline estimator (never localized before the end) only collects: its update times mean nothing
     offline = row.get("time_to_localized") is None
     return None if offline and key.startswith("timing.") else row.get(key)
 
@@ -152,7 +150,7 @@ def _average(values: Sequence[float], rms: bool) -> float:
 
 
 def counted(*by_log: Sequence[Row]) -> str:
-    """How many poses were scored, least to most over the runs of a log, summed over logs; empty where there is no reference."""
+    """Number of scored poses, as a range over the runs of a log, summed over logs; empty without a reference."""
     counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
     known = [of_log for of_log in counts if of_log]
     least, most = sum(map(min, known)), sum(map(max, known))

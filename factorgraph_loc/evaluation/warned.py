@@ -1,21 +1,21 @@
-"""Warnings that concern results: kept with the scores of a run and in its row, and told once however many runs they concern."""
+"""Warnings about results: stored with the scores of a run and in its row, and printed once for all runs concerned."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, a line each; None without any)
+WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, one line each; None without any)
 
 Row = Mapping[str, Any]
 
 
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """The scores of a run as cells of a row: lists are left out, but for the warnings, which become one text."""
+    """The scores of a run as cells of a row: lists are omitted, except for the warnings, which become one text."""
     cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
     return cells | {WARNINGS: "\n".join(scores.get(WARNINGS) or ()) or None}
 
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The runs that each warning concerns, in the order in which warnings come."""
+    """The runs concerned by each warning, in order of appearance."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         for text in (row.get(WARNINGS) or "").split("\n"):
@@ -25,7 +25,7 @@ def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Each warning once; those that do not concern all that ran on their logs name the ones that they do."""
+    """Each warning once, with the estimators concerned unless these are all that ran on the logs."""
     told = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}
@@ -36,5 +36,5 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 
 def label_of(row: Row) -> str:
-    """What the results call the estimator."""
+    """The label of the estimator in the results."""
     return str(row.get("label") or row["estimator"])

@@ -1,4 +1,4 @@
-"""Runs: one, several that are compared, and experiments of many that are kept, resumed and reported."""
+"""Runs: single ones, comparisons, and experiments of many runs that are stored, resumed and reported."""
 
 __all__ = [
     "active",

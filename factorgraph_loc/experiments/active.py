@@ -1,6 +1,6 @@
-"""Many robots that seek their place: worlds, policies and estimators on the same seeds, in processes, and what came out as files.
+"""Experiments with active localization: worlds, policies and estimators on the same seeds, in parallel processes.
 
-What is done is kept while the rest is under way, so that an experiment which was interrupted goes on where it was.
+Finished parts are stored meanwhile, so that an interrupted experiment can be resumed.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, co
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text, write_toml
 from factorgraph_loc.files.parquet import read_parquet
-from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.planning.active_run import ActiveRun
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, run_active
 from factorgraph_loc.planning.policies import POLICIES
@@ -33,7 +33,7 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.text import quoted, told
 from factorgraph_loc.version import __version__
 
-CHUNK = 10  # runs of one process: to start one takes longer than a run
+CHUNK = 10  # runs per process, as starting a process takes longer than a run
 FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")
 PARTS, PLOTS = "parts", "plots"
 ROW: dict[str, Any] = {
@@ -51,7 +51,9 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """Runs of one policy and estimator in one kind of world, for :func:`run_jobs`. The run of ``pictured``, if any, is drawn."""
+    """Runs of one policy and estimator in one kind of world, for :func:`run_jobs`. The run of ``pictured``, if
+    any, is plotted.
+    """
 
     simulation: SimulationSettings
     policy: str
@@ -68,7 +70,7 @@ class ActiveJob:
 
     @property
     def part(self) -> Path:
-        """The file of the rows of this job: other settings, or another version, have another one."""
+        """The file with the rows of this job, specific to settings and version."""
         told: list[Any] = [__version__, self.policy, self.estimator, list(self.seeds), self.pictured]
         told += [model.model_dump(mode="json") for model in (self.simulation, self.settings)]
         key = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
@@ -77,8 +79,8 @@ class ActiveJob:
 
 @dataclass(frozen=True)
 class ActiveResults:
-    """``rows``: one a run, with the keys of :data:`ROW`; ``status`` is ok, refused (bad input) or failed, and without ok there is
-    a ``reason`` and nothing but what names the run. ``failures``: one line for each of those."""
+    """``rows``: one per run, with the keys of :data:`ROW`; ``status`` is ok, refused (bad input) or failed; unless ok, there are
+    only the identification of the run and a ``reason``. ``failures``: one line for each of those."""
 
     rows: list[Row]
     failures: list[str] = field(default_factory=list)
@@ -98,22 +100,20 @@ def seek(
 ) -> ActiveResults:
     """Run every policy with every estimator on every seed, in ``jobs`` parallel processes (None: one per core).
 
-    Written into ``out``: ``results.parquet`` and ``results.csv`` (a row a run), ``differences.csv`` (see
+    Written into ``out``: ``results.parquet`` and ``results.csv`` (a row per run), ``differences.csv`` (see
     :func:`~factorgraph_loc.evaluation.active.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png`` and for each
-    policy and estimator a picture of the run of the first seed. A run that fails is a row with its reason; the others go on.
-    If it is interrupted, the same call goes on. ``progress`` is given the number of runs done and of all.
+    policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others continue. The same
+    call resumes an interrupted experiment. ``progress`` is called with the number of runs done and of all.
 
-    Raises InputError, before anything runs, for an unknown policy or estimator, one that is given twice, or an ``out`` that
-    holds results while ``overwrite`` is off; and where all runs are refused for their input.
+    Raises InputError, before anything runs, for an unknown or repeated policy or estimator, or an ``out`` that contains results
+    without ``overwrite``; and if all runs are refused for their input.
     """
     _check_names("policy", policies, POLICIES)
     _check_names("estimator", estimators, ESTIMATORS)
     settings = ActiveSettings() if settings is None else settings
     check_free(out, overwrite=overwrite)
-    try:
+    with writing(out):
         (out / PLOTS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     if overwrite:
         remove_results(out)
     work = jobs_of(simulation, policies, estimators, seeds, out, settings, pictured=seeds[0])
@@ -133,7 +133,7 @@ def seek(
     write_picture(comparison(results.rows), out / PLOTS / "comparison.png")
     for job in work:
         job.part.unlink(missing_ok=True)
-    with suppress(OSError):  # what else is there stays
+    with suppress(OSError):  # the rest of the folder stays
         (out / PARTS).rmdir()
     return results
 
@@ -147,7 +147,7 @@ def jobs_of(
     settings: ActiveSettings,
     pictured: int | None = None,
 ) -> list[ActiveJob]:
-    """The jobs of all these runs; all policies of some seeds come before the next seeds."""
+    """The jobs of all these runs, ordered such that all policies of some seeds come before the next seeds."""
     chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
     return [
         ActiveJob(simulation, policy, estimator, chunk, settings, folder, pictured if pictured in chunk else None)
@@ -160,7 +160,7 @@ def jobs_of(
 def run_jobs(
     jobs: Sequence[ActiveJob], workers: int, progress: Callable[[int, int], None] | None = None
 ) -> ActiveResults:
-    """The rows of all jobs in their order. What an earlier call did is read from the jobs' parts, what this one does is kept."""
+    """The rows of all jobs in order. Parts from a previous call are read, new ones are stored."""
     found: dict[int, list[Row]] = {i: _kept(job) for i, job in enumerate(jobs) if job.part.exists()}
     left = [i for i in range(len(jobs)) if i not in found]
     total = sum(len(job.seeds) for job in jobs)
@@ -187,7 +187,7 @@ def run_jobs(
 
 
 def run_job(job: ActiveJob) -> list[Row]:
-    """The rows of a job, which are also kept as its part if all went well; jobs can be sent to other processes."""
+    """The rows of a job, stored as its part if all succeeded; can be sent to other processes."""
     rows = [_run(job, seed) for seed in job.seeds]
     if all(row["status"] == "ok" for row in rows):
         job.part.parent.mkdir(parents=True, exist_ok=True)
@@ -197,7 +197,7 @@ def run_job(job: ActiveJob) -> list[Row]:
 
 
 def row_of(run: ActiveRun) -> Row:
-    """What is kept of a run in tables."""
+    """The row of a run in tables."""
     times = run.planning_ms
     return {
         "world": run.preset,
@@ -219,7 +219,7 @@ def row_of(run: ActiveRun) -> Row:
 
 
 def track_of(run: ActiveRun) -> SeekingTrack:
-    """What is drawn of a run."""
+    """The data of a run for plotting."""
     decisions = [Decision(s.metres, s.truth, s.particles, s.candidates, s.chosen) for s in run.steps]
     ended = "localized" if run.localized else "not localized"
     title = f"{run.preset}, seed {run.seed}: {run.policy} with {run.estimator}, {ended} after {run.metres:.1f} m"
@@ -227,7 +227,7 @@ def track_of(run: ActiveRun) -> SeekingTrack:
 
 
 def write_tables(rows: Sequence[Row], out: Path) -> None:
-    """``results.parquet``, ``results.csv``, ``differences.csv`` and ``table.md`` of runs into a folder."""
+    """Write ``results.parquet``, ``results.csv``, ``differences.csv`` and ``table.md`` into a folder."""
     table = pl.DataFrame(rows, schema=ROW)
     write_text(out / "results.csv", table.write_csv())
     write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
@@ -237,25 +237,18 @@ def write_tables(rows: Sequence[Row], out: Path) -> None:
 
 
 def write_picture(figure: Any, path: Path) -> None:
-    """A figure as PNG, at once or not at all."""
+    """Write a figure as PNG, atomically."""
     with replacing(path) as temporary:
         save(figure, temporary)
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder, or holds results that may not be replaced. Parts of them may be there. What
-    earlier calls have left behind is removed."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder for the results")
-    for folder in (out, out / PARTS, out / PLOTS):
-        sweep(folder)
-    held = [name for name in FILES if (out / name).exists()]
-    if held and not overwrite:
-        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+    """Raise InputError if ``out`` is not a folder, or contains results that must not be replaced. Parts are allowed."""
+    require_free(out, FILES, overwrite=overwrite, folders=(out / PARTS, out / PLOTS))
 
 
 def remove_results(out: Path) -> None:
-    """Remove the results of an earlier experiment, and what is there of an interrupted one; and nothing else."""
+    """Remove the results and parts of a previous experiment, and nothing else."""
     for name in FILES:
         (out / name).unlink(missing_ok=True)
     for pattern in (f"{PARTS}/*.parquet", f"{PARTS}/*.error.txt", f"{PLOTS}/*.png"):

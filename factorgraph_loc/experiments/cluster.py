@@ -1,8 +1,8 @@
-"""Planned runs on an existing cluster of ``dask.distributed``: workers compute, and this process alone stores.
+"""Planned runs on an existing cluster of ``dask.distributed``: workers compute, and only this process stores.
 
-A run is claimed in the store here while it is on the cluster, its files are sent back, and stored under that claim. So the workers
-need no common file system but for recorded logs, a run that is lost with its worker is computed by another, and nothing is stored
-twice, whatever else works on the same store.
+A run is claimed in the store while it is on the cluster; its files are sent back, and stored under that claim. Workers thus need
+no common file system except for recorded logs, a run lost with its worker is repeated by another, and nothing is stored twice,
+whatever other processes use the same store.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Executor, Prepared
 
 CONNECT = 10.0  # s to wait for the scheduler
-LOOK = 0.5  # s between looks at what is done, and at runs that another process had claimed
-AHEAD = 2  # runs that are with a worker for each that it computes: the next one must not wait for this process
-RESTART = 60.0  # s for a worker to end and to be back
-_ONE = Lock()  # runs share no thread of a process: their times would be each other's
+LOOK = 0.5  # s between checks for finished runs, and for runs claimed by other processes
+AHEAD = 2  # runs per busy worker, so that the next one does not wait for this process
+RESTART = 60.0  # s for a worker to restart
+_ONE = Lock()  # one run at a time in a process, for meaningful times
 
 
 @dataclass(frozen=True)
 class _Made:
-    """The files of a run; ``late``: the address of the worker where it still goes on, as it took too long."""
+    """The files of a run; ``late``: the address of the worker that is still busy with it after the time limit."""
 
     files: dict[str, bytes]
     late: str | None = None
@@ -58,7 +58,7 @@ class _Sent:
 
 
 def on_cluster(scheduler: str, prepared: Prepared, *, again: bool = False) -> Executor:
-    """What makes the runs of an experiment on the cluster of ``scheduler``; see :func:`execute`."""
+    """Return an executor of an experiment's runs on the cluster of ``scheduler``; see :func:`execute`."""
     limits = prepared.experiment.limits
     return partial(execute, folder=prepared.folder, scheduler=scheduler, limits=limits, again=again)
 
@@ -66,13 +66,13 @@ def on_cluster(scheduler: str, prepared: Prepared, *, again: bool = False) -> Ex
 def execute(
     runs: Sequence[PlannedRun], folder: Path, *, scheduler: str, limits: Limits, again: bool = False
 ) -> Iterator[Outcome]:
-    """Make ``runs`` on the cluster of the ``scheduler`` (its address), store them below ``folder``, yield outcomes as they come.
+    """Make ``runs`` on the cluster of the ``scheduler`` (its address), store them below ``folder``, and yield their outcomes.
 
-    ``limits``: the time of a run is limited here, its memory by the cluster's own limit. ``again``: stored failures are tried once
-    more. When the caller stops listening, what is on the cluster is cancelled.
+    ``limits``: the time of a run is limited here, its memory by the cluster's own limit. ``again``: retry stored failures. When
+    the generator is closed, runs on the cluster are cancelled.
 
-    Raises InputError if ``distributed`` is not installed, no scheduler answers there, it has no workers, or a worker has other code
-    or other libraries; RunFailedError if the scheduler goes away; StoreError if the store cannot be written.
+    Raises InputError if ``distributed`` is not installed, the scheduler does not answer, it has no workers, or a worker has other
+    code or other libraries; RunFailedError if the scheduler disappears; StoreError if the store cannot be written.
     """
     distributed = _import()
     with ExitStack() as stack:
@@ -88,12 +88,14 @@ def execute(
         stack.callback(cluster.close)
         try:
             yield from cluster.outcomes(runs)
-        except (OSError, distributed.CancelledError) as error:  # of the connection: those of the store are StoreErrors
-            raise RunFailedError("the scheduler went away; what is done is stored, the same command goes on") from error
+        except (OSError, distributed.CancelledError) as error:  # connection errors: those of the store are StoreErrors
+            raise RunFailedError(
+                "the scheduler has disappeared; results are stored, the same command continues"
+            ) from error
 
 
 def make(run: PlannedRun, version: str, seconds: float) -> _Made:
-    """Compute a run on a worker, where code and libraries have the digest ``version``, in at most ``seconds``."""
+    """Compute a run on a worker, if its code and libraries have the digest ``version``, in at most ``seconds``."""
     import cv2  # noqa: PLC0415
     from distributed import get_worker  # noqa: PLC0415
 
@@ -132,7 +134,7 @@ class _Cluster:
     def __init__(self, distributed: ModuleType, client: Any, store: Store, limits: Limits, again: bool) -> None:
         self._distributed, self._client, self._store = distributed, client, store
         self._seconds, self._again = limits.time, again
-        self._session = uuid4().hex  # a scheduler gives the same key the same result, also a failed one
+        self._session = uuid4().hex  # for unique keys: a scheduler returns the stored result of a key, even a failure
         self._waiting: deque[PlannedRun] = deque()
         self._busy: list[PlannedRun] = []  # claimed by another process
         self._sent: dict[Any, _Sent] = {}
@@ -190,7 +192,7 @@ class _Cluster:
             made = self._result(future)
             self._store.put(sent.run.key, made.files)
         if made.late is not None:
-            with suppress(Exception):  # a worker without a nanny goes on with that run
+            with suppress(Exception):  # a worker without a nanny continues with that run
                 self._client.restart_workers([made.late], timeout=RESTART, raise_for_error=False)
         return stored_outcome(sent.run.key, self._store)
 
@@ -212,7 +214,7 @@ def _failure(kind: Kind, reason: str) -> dict[str, bytes]:
 
 
 def _absolute(source: LogSource) -> LogSource:
-    """The source with paths that do not depend on the folder that a worker was started in."""
+    """The source with absolute paths, independent of the worker's working folder."""
 
     def path(name: str) -> str:
         return str(Path(name).resolve()) if Path(name).exists() else name

@@ -1,4 +1,4 @@
-"""Several estimators on several logs: every pair in a process of its own, one table, the differences, and plots."""
+"""Comparison of several estimators on several logs: every pair in its own process, a table, differences, and plots."""
 
 import hashlib
 import os
@@ -24,6 +24,7 @@ from factorgraph_loc.experiments.preparation import columns_of, fill_cache, use_
 from factorgraph_loc.experiments.prior import check_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
+from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.results.layout import FILES
@@ -34,14 +35,14 @@ from factorgraph_loc.processes import run_each
 from factorgraph_loc.text import quoted
 
 _ERROR = "error.txt"
-_BEGUN = "unfinished.txt"  # is there until a comparison is done, with a digest of what was asked for
+_BEGUN = "unfinished.txt"  # exists until a comparison is finished, with a digest of its arguments
 _TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "report.html")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came out. ``rows``: one a run, all with the same keys: log, estimator, seed, status (ok, failed), reason, and the scalar
-    scores (None in a failed run), and ``warnings``, a line each. ``failures``: one line a failed run; ``warnings``: each once."""
+    """``rows``: one per run, all with the same keys: log, estimator, seed, status (ok, failed), reason, the scalar scores (None
+    in a failed run), and ``warnings``, one per line. ``failures``: one line per failed run; ``warnings``: each once."""
 
     rows: list[dict[str, Any]]
     failures: list[str] = field(default_factory=list)
@@ -72,16 +73,15 @@ def compare(
 ) -> Comparison:
     """Run every configuration on every log, in ``jobs`` parallel processes (None: one per core).
 
-    An estimator that uses no randomness runs with the first of its seeds only. A run that fails, or whose process dies, becomes a
-    row with its reason; the others go on. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows),
-    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
+    Deterministic estimators run with the first of their seeds only. A run that fails, or whose process dies, becomes a row with
+    its reason; the others continue. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv``
+    (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png`` and ``runs/LOG/ESTIMATOR/seedK/`` with the files of
-    each run, or ``error.txt`` with the traceback.
-    ``progress`` is given the number of runs done and of all.
+    each run, or ``error.txt`` with the traceback. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
-    estimator and seed, bad settings, a prior that is none, a sensor that no log has, or an ``out`` that holds results while
-    ``overwrite`` is off.
+    estimator and seed, invalid settings or prior, a sensor that no log has, or an ``out`` that contains results without
+    ``overwrite``.
     """
     configs = _without_needless_seeds(configs)
     _check(logs, configs)
@@ -99,7 +99,8 @@ def compare(
             if progress is not None:
                 progress(len(outcomes), len(work))
     finally:
-        _sweep(out)
+        for folder in _folders(out):
+            sweep(folder)
     rows = [_row(job, outcomes[i]) for i, job in enumerate(work)]
     keys = list(dict.fromkeys(key for row in rows for key in row))
     rows = [{key: row.get(key) for key in keys} for row in rows]
@@ -110,7 +111,7 @@ def compare(
         for i, job in enumerate(work):
             outcome = outcomes[i]
             if job.log is log and isinstance(outcome, _Outcome):
-                tracks.setdefault(job.config.estimator, outcome.track)  # the first seed stands for all
+                tracks.setdefault(job.config.estimator, outcome.track)  # the first seed represents all
         if tracks:
             plot_log(log, tracks, out / "plots", file_name(log.name))
     (out / _BEGUN).unlink(missing_ok=True)
@@ -127,7 +128,7 @@ def _execute(job: _Job) -> _Outcome:
 
 def _without_needless_seeds(configs: Sequence[RunConfig]) -> list[RunConfig]:
     kept: list[RunConfig] = []
-    first: list[RunConfig] = []  # of those without randomness
+    first: list[RunConfig] = []  # of deterministic estimators
     for config in configs:
         if _is_deterministic(config.estimator):
             if any(replace(one, seed=config.seed) == config for one in first):
@@ -167,25 +168,19 @@ def _asked(logs: Sequence[Log], configs: Sequence[RunConfig]) -> str:
 
 
 def check_free(out: Path, *, overwrite: bool, asked: str | None = None) -> None:
-    """InputError if ``out`` is no folder, or holds results that may not be replaced: those of an unfinished comparison may, by the
-    same one, if it is known which is ``asked`` for. What earlier ones have left behind is removed."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder for the results")
-    _sweep(out)
-    held = [name for name in (*_TABLES, *FILES) if (out / name).exists()]
-    held += [str(run.relative_to(out)) for run in _runs(out)]
+    """Raise InputError if ``out`` is not a folder, or contains results that must not be replaced. Those of an unfinished
+    comparison may be replaced by the same one, identified by ``asked``."""
     try:
         begun = (out / _BEGUN).read_text(encoding="ascii", errors="replace").split()[0]
     except (OSError, IndexError):
         begun = None
+    names = (*_TABLES, *FILES, *(str(run.relative_to(out)) for run in _runs(out)))
     same = begun is not None and asked in (None, begun)
-    if held and not overwrite and not same:
-        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+    require_free(out, names, overwrite=overwrite or same, folders=_folders(out))
 
 
-def _sweep(out: Path) -> None:
-    for folder in (out.parent, out, out / "plots", *out.glob("runs/*/*")):
-        sweep(folder)
+def _folders(out: Path) -> list[Path]:
+    return [out.parent, out, out / "plots", *out.glob("runs/*/*")]
 
 
 def _runs(out: Path) -> list[Path]:
@@ -193,22 +188,18 @@ def _runs(out: Path) -> list[Path]:
 
 
 def _prepare(out: Path, overwrite: bool, asked: str) -> None:
-    """Refuse what may not be replaced, remove what may: only files that an earlier comparison wrote."""
+    """Check ``out``, and remove the files of a previous comparison."""
     check_free(out, overwrite=overwrite, asked=asked)
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        write_text(
-            out / _BEGUN, f"{asked} of a comparison that is not done; the same command makes it from its start\n"
-        )
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+        write_text(out / _BEGUN, f"{asked} of an unfinished comparison; the same command starts it again\n")
     for name in _TABLES:
         (out / name).unlink(missing_ok=True)
     remove_plots(out / "plots")
     for folder in _runs(out):
         remove_run(folder)
         (folder / _ERROR).unlink(missing_ok=True)
-        with suppress(OSError):  # there is something of somebody else
+        with suppress(OSError):  # the folder contains other files
             folder.rmdir()
 
 

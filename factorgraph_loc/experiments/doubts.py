@@ -1,4 +1,4 @@
-"""What a run says of itself where the map and what was measured do not come together."""
+"""Warnings about a run whose map or reference does not fit its measurements."""
 
 from collections.abc import Sequence
 
@@ -11,11 +11,11 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import functions
 
-MOSTLY = 0.9  # of the time with estimates
+MOSTLY = 0.9  # fraction of the time with estimates
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...]:
-    """A reference with too few poses to score by, or that is there for a part of the time."""
+    """Warnings for a reference with too few poses to be scored, or that covers a part of the time only."""
     reference = log.reference
     if reference is None or not len(reference) or not len(final):
         return ()
@@ -35,7 +35,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[str, ...]:
-    """Gaps (begin, end) [s] between measurements inside of which there are no estimates."""
+    """Warnings for gaps (begin, end) [s] between measurements without estimates inside."""
     if not skipped:
         return ()
     begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])
@@ -47,18 +47,16 @@ def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: floa
 
 
 def findable(log: Log, sensors: Sequence[str]) -> list[tuple[str, str]]:
-    """What ``sensors`` could find in the map, each with the words for that nothing of it was."""
+    """The objects of the map that ``sensors`` can observe, each with the warning that none was."""
     return [found for _, function in functions("findable") if (found := function(log, sensors))]
 
 
 def never_localized(
     log: Log, sensors: Sequence[str], estimates: Sequence[PoseEstimate], final: Trajectory
 ) -> tuple[str, ...]:
-    """An unknown start that nothing told, in terms of what ``sensors`` find in the map."""
+    """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map."""
     found = {e.status for e in estimates}
-    if "localized" in found or (
-        len(final) and estimates[-1].status == "unlocalized"
-    ):  # or it says nothing before the end
+    if "localized" in found or (len(final) and estimates[-1].status == "unlocalized"):  # or it has no causal estimates
         return ()
     kinds = findable(log, sensors)
     names = " and ".join(name for name, _ in kinds)
@@ -66,8 +64,8 @@ def never_localized(
         why = "the map has nothing that its sensors could find"
     elif "ambiguous" in found:
         why = f"its {names} leave several places possible"
-    elif len(kinds) > 1:  # an estimator need not take all of them
-        why = f"its {names} did not tell the place"
+    elif len(kinds) > 1:  # an estimator may use only some of them
+        why = f"its {names} did not determine the pose"
     else:
         why = kinds[0][1]
     return (f"{log.name}: never localized: {why}",)

@@ -1,4 +1,4 @@
-"""One planned run: computed, or stored under its key, by whichever process it is sent to."""
+"""Execution of one planned run, or its lookup in the store, in any process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run: its results are stored (``ok``), its failure is, or another process is at it (``busy``)."""
+    """The outcome of a run: its results are stored (``ok``), its failure is, or another process works on it (``busy``)."""
 
     key: str
     status: Literal["ok", "failed", "busy"]
@@ -35,19 +35,19 @@ class Outcome:
 
 
 class VanishedError(InputError):
-    """A log is not there any more, or is another one than was planned."""
+    """A log disappeared, or differs from the planned one."""
 
 
 def run_planned(run: PlannedRun, folder: Path, *, again: bool = False) -> Outcome:
-    """Make a run and store its results, or its failure, in the store below ``folder``, unless they are there.
+    """Make a run and store its results, or its failure, in the store below ``folder``, unless they exist.
 
-    ``again``: a stored failure is tried again. StoreError if the store cannot be written; nothing else is raised.
+    ``again``: retry a stored failure. Raises StoreError only, if the store cannot be written.
     """
     store = Store(folder)
     with store.claim(run.key) as mine:
         if not mine:
             return Outcome(run.key, "busy")
-        state = store.state(run.key, thorough=True)  # that of a run which its caller takes to be missing or damaged
+        state = store.state(run.key, thorough=True)  # the caller considers it missing or damaged
         if state == "ok" or (state == "failed" and not again):
             return stored_outcome(run.key, store)
         store.put(run.key, compute(run))
@@ -55,7 +55,7 @@ def run_planned(run: PlannedRun, folder: Path, *, again: bool = False) -> Outcom
 
 
 def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Outcome:
-    """Store what became of a run whose process could not do so itself."""
+    """Store the failure of a run whose process could not do so itself."""
     store = Store(folder)
     with store.claim(run.key) as mine:
         if not mine:
@@ -68,7 +68,7 @@ def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Out
 def compute(run: PlannedRun) -> dict[str, bytes]:
     """The files of a run, or of its failure, for :meth:`~factorgraph_loc.experiments.store.Store.put`.
 
-    StoreError if there is no room for them; nothing else is raised.
+    Raises StoreError only, if there is no space for them.
     """
     from factorgraph_loc.experiments.run import run as run_log  # noqa: PLC0415
     from factorgraph_loc.experiments.stored_run import run_files  # noqa: PLC0415
@@ -92,14 +92,13 @@ def compute(run: PlannedRun) -> dict[str, bytes]:
 
 
 def failure_file(kind: Kind, reason: str, details: str = "") -> bytes:
-    """The content of ``failure.json``."""
     content: dict[str, Any] = {"kind": kind, "reason": reason}
     return (json.dumps(content | ({"traceback": details} if details else {}), indent=2) + "\n").encode()
 
 
 @lru_cache(maxsize=4)
 def _load(source: LogSource, digest: str) -> Log:
-    """The log of a source; it is kept, as the runs of one log follow each other."""
+    """The log of a source; cached, as consecutive runs use the same log."""
     from factorgraph_loc.experiments.keys import source_digest  # noqa: PLC0415
 
     try:
@@ -107,12 +106,12 @@ def _load(source: LogSource, digest: str) -> Log:
     except InputError as error:
         raise VanishedError(f"the log has vanished: {error}") from error
     if now != digest:
-        raise VanishedError("the log is another one than when the experiment began")
+        raise VanishedError("the log has changed since the experiment was planned")
     return source.load()
 
 
 def stored_outcome(key: str, store: Store) -> Outcome:
-    """What became of a run whose results, or whose failure, are stored."""
+    """The outcome of a run whose results, or whose failure, are stored."""
     state = store.state(key)
     if state == "failed":
         return Outcome(key, "failed", str(store.row(key)["reason"]))
@@ -120,7 +119,7 @@ def stored_outcome(key: str, store: Store) -> Outcome:
 
 
 def _forget_peak_memory() -> None:
-    """Let the kernel count the peak of this process anew (proc(5), clear_refs 5), where it can."""
+    """Reset the kernel's peak memory of this process (proc(5), clear_refs 5), where possible."""
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:

@@ -1,4 +1,4 @@
-"""An experiment from its file to the table of its results; what is stored already is not run again."""
+"""An experiment from its file to the table of its results; stored runs are not repeated."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ from factorgraph_loc.text import plain
 if TYPE_CHECKING:
     import polars as pl
 
-PACE = 20.0  # s of a log in a second, where nothing is known of an estimator
+PACE = 20.0  # assumed ratio of log time to computing time, for an unknown estimator
 Executor = Callable[[Sequence[PlannedRun]], Iterator[Outcome]]
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An experiment whose ``runs`` are planned; its results go to ``folder``, and ``states`` says what is there by key."""
+    """An experiment with planned ``runs``; its results go to ``folder``, and ``states`` are those of the stored
+    results by key.
+    """
 
     experiment: Experiment
     folder: Path
@@ -38,30 +40,30 @@ class Prepared:
 
     @property
     def store(self) -> Store:
-        """Where the results are."""
+        """The store of the results."""
         return Store(self.folder)
 
     def damaged(self) -> list[PlannedRun]:
-        """The runs whose results are not as they were written."""
+        """The runs with damaged results."""
         return [run for run in self.runs if self.states[run.key] == "damaged"]
 
     def verified(self) -> Prepared:
-        """The same, with states by all checksums."""
+        """The same, with all checksums verified."""
         return replace(self, states={key: self.store.state(key, thorough=True) for key in self.states})
 
     def todo(self, *, again: bool = False) -> list[PlannedRun]:
-        """The runs that are to be made; with ``again`` those that failed too."""
+        """The runs to be made; with ``again`` also the failed ones."""
         done = ("ok",) if again else ("ok", "failed")
         return [run for run in self.runs if self.states[run.key] not in done]
 
     def counts(self) -> Counter[State]:
-        """How many runs are ok, failed, missing and damaged."""
+        """Number of runs that are ok, failed, missing and damaged."""
         return Counter(self.states[run.key] for run in self.runs)
 
 
 @dataclass(frozen=True)
 class Done:
-    """What came out: a row a run, see :func:`~factorgraph_loc.experiments.index.load_results`; a line for each failure, and each
+    """The results: a row per run, see :func:`~factorgraph_loc.experiments.index.load_results`; a line for each failure, and each
     warning once."""
 
     rows: pl.DataFrame
@@ -78,9 +80,9 @@ def prepare(
     verify: bool = False,
     most: int = MOST_RUNS,
 ) -> Prepared:
-    """Plan the experiment of a ``file`` with ``changes``, and look at what is stored; ``verify``: by all checksums.
+    """Plan the experiment of a ``file`` with ``changes``, and look up stored results; ``verify``: check all checksums.
 
-    InputError for what is wrong in the file, TooManyRunsError for more than ``most`` runs, StoreError if the folder for results
+    Raises InputError for errors in the file, TooManyRunsError for more than ``most`` runs, StoreError if the folder for results
     cannot be written.
     """
     experiment = read_experiment(file, changes)
@@ -105,11 +107,10 @@ def run_experiment(
     executor: Executor | None = None,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Make the runs that are not stored, with ``again`` those that failed too, and write the table of all results.
+    """Make the runs that are not stored, with ``again`` also the failed ones, and write the table of all results.
 
-    ``jobs``: processes, by default one per core; ``executor``: what makes the runs instead, and yields their outcomes.
-    ``progress`` is given the number of runs made, of those to be made, and of all failures. The table is written however this
-    ends.
+    ``jobs``: processes, by default one per core; ``executor``: makes the runs instead, and yields their outcomes. ``progress`` is
+    called with the numbers of runs made, to be made, and failed. The table is written also after an error or interrupt. Raises
     StoreError if the store cannot be written.
     """
     todo = prepared.todo(again=again)
@@ -130,7 +131,7 @@ def run_experiment(
             made, failed = made + 1, failed + (outcome.status == "failed")
             progress(made, len(todo), failed)
     finally:
-        for run in todo:  # an interrupt may come between a run's end and the news of it
+        for run in todo:  # an interrupt may come between a run's end and its outcome
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key, thorough=True)
         rows = _write_rows(prepared, states)
@@ -139,7 +140,7 @@ def run_experiment(
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
-    """How long the runs take one after the other [s]: as those of the same estimator did, by duration of the log, else a guess."""
+    """Estimated sum of the run times [s], from stored runs of the same estimator and the duration of the log, else a default."""
     import polars as pl  # noqa: PLC0415
 
     from factorgraph_loc.experiments.index import load_results  # noqa: PLC0415

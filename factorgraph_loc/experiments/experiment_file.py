@@ -1,4 +1,4 @@
-"""The file that says what an experiment is: logs, estimators, sensors, seeds, and settings to sweep over."""
+"""The experiment file: logs, estimators, sensors, seeds, and settings to sweep over."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.ticks import LONGEST, SHORTEST, TICK_GAP
 from factorgraph_loc.text import listed, plain, quoted
 
-SIMULATION = "simulation"  # the first word of settings of simulated logs
+SIMULATION = "simulation"  # first word of settings of simulated logs
 METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")
-PATH, PART = 1000, 255  # bytes of a path, and of a name within it
-LONGEST_NAME = 200  # characters of the experiment's name, which is that of a folder
-MOST = 1000  # logs, estimators, sets of sensors and metrics that a file lists; globs and seeds make more of them
-MOST_SWEPT, MOST_VALUES = 50, 10_000  # swept settings, and values of one
+PATH, PART = 1000, 255  # maximum bytes of a path, and of a name within it
+LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
+MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
+MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one
 Name = Annotated[str, Field(min_length=1)]
 Seeds = Annotated[
     tuple[Annotated[int, Field(ge=0, le=LARGEST_SEED)], ...], Field(min_length=1, max_length=MOST_SEEDS, fail_fast=True)
@@ -48,7 +48,7 @@ PathName = Annotated[Name, AfterValidator(_path)]
 
 
 def _seeds(value: Any) -> Any:
-    """``"0:5"`` and 3 as tuples; a list stays what it is."""
+    """``"0:5"`` and 3 as tuples; a list is unchanged."""
     if isinstance(value, int) and not isinstance(value, bool):
         return (value,)
     if isinstance(value, str):
@@ -69,9 +69,9 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
 
 
 class LogEntry(FileModel):
-    """Logs: ``log``, a name that ``fgloc datasets`` lists, a path from the file's folder on, or a glob over either, with
-    ``reader``, ``options`` of the reader, and files ``rig`` and ``world`` in place of the log's own; or ``simulate``, a preset or
-    a TOML file, with changed ``settings`` and ``seeds``, a log of each."""
+    """Logs: ``log``, a name listed by ``fgloc datasets``, a path relative to the file's folder, or a glob over either, with
+    ``reader``, its ``options``, and files ``rig`` and ``world`` replacing the log's own; or ``simulate``, a preset or a TOML
+    file, with changed ``settings`` and ``seeds``, for a log each."""
 
     log: PathName | None = None
     reader: Name | None = None
@@ -95,7 +95,7 @@ class LogEntry(FileModel):
 
 
 class EstimatorEntry(FileModel):
-    """An estimator by its ``name``, with ``settings``; ``label``: what the results call it, by default its name."""
+    """An estimator by its ``name``, with ``settings``; ``label``: its name in the results, by default its name."""
 
     name: Name
     label: str = ""
@@ -103,13 +103,13 @@ class EstimatorEntry(FileModel):
 
     @property
     def shown(self) -> str:
-        """The label."""
+        """The label, or the name."""
         return self.label or self.name
 
 
 class Sweep(FileModel):
-    """Settings by dotted name, ``LABEL.KEY`` or ``simulation.KEY``, and the values that each takes. ``mode``: ``grid``, every
-    value with every other, or ``list``, the first with the first, the second with the second."""
+    """Settings by dotted name, ``LABEL.KEY`` or ``simulation.KEY``, and the values of each. ``mode``: ``grid``, all combinations,
+    or ``list``, the first with the first, the second with the second."""
 
     mode: Literal["grid", "list"] = "grid"
     over: Mapping[str, tuple[Scalar, ...]] = Field(default_factory=dict)
@@ -138,8 +138,8 @@ class Sweep(FileModel):
         return self
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
-        """What is set together of keys that begin with one of ``words``, by default of all, each once; one empty point if none
-        does."""
+        """The combinations of settings whose keys begin with one of ``words``, by default of all, without duplicates; one empty
+        combination if there are none."""
         columns = self._columns(words)
         combined = (
             self._rows(columns) if self.mode == "list" else itertools.product(*map(dict.fromkeys, columns.values()))
@@ -147,7 +147,7 @@ class Sweep(FileModel):
         return [dict(zip(columns, values, strict=True)) for values in combined]
 
     def count(self, *words: str) -> int:
-        """How many :meth:`points` there are, which are not made for that."""
+        """The number of :meth:`points`, without constructing them."""
         columns = self._columns(words)
         if self.mode == "list":
             return len(self._rows(columns))
@@ -161,14 +161,14 @@ class Sweep(FileModel):
 
 
 class ReportSettings(FileModel):
-    """``metrics``: the scores that the report shows; ``baseline``: the label that the others are compared with."""
+    """``metrics``: the scores in the report; ``baseline``: the label that the others are compared with."""
 
     metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = METRICS
     baseline: str | None = None
 
 
 class Limits(FileModel):
-    """Of one run: ``memory`` [10^6 bytes] that its process may hold, by default the machine's share of it; ``time`` [s]."""
+    """Limits of one run: ``memory`` [10^6 bytes] of its process, by default its share of the machine's; ``time`` [s]."""
 
     memory: Annotated[float, Field(gt=0.0)] | None = None
     time: Annotated[float, Field(gt=0.0)] = 3600.0
@@ -176,9 +176,9 @@ class Limits(FileModel):
 
 class Experiment(FileModel):
     """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
-    default those of each log's rig; ``prior``: where runs start; ``seeds``: of the estimators; ``max_gap`` [s]: how far apart
-    estimates may lie between which the score interpolates; ``tick_gap`` [s]: gaps between measurements that are longer than this
-    hold no estimates."""
+    default those of each log's rig; ``prior``: of the start; ``seeds``: of the estimators; ``max_gap`` [s]: the largest interval
+    between estimates that is interpolated for scoring; ``tick_gap`` [s]: there are no estimates inside longer gaps between
+    measurements."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
     out: PathName | None = None
@@ -201,7 +201,7 @@ class Experiment(FileModel):
     @field_validator("logs", "estimators", mode="before")
     @classmethod
     def _named(cls, value: Any, info: Any) -> Any:
-        """A name alone is an entry too."""
+        """Allow a name in place of an entry."""
         key = "log" if info.field_name == "logs" else "name"
         return [{key: one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
 
@@ -230,13 +230,13 @@ class Experiment(FileModel):
         return self
 
     def folder(self) -> Path:
-        """Where the results are."""
+        """The folder of the results."""
         return Path("out", self.name) if self.out is None else Path(self.out)
 
 
 def read_experiment(path: Path, changes: Sequence[tuple[str, Any]] = ()) -> Experiment:
-    """The experiment of a TOML file. ``changes``: dotted keys of the file with other values; ``LABEL.KEY`` is a setting of an
-    estimator, ``simulation.KEY`` one of all simulated logs. InputError names file, key and what is expected."""
+    """Read an experiment from a TOML file. ``changes``: dotted keys of the file with other values; ``LABEL.KEY`` is a setting of
+    an estimator, ``simulation.KEY`` one of all simulated logs. Raises InputError with file, key and what is expected."""
     content = read_toml(path)
     for key, value in changes:
         _change(content, key, value, path)
@@ -270,7 +270,7 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
-    """The entries of a list of the file, in place of names tables with the key ``named``."""
+    """The entries of a list of the file, with names replaced by tables with the key ``named``."""
     found = content.setdefault(key, [])
     if not isinstance(found, list):
         raise InputError(f"{source}: {key} is {quoted(found)}, expected a list")
@@ -292,5 +292,5 @@ def _set(table: dict[str, Any], key: str, value: Any, source: object) -> None:
 
 
 def canonical(settings: Mapping[str, Any]) -> str:
-    """Settings as JSON, the same for the same settings."""
+    """Settings as canonical JSON."""
     return json.dumps(settings, sort_keys=True)

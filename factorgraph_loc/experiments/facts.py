@@ -1,4 +1,4 @@
-"""What planning must know of logs and estimators, kept in a file: to look it up takes numerical libraries, or a log's reading."""
+"""Cached facts about logs and estimators for planning, as obtaining them requires numerical libraries or reading the log."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from factorgraph_loc.experiments.log_source import LogSource
 
 @dataclass(frozen=True)
 class LogFacts:
-    """The ``name`` of a log, its ``duration`` [s], and the ``sensors`` that a run of it can use."""
+    """The ``name`` of a log, its ``duration`` [s], and the ``sensors`` available to a run."""
 
     name: str
     duration: float
@@ -23,15 +23,15 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """The ``effective`` settings of an estimator as plain data, and whether it uses no randomness."""
+    """The ``effective`` settings of an estimator as plain data, and whether it is deterministic."""
 
     effective: Mapping[str, Any]
     deterministic: bool
 
 
 class _Kept(BaseModel):
-    """What was looked up with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings, and
-    ``priors`` that are some."""
+    """Facts obtained with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings, and
+    valid ``priors``."""
 
     version: str
     logs: dict[str, list[LogFacts]] = {}
@@ -40,7 +40,7 @@ class _Kept(BaseModel):
 
 
 class Facts:
-    """Facts by what they are about, kept in ``cache`` as long as code and libraries are the same."""
+    """Facts with a file ``cache``, valid for unchanged code and libraries."""
 
     def __init__(self, cache: Path) -> None:
         self._cache = cache
@@ -50,24 +50,24 @@ class Facts:
         self._new = False
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Of all logs that a source stands for; InputError as of the reader, or of the simulation's settings."""
+        """Facts of all logs of a source. Raises InputError as the reader or the simulation's settings do."""
         if digest not in self._known.logs:
             self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
         return self._known.logs[digest]
 
     def knows(self, digest: str) -> bool:
-        """Whether the logs of that digest were looked up already."""
+        """Whether the logs of that digest are cached."""
         return digest in self._known.logs
 
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-        """Of an estimator with these settings; InputError if there is none, or if they are none of it."""
+        """Facts of an estimator with these settings. Raises InputError for an unknown estimator or invalid settings."""
         key = f"{name} {canonical(settings)}"
         if key not in self._known.estimators:
             self._known.estimators[key], self._new = _of_estimator(name, settings), True
         return self._known.estimators[key]
 
     def check_prior(self, prior: str) -> None:
-        """InputError for a prior that is none."""
+        """Raise InputError for an invalid prior."""
         if prior not in self._known.priors:
             from factorgraph_loc.experiments.prior import check_prior  # noqa: PLC0415
 
@@ -76,7 +76,7 @@ class Facts:
             self._new = True
 
     def save(self) -> None:
-        """Keep what is new."""
+        """Save new facts."""
         if self._new:
             write_cache(self._cache, self._known)
             self._new = False

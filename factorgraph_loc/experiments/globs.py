@@ -1,4 +1,4 @@
-"""Paths that match a pattern, found without walking through a whole disk."""
+"""Paths that match a glob pattern, with a bound on the files visited."""
 
 import fnmatch
 import os
@@ -10,28 +10,26 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import DEEPEST
 from factorgraph_loc.text import quoted
 
-VISITED = 100_000  # files and folders that a pattern may make us look at
+VISITED = 100_000  # maximum number of files and folders visited for a pattern
 ANY_DEPTH = "**"
 _MAGIC = re.compile(r"[*?[]")
 
 
 def is_pattern(name: str) -> bool:
-    """Whether a name has wildcards."""
     return _MAGIC.search(name) is not None
 
 
 def matching(pattern: str, folder: Path, source: object) -> list[Path]:
-    """What matches ``pattern`` from ``folder`` on, sorted: ``*``, ``?`` and ``[...]`` within a name, ``**`` for any folders but
-    links. InputError for what is no pattern, or one that would look at more than :data:`VISITED` files and folders."""
+    """The sorted paths that match ``pattern`` relative to ``folder``: ``*``, ``?`` and ``[...]`` within a name, ``**`` for any
+    folders except links. Raises InputError for an invalid pattern, or one that visits more than :data:`VISITED` files and
+    folders."""
     path = Path(pattern)
     parts = path.parts[1:] if path.anchor else path.parts
     if len(parts) > DEEPEST:
         raise InputError(f"{source}: {quoted(pattern)} has {len(parts)} parts, expected at most {DEEPEST}")
     if wrong := [part for part in parts if ANY_DEPTH in part and part != ANY_DEPTH]:
         raise InputError(f"{source}: {quoted(pattern)} has {quoted(wrong[0])}, expected {ANY_DEPTH} to be a whole part")
-    walk = _Walk(
-        f"{source}: {quoted(pattern)} looks at more than {VISITED:,} files and folders, expected a narrower one"
-    )
+    walk = _Walk(f"{source}: {quoted(pattern)} visits more than {VISITED:,} files and folders, expected a narrower one")
     found = {Path(path.anchor) if path.anchor else folder}
     for part in parts:
         found = {one for base in found for one in walk.step(base, part)}
@@ -44,7 +42,7 @@ class _Walk:
         self._visited = 0
 
     def step(self, base: Path, part: str) -> Iterator[Path]:
-        """What one part of a pattern leads to."""
+        """The paths that match one part of a pattern."""
         if part == ANY_DEPTH:
             waiting = [base]
             while waiting:
@@ -59,7 +57,7 @@ class _Walk:
             yield base / part
 
     def _entries(self, folder: Path) -> list[os.DirEntry[str]]:
-        """What is in a folder; nothing in one that is none, or may not be read."""
+        """The entries of a folder; none if it is not a readable folder."""
         found = []
         try:
             with os.scandir(folder) as entries:

@@ -1,4 +1,6 @@
-"""Maps from some images of a log, and where others were taken: errors against the log's reference, for several features."""
+"""Evaluation of image localization: a map from some images of a log, and the errors of others against the
+reference, by feature.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import replacing, write_text
-from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
 from factorgraph_loc.mapping.image_localization import ImageLocalizer, Located
 from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 FILES = ("table.md", "images.csv", "images.png")
 NEAR, TURNED = 0.05, np.radians(5.0)  # m, rad: an image with smaller errors is located
-# rad, m: of the reference. Nearly none, as errors are told against it: the map keeps to its frame with all bends that this has
+# rad, m: of the reference. Nearly exact, as errors are relative to it: the map follows its frame including distortions
 TURN_SIGMA, SHIFT_SIGMA = 0.0002, 0.0004
 METHODS = ("image by image", "graph")
 HEADER = ("feature", "images", "method", "located", "position [m]", "angle [degrees]", "p90 [m]", "p90 [degrees]")
@@ -39,8 +41,8 @@ HEADER = ("feature", "images", "method", "located", "position [m]", "angle [degr
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Images ``frames`` (F,) of a query by their numbers in the log: errors of the camera's centre (F,) [m] and of its rotation
-    (F,) [rad], infinite where it was not located; ``cameras``: where they were found, NaN likewise."""
+    """Errors of a query's images ``frames`` (F,), numbered as in the log: of the camera's centre (F,) [m] and of its rotation
+    (F,) [rad], infinite if not located; ``cameras``: estimated poses, NaN likewise."""
 
     feature: str
     query: str
@@ -52,7 +54,7 @@ class Outcome:
 
     @property
     def success(self) -> float:
-        """The share of images whose errors are below :data:`NEAR` and :data:`TURNED`."""
+        """The fraction of images with errors below :data:`NEAR` and :data:`TURNED`."""
         return float(np.mean((self.position < NEAR) & (self.angle < TURNED)))
 
     def cells(self) -> list[str]:
@@ -69,7 +71,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class ImageResults:
-    """All ``outcomes``, the ``maps`` by feature, and where the reference has the cameras of all images (N, 3)."""
+    """All ``outcomes``, the ``maps`` by feature, and the reference poses of the cameras of all images (N, 3)."""
 
     outcomes: list[Outcome]
     maps: Mapping[str, PointReport]
@@ -85,10 +87,10 @@ def evaluate_images(
     queries: Mapping[str, Sequence[int]],
     progress: Callable[[float], None] = lambda _: None,
 ) -> ImageResults:
-    """Map the images ``mapped`` of a log with their poses, for each of ``features`` (``count`` an image), and locate those of each
-    of ``queries``, image by image and all of one query in a graph. InputError where the log has no such images or poses.
+    """Map the images ``mapped`` of a log with their poses, for each of ``features`` (``count`` per image), and locate those of
+    each of ``queries``, image by image and all of one query in a graph.
 
-    Poses of queries are used for their errors alone.
+    Poses of queries are used for their errors only. Raises InputError if the log has no such images or poses.
     """
     outcomes: list[Outcome] = []
     maps: dict[str, PointReport] = {}
@@ -130,33 +132,28 @@ def evaluate_images(
 
 
 def check_free(folder: Path, *, overwrite: bool) -> None:
-    """InputError if a result is in ``folder`` already."""
-    sweep(folder)
-    there = [name for name in FILES if (folder / name).exists()]
-    if there and not overwrite:
-        raise InputError(f"{folder / there[0]}: exists already; choose another folder or give --overwrite")
+    """Raise InputError if ``folder`` is not a folder, or contains such results already."""
+    require_free(folder, FILES, overwrite=overwrite)
 
 
 def table(results: ImageResults) -> tuple[tuple[str, ...], list[list[str]]]:
-    """Head and rows, one an outcome."""
+    """Header and rows, one per outcome."""
     return HEADER, [outcome.cells() for outcome in results.outcomes]
 
 
 def write_results(log: str, results: ImageResults, folder: Path) -> None:
-    """Write :data:`FILES`: the table, the errors of each image, the trajectories and errors as a picture."""
-    try:
+    """Write :data:`FILES`: the table, the errors of each image, and a plot of trajectories and errors."""
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "table.md", markdown(*table(results)) + "\n")
         with replacing(folder / "images.csv") as temporary:
             _rows(results).write_csv(temporary)
         with replacing(folder / "images.png") as temporary:
             save(picture(log, results), temporary)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
 def picture(log: str, results: ImageResults) -> Figure:
-    """From above where the graph finds the cameras, and the errors of all images, one column a query."""
+    """Plot the camera positions from the graph, and the errors of all images, one column per query."""
     queries = list(dict.fromkeys(outcome.query for outcome in results.outcomes))
     features = list(results.maps)
     out, axes = grid(3, len(queries), 16.0, f"{log}: images located in a map of points")
@@ -191,7 +188,7 @@ def picture(log: str, results: ImageResults) -> Figure:
 
 
 def _check(log: Log, seen: Log, posed: PosedFrames, numbers: Mapping[str, Sequence[int]]) -> None:
-    """InputError for numbers that no image has, or images without a pose."""
+    """Raise InputError for image numbers out of range, or images without a pose."""
     count = len(frames_of(seen)[0])
     if len(posed.frames) != count:
         raise InputError(f"{log.name}: {count - len(posed.frames)} of {count} images have no pose")
@@ -219,7 +216,7 @@ def _outcome(
 
 
 def _rows(results: ImageResults) -> pl.DataFrame:
-    """One row an image and outcome."""
+    """One row per image and outcome."""
     return pl.concat(
         pl.DataFrame(
             {

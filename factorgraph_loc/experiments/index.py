@@ -1,4 +1,4 @@
-"""All results of an experiment in one table, a row a run."""
+"""The table of all results of an experiment, with a row per run."""
 
 import io
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "rea
 
 
 def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
-    """The rows of those runs whose results are stored; see :func:`load_results`. DamagedError for a damaged one."""
+    """The rows of those runs whose results are stored; see :func:`load_results`. Raises DamagedError for a damaged one."""
     rows = [_row(run, store.row(run.key)) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
@@ -32,8 +32,8 @@ def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
 
 
 def write_index(table: pl.DataFrame, folder: Path) -> None:
-    """Write the table into ``folder``, at once or not at all; StoreError where it cannot be written."""
-    content = io.BytesIO()  # polars itself says of a full disk that the file is out of specification
+    """Write the table into ``folder``, atomically. Raises StoreError if it cannot be written."""
+    content = io.BytesIO()  # polars reports a full disk as a file out of specification
     table.write_parquet(content)
     try:
         with replacing(folder / INDEX) as temporary:
@@ -43,13 +43,13 @@ def write_index(table: pl.DataFrame, folder: Path) -> None:
 
 
 def load_results(path: str | Path) -> pl.DataFrame:
-    """The results of an experiment in the folder ``path``, a row a run.
+    """Load the results of an experiment from the folder ``path``, with a row per run.
 
-    Columns: ``label``, ``log``, ``estimator``, ``sensors`` (with commas; null for those of the rig), ``prior``, ``seed``,
-    ``sweep.KEY`` of each swept setting (null where it does not concern the run), ``status`` (ok, failed), ``kind`` (error, timeout,
-    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, ``warnings`` (a line
-    each), and the scores of :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). InputError if there are no
-    results.
+    Columns: ``label``, ``log``, ``estimator``, ``sensors`` (comma-separated; null for those of the rig), ``prior``, ``seed``,
+    ``sweep.KEY`` of each swept setting (null if it does not apply to the run), ``status`` (ok, failed), ``kind`` (error, timeout,
+    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, ``warnings`` (one
+    per line), and the scores of :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). Raises InputError if
+    there are no results.
     """
     file = Path(path) / INDEX if kind(Path(path)) == "a folder" else Path(path)
     try:

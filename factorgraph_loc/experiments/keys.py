@@ -1,4 +1,4 @@
-"""What a run's result depends on, as one key: the log, the configuration, the rule of scoring, the code, the libraries."""
+"""Keys of runs: digests of all that a result depends on (log, configuration, scoring rule, code, libraries)."""
 
 import hashlib
 import importlib.metadata
@@ -21,7 +21,7 @@ from factorgraph_loc.model.scoring import RULE
 from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
-# parts of the package that no run goes through: a change to the report must not undo a night's work
+# parts of the package that runs do not use: a change of the report must not invalidate stored runs
 OUTSIDE = (
     "api.py",
     "cli",
@@ -40,17 +40,17 @@ OUTSIDE = (
     "experiments/reporting.py",
 )
 Kept = TypeVar("Kept", bound=BaseModel)
-_UNSETTLED = 2.0  # s: a file that young may change again within the same stamp
+_UNSETTLED = 2.0  # s: a younger file may change again without a new modification time
 
 
 def digest_of(content: Any) -> str:
-    """The sha256 of plain data, as hexadecimal digits."""
+    """The sha256 of plain data, in hexadecimal digits."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @lru_cache
 def code_version() -> str:
-    """A digest of the source files that a run can go through."""
+    """A digest of the source files that runs use."""
     package = Path(__file__).parents[1]
     total = hashlib.sha256()
     for root in (package, package.parent / "factors"):
@@ -63,12 +63,12 @@ def code_version() -> str:
 
 @lru_cache
 def library_versions() -> dict[str, str]:
-    """The versions of what computes, by name."""
+    """The versions of numerical libraries, by name."""
     return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
 
 
 def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
-    """The key of a run: of a log's digest, and its effective configuration as plain data."""
+    """The key of a run, from a log's digest and its effective configuration as plain data."""
     return digest_of(
         {
             "log": log_digest,
@@ -81,7 +81,7 @@ def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
 
 
 def read_cache(file: Path, kind: type[Kept]) -> Kept | None:
-    """What was kept; None if it is not there or damaged, for it can be made again."""
+    """Read a cache; None if it is missing or damaged."""
     try:
         return kind.model_validate_json(bounded.read_bytes(file, bounded.DATA))
     except (InputError, ValidationError):
@@ -89,19 +89,21 @@ def read_cache(file: Path, kind: type[Kept]) -> Kept | None:
 
 
 def write_cache(file: Path, content: BaseModel) -> None:
-    """Keep it; where it cannot be written, it is made again the next time."""
+    """Write a cache; errors are ignored."""
     with suppress(OSError):
         write_text(file, json.dumps(content.model_dump()))
 
 
 class _Digests(BaseModel):
-    """By path: the size, the time of change and the sha256."""
+    """By path: size, modification time and sha256."""
 
     files: dict[str, tuple[int, int, str]] = {}
 
 
 class FileDigests:
-    """The sha256 of files; with ``cache``, a JSON file, by path, size and time of change, so that a file is read once."""
+    """The sha256 of files; with ``cache``, a JSON file, keyed by path, size and modification time, so that a file
+    is read once.
+    """
 
     def __init__(self, cache: Path | None) -> None:
         self._cache = cache
@@ -109,16 +111,16 @@ class FileDigests:
         self._known = ((cache and read_cache(cache, _Digests)) or _Digests()).files
 
     def of_source(self, source: LogSource) -> str:
-        """The digest of what a log is made from; InputError if a file is not there."""
+        """The digest of a log's source. Raises InputError if a file is missing."""
         try:
             found = source.files()
-        except OSError as error:  # a folder that may not be looked into
+        except OSError as error:  # a folder that must not be read
             raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
         files = {name: self.of_file(path) for name, path in found.items()}
         return digest_of({"identity": source.identity(), "files": files})
 
     def of_file(self, path: Path) -> str:
-        """The sha256 of a file; InputError if it cannot be read."""
+        """The sha256 of a file. Raises InputError if it cannot be read."""
         try:
             stat = path.stat()
             known = self._known.get(str(path))
@@ -134,12 +136,12 @@ class FileDigests:
         return found
 
     def save(self) -> None:
-        """Keep what is new."""
+        """Save new digests."""
         if self._new and self._cache is not None:
             write_cache(self._cache, _Digests(files=self._known))
             self._new = False
 
 
 def source_digest(source: LogSource) -> str:
-    """The digest of what a log is made from now, every file read; InputError if one is not there."""
+    """The digest of a log's source, with every file read. Raises InputError if one is missing."""
     return FileDigests(None).of_source(source)

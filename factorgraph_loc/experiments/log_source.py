@@ -1,6 +1,6 @@
-"""Where the logs of an experiment come from, as plain data that other processes can load them from.
+"""Sources of an experiment's logs, as plain data from which other processes can load them.
 
-Nothing numerical is imported until a log is loaded: an experiment whose results are there already must not wait for that.
+Nothing numerical is imported until a log is loaded, so that an experiment with stored results starts quickly.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files th
 
 @dataclass(frozen=True)
 class RecordedSource:
-    """The log at place ``number`` of those that ``log`` stands for, as :func:`~factorgraph_loc.io.readers.load` takes it.
+    """Log ``number`` of those that ``log`` stands for, in the sense of :func:`~factorgraph_loc.io.readers.load`.
 
-    ``options``: of the reader, as JSON. ``rig``, ``world``: files in place of the log's own. ``data_root``: where the files of
-    manifests are, by default the environment's FGLOC_DATA.
+    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: folder of the data of
+    manifests, by default from the environment's FGLOC_DATA.
     """
 
     log: str
@@ -44,7 +44,7 @@ class RecordedSource:
     data_root: str | None = None
 
     def load_all(self) -> list[Log]:
-        """All logs that ``log`` stands for; InputError as of the reader."""
+        """All logs that ``log`` stands for. Raises InputError as the reader does."""
         from factorgraph_loc.io.readers import load  # noqa: PLC0415
 
         rig, world, root = (None if name is None else Path(name) for name in (self.rig, self.world, self.data_root))
@@ -56,13 +56,13 @@ class RecordedSource:
         return self.load_all()[self.number]
 
     def files(self) -> dict[str, Path]:
-        """The files that the log is read from, by names that do not depend on where they lie."""
+        """The files that the log is read from, by names independent of their location."""
         given = {"rig": self.rig, "world": self.world}
         found = [(f"{what}/{name}", file) for what, path in given.items() for name, file in _of_toml(path)]
         return dict(found) | dict(self._data())
 
     def identity(self) -> dict[str, Any]:
-        """What, beside the bytes of its files, makes the log what it is."""
+        """What determines the log besides the content of its files."""
         path = Path(self.log)
         name = path.stem if path.is_file() else path.name
         return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
@@ -82,11 +82,11 @@ class RecordedSource:
             return
         yield from _of_toml(str(path))
         content = read_toml(path)
-        if content.get("path") is None:  # the data come with a library, whose version is in the key
+        if content.get("path") is None:  # the data come with a library, whose version is part of the key
             return
         from factorgraph_loc.io.readers.manifests import find_data_root  # noqa: PLC0415
 
-        beside = inside(path.parent, str(content["path"]), path).exists()  # one's own manifest, beside its log
+        beside = inside(path.parent, str(content["path"]), path).exists()  # a user's manifest next to its log
         given = None if self.data_root is None else Path(self.data_root)
         root = path.parent if beside else find_data_root(given, path)
         summed = content.get("checksums")
@@ -105,14 +105,14 @@ class SimulatedSource:
     seed: int = 0
 
     def load_all(self) -> list[Log]:
-        """The log, simulated."""
+        """Simulate the log."""
         from factorgraph_loc.simulation import named_settings, simulate  # noqa: PLC0415
 
         return [simulate(named_settings(self.preset, json.loads(self.settings)), self.seed)]
 
     def size(self) -> tuple[float, float]:
-        """How long the drive is to be [s], and how often it looks for something, from the settings alone; InputError if they are
-        none."""
+        """The duration of the drive [s] and the number of simulated observations, from the settings only. Raises InputError for
+        invalid settings."""
         from factorgraph_loc.simulation import named_settings  # noqa: PLC0415
 
         settings = named_settings(self.preset, json.loads(self.settings))
@@ -123,11 +123,11 @@ class SimulatedSource:
         return self.load_all()[0]
 
     def files(self) -> dict[str, Path]:
-        """The file of the settings, if they are in one, and those that it names."""
+        """The file of the settings, if any, and those that it names."""
         return dict(_of_toml(self.preset)) if self.preset.endswith(".toml") else {}
 
     def identity(self) -> dict[str, Any]:
-        """What, beside the bytes of its files, makes the log what it is."""
+        """What determines the log besides the content of its files."""
         return {"simulated": Path(self.preset).name, "settings": json.loads(self.settings), "seed": self.seed}
 
 
@@ -135,15 +135,15 @@ LogSource = RecordedSource | SimulatedSource
 
 
 def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSource]:
-    """The sources that ``name`` stands for: a known name, a path from ``folder`` on, or a glob over either.
+    """The sources that ``name`` stands for: a known name, a path relative to ``folder``, or a glob over either.
 
-    InputError if there is none. ``others``: fields of the sources.
+    ``others``: fields of the sources. Raises InputError if there is none.
     """
     known = manifests()
     if name in known:
         return [RecordedSource(name, **others)]
     if not is_pattern(name):
-        # what is nothing at all is for the reader to tell, which knows the nearest name
+        # for anything else the reader raises the error, with the nearest name
         is_path = kind(folder / name) or kind(Path(name))
         return [RecordedSource(str(folder / name) if is_path else name, **others)]
     found = [one for one in known if fnmatchcase(one, name)]
@@ -170,7 +170,7 @@ def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
-    """A file of settings, and the files beside it that it names, and that those name."""
+    """A file of settings, and recursively the files beside it that it names."""
     if path is None:
         return
     waiting, met = [Path(path)], set()

@@ -1,4 +1,4 @@
-"""A map from a log: of its landmarks, of the RFID tags that it read, or of the points in its images."""
+"""Maps from a log: of its landmarks, of the RFID tags that it read, or of the points in its images."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
 from factorgraph_loc.mapping.camera_poses import posed_frames
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 SUFFIX = ".world.toml"
 MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
-START_SIGMA = 1e-3  # m and rad; without a map the start is what defines the frame
+START_SIGMA = 1e-3  # m and rad; without a map the start defines the frame
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"
@@ -51,7 +52,7 @@ Stages = Callable[[str], AbstractContextManager[Callable[[float, float], None]]]
 
 @contextmanager
 def silent(_: str) -> Iterator[Callable[[float, float], None]]:
-    """Tells nobody how far a stage is."""
+    """A stage without progress output."""
     yield lambda _done, _total: None
 
 
@@ -59,11 +60,11 @@ def silent(_: str) -> Iterator[Callable[[float, float], None]]:
 class MapOptions:
     """How a map is made.
 
-    ``of``: landmarks, tags or points; None: points where the log has images, landmarks where it has sightings of them, else tags.
-    ``estimator`` and ``settings``: for landmarks. ``extend``: the log's map stays, what it lacks is added; not for points.
-    ``poses``: of the robot, for tags and points: reference, or odometry, which estimates them too; None: the reference if there is
-    one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: nothing is mapped, the
-    log's map is written without the tags that are believed dead. ``prior``: see
+    ``of``: landmarks, tags or points; None: points if the log has images, landmarks if it has sightings of them, else tags.
+    ``estimator`` and ``settings``: for landmarks. ``extend``: keep the log's map, and add what it lacks; not for points.
+    ``poses``: of the robot, for tags and points: reference, or odometry, with estimation of the poses; None: the reference if
+    there is one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's
+    map without the tags that are believed dead, and map nothing. ``prior``: see
     :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
     """
 
@@ -79,7 +80,7 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class DroppedTags:
-    """An edit of a map: ``dropped`` tags with the probability that they are dead, and how many are ``kept``."""
+    """An edited map: ``dropped`` tags with their probability of being dead, and the number ``kept``."""
 
     dropped: Mapping[str, float]
     kept: int
@@ -87,9 +88,9 @@ class DroppedTags:
 
 @dataclass(frozen=True, eq=False)
 class MadeMap:
-    """A map: the ``world`` to be written; ``frame``: its frame in words; ``details``: what was found, by what is in it.
+    """A map: the ``world`` to be written; ``frame``: its frame in words; ``details``: results, by kind of map.
 
-    ``warnings``: of the log and the run. ``draw`` makes a picture of it.
+    ``warnings``: of the log and the run. ``draw`` makes a plot of it.
     """
 
     world: World
@@ -99,25 +100,22 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map, and its picture beside it. InputError as of :func:`picture_beside`, or if they cannot be written."""
+        """Write the map, and its plot beside it. Raises InputError as :func:`picture_beside`, or if they cannot be written."""
         picture = picture_beside(out, overwrite=overwrite)
-        try:
-            with replacing(picture) as temporary:  # both are there or none
-                save(self.draw(), temporary)
-                write_world(self.world, out)
-        except OSError as error:
-            raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+        with writing(out), replacing(picture) as temporary:  # write both or none
+            save(self.draw(), temporary)
+            write_world(self.world, out)
 
 
 def picture_beside(out: Path, *, overwrite: bool) -> Path:
-    """The path of the picture beside a map; InputError if the map's name is not one, or something is there already."""
+    """The path of the plot beside a map. Raises InputError for a wrong name of the map, or if a file exists already."""
     return beside(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
 def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silent) -> MadeMap:
-    """Make a map of what a log saw. A map that it has is compared, or extended.
+    """Make a map from a log. An existing map of the log is compared, or extended.
 
-    ``stages`` is told the name of each stage, and is then given how much of it is done. Raises InputError for options that do not
+    ``stages`` is called with the name of each stage, and yields its progress function. Raises InputError for options that do not
     fit together or the log, RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
@@ -130,7 +128,7 @@ def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silen
 
 
 def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
-    """What is mapped; InputError for options of another kind of map."""
+    """What is mapped. Raises InputError for options of another kind of map."""
     of_landmarks = bool(options.settings) or options.estimator != MAPPERS[0]
     of_tags = options.tag_height is not None
     of_others = of_landmarks or of_tags or options.extend
@@ -151,7 +149,7 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
 
 
 def _mappable(log: Log) -> dict[str, str]:
-    """The layers of a world that can be made of a log, and the sensors that tell of them."""
+    """The layers of a world that can be mapped from a log, and the sensors that observe them."""
     return {layer: name for name, function in functions("mappable") if (layer := function(log)) is not None}
 
 
@@ -204,7 +202,7 @@ def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
 
 
 def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
-    """The map as it is, but for tags that were not read where the smoother says that they should have been."""
+    """The map without tags that were not read where the smoother expects them to be."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
         raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
     if "tags" not in _mappable(log) or not log.world.tags:
@@ -241,14 +239,14 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
 
 
 def _along_reference(options: MapOptions, *, there: bool) -> bool:
-    """Whether the robot's poses are those of the reference; ``there``: there is one that could be used."""
+    """Whether the robot's poses are those of the reference; ``there``: whether a usable one exists."""
     if options.poses not in (None, "reference", "odometry"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")
     return there if options.poses is None else options.poses == "reference"
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
-    """The log with a start that is certain, and where that lies, in words."""
+    """The log with an exact start, and its position in words."""
     start, source = resolve_prior(log, prior)
     if start is None:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
@@ -258,7 +256,7 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
 
 
 def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
-    """Where the robot starts, and the frame in words. Without a map in use the start is certain, as it defines the frame."""
+    """The start of the robot, and the frame in words. If no map is used the start is exact, as it defines the frame."""
     prior, source = resolve_prior(log, options.prior)
     if prior is None or (options.extend and not prior.has_heading):
         if options.extend:
@@ -270,15 +268,15 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
 
 def _in_words(start: PosePrior, source: str) -> str:
     x, y, heading = start.pose
-    chosen = "" if start.has_heading else ", which tells no heading"
+    chosen = "" if start.has_heading else ", which has no heading"
     source = SOURCES.get(source, "--prior")
     return f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {source}{chosen}"
 
 
 def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tuple[str, ...]]:
-    """The log with the smoother's final trajectory, from all sensors but the camera, in place of its reference; and warnings.
+    """The log with the smoother's final trajectory, from all sensors but the camera, as its reference; and warnings.
 
-    Its covariances say how well each pose is known, so that images of a place that is visited again still draw it together.
+    It has covariances, so that images of revisited places can still correct it.
     """
     eyes = {channel.name for channel in sensors()[_mappable(log)["points"]].channels}
     others = tuple(name for name in log.rig.sensors if name in log.streams and name not in eyes)

@@ -1,4 +1,4 @@
-"""The files of one run: trajectories, estimates, what was learnt, events, scores, and the configuration."""
+"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration."""
 
 import io
 import json
@@ -16,6 +16,7 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.files.models import file_name, write_text, write_toml
+from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import sweep, temporary_folder
 from factorgraph_loc.io.results.layout import COVARIANCES, FILES
 from factorgraph_loc.model.learnt import Learnt
@@ -29,26 +30,24 @@ from factors.se2 import Array
 def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """Score a run, write its files into the folder ``out``, and return the scores.
 
-    ``estimates.parquet`` has one row a tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m], ``heading``
-    [rad], the covariances in the world's frame, ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at that
-    stamp of the reference to which the tick is the nearest (null where there is none: a reference may have fewer stamps),
-    ``update_ms`` (causal: the slowest update since the tick before, null if there was none) and ``status`` (of the causal
-    estimate at that time). ``causal.tum`` holds the estimates from the first localized one on. ``learnt.json``: ``constants`` by
-    name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy) [m^2] in the
-    world's frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and what happened.
+    ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
+    ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
+    the stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update
+    since the previous tick, null if there was none) and ``status`` (of the causal estimate). ``causal.tum`` contains the
+    estimates from the first localized one on. ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``, ``landmarks``
+    by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute),
+    ``t`` [s from the log's start] and the event.
 
-    Raises InputError if ``out`` holds results and ``overwrite`` is off. Everything is written beside ``out`` first; files in
-    ``out`` that are not ours are left alone.
+    Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
+    contains results and ``overwrite`` is off.
     """
     check_free(out, overwrite=overwrite)
     scores = score(result, log)
     with ExitStack() as stack:
-        try:
+        with writing(out):
             out.parent.mkdir(parents=True, exist_ok=True)
-            content = stack.enter_context(temporary_folder(out)) / "run"  # its mode is that of any new folder
+            content = stack.enter_context(temporary_folder(out)) / "run"  # with the permissions of any new folder
             content.mkdir()
-        except OSError as error:
-            raise InputError(f"{out}: cannot be written: {error.strerror}") from error
         write_files(result, log, scores, content)
         if out.exists():
             remove_run(out)
@@ -64,7 +63,7 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     write_tum(result.final, folder / "final.tum", log.t0_ns)
     write_tum(causal, folder / "causal.tum", log.t0_ns)
-    table = io.BytesIO()  # polars itself says of a full disk that the file is out of specification
+    table = io.BytesIO()  # polars reports a full disk as a file out of specification
     estimates(result, log).write_parquet(table)
     (folder / "estimates.parquet").write_bytes(table.getvalue())
     write_toml(folder / "config.toml", result.config)
@@ -74,15 +73,15 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
 
 
 def write_plots(result: RunResult, log: Log, out: Path) -> None:
-    """Write the plots of a run into ``out/plots``, in place of those of an earlier one."""
+    """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
     folder = out / "plots"
     remove_plots(folder)
     plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
 
 
 def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
-    """The path of what is written beside ``out``, whose name ends in ``suffix``: the same name with another ``ending``. InputError
-    if it does not, if there is no folder for it, or if either is there already."""
+    """The path with another ``ending`` beside ``out``, whose name ends in ``suffix``. Raises InputError if it does not, if its
+    folder is missing, or if either file exists already."""
     name = out.name.removesuffix(suffix)
     if name in ("", out.name):
         raise InputError(f"--out is {quoted(str(out))}, expected a name that ends in {suffix}")
@@ -97,19 +96,12 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder, or holds the results of a run that may not be replaced. What earlier attempts to write
-    there have left behind is removed."""
-    for folder in (out.parent, out, out / "plots"):
-        sweep(folder)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder for the results")
-    found = [name for name in FILES if (out / name).exists()]
-    if found and not overwrite:
-        raise InputError(f"{out}: holds results already ({found[0]}); choose another folder, or --overwrite")
+    """Raise InputError if ``out`` is not a folder, or contains the results of a run that must not be replaced."""
+    require_free(out, FILES, overwrite=overwrite, folders=(out.parent, out / "plots"))
 
 
 def remove_run(out: Path) -> None:
-    """Remove the files of an earlier run, the mark of completeness first, and nothing else."""
+    """Remove the files of a previous run, the mark of completeness first, and nothing else."""
     for name in reversed(FILES):
         (out / name).unlink(missing_ok=True)
 
@@ -190,7 +182,7 @@ def _json(content: Mapping[str, Any]) -> str:
 
 
 def _plain(content: Any) -> Any:
-    """JSON has no NaN and no infinity: null."""
+    """Replace NaN and infinity, which JSON lacks, by null."""
     if isinstance(content, Mapping):
         return {key: _plain(value) for key, value in content.items()}
     if isinstance(content, list):

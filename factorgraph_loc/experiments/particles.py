@@ -1,4 +1,4 @@
-"""The particles of a run. They are too many to be kept with its results, so the run is made again, as its configuration says."""
+"""The particles of a stored run, which are not stored with it, by repeating the run from its configuration."""
 
 from collections.abc import Callable
 
@@ -15,18 +15,18 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 OF_PARTICLES = ("particle_filter", "switching")
-SHOWN = 500  # particles at a time
+SHOWN = 500  # maximum number of particles per time
 INTERVAL = 0.5  # s between the times
 
 
 def particles_of(run: StoredRun, log: Log, progress: Callable[[float], None] | None = None) -> Particles | None:
-    """The particles of a run of ``log``; None of an estimator that has none. InputError if it cannot be made again."""
+    """The particles of a run of ``log``; None if the estimator has none. Raises InputError if the run cannot be repeated."""
     if run.folder.estimator not in OF_PARTICLES:
         return None
     kept = run.folder.config
     if kept.sensors is None or kept.prior is None:
         raise InputError(
-            f"{run.folder.path}: config.toml has no sensors or no prior, which it takes to make the run again"
+            f"{run.folder.path}: config.toml has no sensors or no prior, which are needed to repeat the run"
         )
     config = RunConfig(run.folder.estimator, kept.settings, kept.sensors, kept.prior, kept.seed)
     stamps: list[float] = []
@@ -47,7 +47,7 @@ def particles_of(run: StoredRun, log: Log, progress: Callable[[float], None] | N
 
 
 def _drawn(weights: Array) -> Array:
-    """Indices (K,) of evenly spaced draws by ``weights`` (N,), K at most :data:`SHOWN`."""
+    """Indices (K,) of a systematic sample with ``weights`` (N,), K at most :data:`SHOWN`."""
     count = min(SHOWN, len(weights))
     shares = np.cumsum(weights / np.sum(weights))
     return np.searchsorted(shares, (np.arange(count) + 0.5) / count).clip(max=len(weights) - 1)

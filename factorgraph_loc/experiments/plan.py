@@ -1,4 +1,4 @@
-"""The runs of an experiment, each with its key, before any of them is made."""
+"""Planning of an experiment: its runs with their keys, before any of them is made."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.run import RunConfig
 
 MOST_RUNS = 100_000
-# what may be to simulate before the first run, each of which takes about a quarter of an hour
-MOST_SECONDS = 2_000_000  # of driving
-MOST_LOOKS = 2_000_000_000  # for tags, landmarks and points, one by one
+# limits of what is simulated before the first run, each about a quarter of an hour of computing
+MOST_SECONDS = 2_000_000  # of simulated driving
+MOST_LOOKS = 2_000_000_000  # simulated observations of tags, landmarks and points
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class PlannedRun:
     """One run, as plain data that can be sent to other processes.
 
     ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``tick_gap`` [s]: of the estimates; ``sweep``: what was
-    set for this run, by dotted name. ``key``: of its results.
+    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``tick_gap`` [s]: of the estimates; ``sweep``: swept
+    settings by dotted name. ``key``: of its results.
     """
 
     source: LogSource
@@ -61,13 +61,13 @@ class PlannedRun:
 
     @property
     def shown(self) -> str:
-        """What tells it from the others, in words."""
+        """A description that distinguishes it from the other runs."""
         swept = "".join(f", {key} {value}" for key, value in self.sweep.items())
         return f"{self.log}, {self.label}{swept}, seed {self.seed}"
 
     @property
     def config(self) -> RunConfig:
-        """What is run on the log."""
+        """The configuration of the run."""
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
 
         return RunConfig(
@@ -85,18 +85,18 @@ class _PlannedLog:
 
 
 class TooManyRunsError(InputError):
-    """An experiment would have more runs than are to be planned."""
+    """An experiment would have more runs than allowed."""
 
 
 def plan(
     experiment: Experiment, folder: Path, cache: Path, data_root: str | None = None, *, most: int = MOST_RUNS
 ) -> list[PlannedRun]:
-    """All runs of an experiment whose paths start from ``folder``; what had to be looked up is kept below ``cache``.
+    """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``.
 
-    An estimator is not run again for values of a sweep that do not concern it, and one without randomness only with the first
-    seed. InputError, before anything runs, for a log that cannot be read, two logs of one name, settings that are none, a prior
-    that is none, or a sensor that no log has; and before any log is read, TooManyRunsError for more than ``most`` runs, InputError
-    for logs to simulate that are longer than :data:`MOST_SECONDS` together, or look more often than :data:`MOST_LOOKS`.
+    Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only. Raises
+    InputError, before anything runs, for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no
+    log has; and before any log is read, TooManyRunsError for more than ``most`` runs, InputError for simulated logs that are
+    longer than :data:`MOST_SECONDS` together, or have more observations than :data:`MOST_LOOKS`.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
     sweep = experiment.sweep
@@ -110,11 +110,11 @@ def plan(
     _check_count(_count(experiment, sum(map(len, recorded.values())), facts), most)
     for entry in experiment.estimators:
         for swept in sweep.points(entry.shown, entry.name):
-            facts.estimator(entry.name, _settings(entry, swept))  # a wrong setting is told before logs are read
+            facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
     _check_simulated(experiment, folder, digests, facts)
     try:
         runs = _all_runs(experiment, folder, recorded, digests, facts, most)
-    finally:  # what an interrupted plan has looked up stays known
+    finally:  # keep what was looked up, even if interrupted
         digests.save()
         facts.save()
     return runs
@@ -143,7 +143,9 @@ def _all_runs(
             )
         ]
         _check(logs, experiment.sensors)
-        for log in logs if number == 0 else filter(_is_simulated, logs):  # points do not concern recorded logs
+        for log in (
+            logs if number == 0 else filter(_is_simulated, logs)
+        ):  # sweeps of the simulation do not apply to recorded logs
             for entry in experiment.estimators:
                 concerns = of_simulated[entry.shown][simulated] if _is_simulated(log) else of_others[entry.shown]
                 for swept in concerns:
@@ -154,7 +156,7 @@ def _all_runs(
 
 
 def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
-    """The number of runs on so many recorded sources, each of which is a log at least, and on the simulated logs."""
+    """The number of runs on ``recorded`` sources, each with at least one log, and on the simulated logs."""
     simulated = sum(len(entry.seeds) for entry in experiment.logs if entry.simulate is not None)
     total = 0
     for entry in experiment.estimators:
@@ -172,7 +174,7 @@ def _check_count(count: int, most: int) -> None:
 
 
 def _check_simulated(experiment: Experiment, folder: Path, digests: FileDigests, facts: Facts) -> None:
-    """InputError if more would have to be simulated than may be."""
+    """Raise InputError if the simulations exceed the limits."""
     seconds, looks = 0.0, 0.0
     for point in experiment.sweep.points(SIMULATION):
         for entry in experiment.logs:
@@ -182,13 +184,13 @@ def _check_simulated(experiment: Experiment, folder: Path, digests: FileDigests,
                 size = sources[0].size() if new else (0.0, 0.0)
                 seconds, looks = seconds + new * size[0], looks + new * size[1]
                 if seconds > MOST_SECONDS or looks > MOST_LOOKS:
-                    what = f"{seconds:,.0f} s and {looks:,.0f} looks for tags, landmarks and points"
-                    expected = f"{MOST_SECONDS:,} s and {MOST_LOOKS:,} looks"
+                    what = f"{seconds:,.0f} s and {looks:,.0f} observations of tags, landmarks and points"
+                    expected = f"{MOST_SECONDS:,} s and {MOST_LOOKS:,} observations"
                     raise InputError(f"has to simulate drives of {what} or more, expected at most {expected}")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """The points of a sweep that concern an estimator or simulated logs, by the values of the latter."""
+    """The points of a sweep that apply to an estimator or to simulated logs, by the values of the latter."""
     found: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         found.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
@@ -276,7 +278,7 @@ def _merge(into: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 
 def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """Of a point of a sweep, what concerns ``words``."""
+    """The part of a sweep's point that applies to ``words``."""
     return {key: value for key, value in point.items() if key.partition(".")[0] in words}
 
 

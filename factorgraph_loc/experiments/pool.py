@@ -1,6 +1,6 @@
-"""Planned runs in processes of this machine: each worker makes many, so that a short run does not wait for imports.
+"""Planned runs in local processes: each worker makes many runs, so that short runs do not wait for imports.
 
-A run that takes too long or too much memory is ended with its process, and stored as failed; the others go on.
+A run that exceeds its limit of time or memory is ended with its process, and stored as failed; the others continue.
 """
 
 import os
@@ -21,9 +21,11 @@ from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.files.temporary import of_system, sweep
 from factorgraph_loc.processes import Child, ProcessDiedError, start
 
-LOOK = 0.1  # s between looks at memory and time
-AGAIN = 0.5  # s after which a run that another process had claimed is asked for again
-ATTEMPTS = 2  # a process can be killed for what others use; a run whose process dies twice is to blame itself
+LOOK = 0.1  # s between checks of memory and time
+AGAIN = 0.5  # s after which a run that another process had claimed is retried
+ATTEMPTS = (
+    2  # a process may be killed because of others' memory; after two deaths the run itself is considered the cause
+)
 SHARE = 0.9  # of the machine's memory, for all workers together
 
 
@@ -33,13 +35,13 @@ class _Worker:
     connection: Connection
     ready: bool = False
     run: PlannedRun | None = None
-    source: LogSource | None = None  # of its last run: that log is loaded there
+    source: LogSource | None = None  # of its last run, whose log is loaded
     since: float = 0.0
 
 
 @dataclass
 class _Queue:
-    """What is to be run; a worker gets runs of the log that it has, else of one that no other has."""
+    """The runs to be made; a worker preferably gets runs of the log it has loaded, else of one that no other has."""
 
     runs: dict[LogSource, list[PlannedRun]] = field(default_factory=dict)
     later: list[tuple[float, PlannedRun]] = field(default_factory=list)
@@ -51,7 +53,7 @@ class _Queue:
         self.runs.setdefault(run.source, []).append(run)
 
     def next(self, own: LogSource | None, taken: Sequence[LogSource]) -> PlannedRun | None:
-        """The next run for a worker whose log is ``own``, while others have those ``taken``."""
+        """The next run for a worker whose log is ``own``, while others have those in ``taken``."""
         while self.later and self.later[0][0] <= time.monotonic():
             self.add(self.later.pop(0)[1])
         if not self.runs:
@@ -69,11 +71,11 @@ class _Queue:
 def execute(
     runs: Sequence[PlannedRun], folder: Path, *, jobs: int, limits: Limits, again: bool = False
 ) -> Iterator[Outcome]:
-    """Make ``runs`` in ``jobs`` processes, store them below ``folder``, and yield outcomes as they come.
+    """Make ``runs`` in ``jobs`` processes, store them below ``folder``, and yield their outcomes.
 
-    ``again``: stored failures are tried again. When the caller stops listening, the processes end at once, and what they had not
-    stored is not. The processes are spawned, so a script needs the usual ``if __name__ == "__main__"``. StoreError if the store
-    cannot be written, ProcessDiedError if no process can be started.
+    ``again``: retry stored failures. When the generator is closed, the processes end at once, and unfinished runs are not stored.
+    Processes are spawned, so a script needs ``if __name__ == "__main__"``. Raises StoreError if the store cannot be written,
+    ProcessDiedError if no process can be started.
     """
     pool = _Pool(folder, limits, again, min(jobs, len(runs)))
     for run in runs:
@@ -141,7 +143,7 @@ class _Pool:
         run = self.queue.next(w.source, others)
         if run is not None:
             w.run, w.source, w.since = run, run.source, time.monotonic()
-            with suppress(OSError):  # it has died, which the next look tells
+            with suppress(OSError):  # it has died, which the next check detects
                 w.connection.send(run)
 
     def _heard(self, w: _Worker, message: object) -> Iterator[Outcome]:
@@ -162,7 +164,7 @@ class _Pool:
             yield outcome
 
     def _died(self, w: _Worker) -> tuple[Kind, str] | None:
-        """What the death of a worker says about its run; None if it is tried once more."""
+        """The failure that the death of a worker means for its run; None if it is retried."""
         if not w.ready:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
@@ -192,7 +194,7 @@ def _machine_memory() -> float:
 
 
 def _resident(pid: int | None) -> float:
-    """Bytes that a process holds; 0 where the system does not tell."""
+    """Resident memory of a process in bytes; 0 if unknown."""
     try:
         return float(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):

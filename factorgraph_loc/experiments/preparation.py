@@ -1,4 +1,4 @@
-"""Which sensors a run uses, and what their packages make ready before an estimator runs."""
+"""The sensors of a run, and what their packages prepare before an estimator runs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -22,7 +22,7 @@ def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
 
 
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The sensors to use; what the rig lists and this log lacks is left out, what the user asks for must be there."""
+    """The sensors to use: those of the rig that the log has, or ``asked``, which must be available."""
     there = (*log.streams, *_told_columns(log))
     for sensor in asked or ():
         channel = channels().get(sensor)
@@ -46,7 +46,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """What the rig lists and cannot be used, and that nothing tells how the robot moves."""
+    """Warnings about unusable sensors of the rig, and about missing odometry."""
     there = (*log.streams, *_told_columns(log))
     doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in log.rig.sensors if s not in there]
     lacking = {s: section for s in log.streams if s in log.rig.sensors and (section := lacking_section(log.rig, s))}
@@ -59,14 +59,14 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel) -> Use:
-    """What the sensors' packages are told of a run."""
+    """The description of a run for the sensors' packages."""
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
 
 
 def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> Prepared:
-    """The log of a run, and what is in doubt of it, after all that its sensors make ready."""
+    """The log of a run after the preparation by its sensors, and warnings."""
     made = Prepared(use.log)
     for _, function in functions("prepare"):
         one: Prepared = function(replace(use, log=made.log), progress)
@@ -76,15 +76,15 @@ def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> Pre
 
 
 def fill_cache(uses: Iterable[Use]) -> None:
-    """Find the features of a log's images, so that runs of it in several processes find them in the cache.
+    """Find the features of a log's images, so that parallel runs find them in the cache.
 
-    What is wrong with the log is for the runs to tell.
+    Errors of the log are left to the runs.
     """
     with suppress(FglocError):
         any(prepare(use).images for use in uses)
 
 
 def _told_columns(log: Log) -> tuple[str, ...]:
-    """The columns that any row of the log has a value in."""
+    """The columns that have a value in any row of the log."""
     names = columns_of(log.streams)
     return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[channels()[n].column_of], n, np.nan))))

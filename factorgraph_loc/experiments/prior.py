@@ -1,4 +1,4 @@
-"""Where a run starts: what the user says, what the log says, or where the reference is."""
+"""The start of a run: from the user, the log, or the reference."""
 
 import math
 
@@ -13,7 +13,7 @@ from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import quoted
 
-# of a start read from the reference
+# of a start taken from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
 
@@ -22,14 +22,14 @@ EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
-    """The Gaussian that a run starts from, and the name of its source.
+    """The Gaussian prior of the start of a run, and the name of its source.
 
     ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
-    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with any heading,
-    ``unknown``, or None: the log's start, else the reference, else unknown. An unknown start is returned as None. From a
-    reference without headings, too, the heading may be any.
+    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with unknown heading,
+    ``unknown``, or None: the log's start, else the reference, else unknown. An unknown start is returned as None. For a reference
+    without headings, the heading is unknown too.
 
-    Raises InputError if the log lacks what is asked for, or ``prior`` is none of these.
+    Raises InputError if the log lacks what is requested, or ``prior`` is none of these.
     """
     if prior is None:
         has_reference = log.reference is not None or log.reference3 is not None
@@ -49,12 +49,12 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 
 
 def at_origin(log: Log) -> PosePrior:
-    """The start (0, 0, 0) of a log of which nothing else is known, at the first odometry."""
+    """The start (0, 0, 0) of a log without other information, at the first odometry."""
     return PosePrior(first_odometry(log), np.zeros(3), _covariance(POSITION_SIGMA, HEADING_SIGMA))
 
 
 def check_prior(prior: str | None) -> None:
-    """InputError if ``prior`` is none of what :func:`resolve_prior` takes; what a log has is not looked at."""
+    """Raise InputError for an invalid ``prior`` of :func:`resolve_prior`, without checking the log."""
     if prior not in (None, "unknown", "log", "reference"):
         _parse(prior)
 
@@ -88,7 +88,7 @@ def _from_reference(log: Log) -> PosePrior:
 
 
 def _in_space(reference: Trajectory3) -> PosePrior:
-    """The first pose of a robot that is not on a floor."""
+    """The first pose of a robot in space."""
     covariance = np.diag(np.repeat(np.square((REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA)), 3))
     pose = SpacePose(reference.positions[0], reference.rotations[0], covariance)
     seen = planar_estimate(float(reference.t[0]), pose)
@@ -100,7 +100,7 @@ def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArra
 
 
 def _parse(prior: str) -> list[float]:
-    """Position [m], and the heading [rad] if it is given."""
+    """Position [m], and the heading [rad] if given."""
     try:
         x, y, *heading = (float(part) for part in prior.split(","))
     except ValueError:

@@ -1,4 +1,4 @@
-"""The page of an experiment's results, from what is stored."""
+"""The report of an experiment's stored results."""
 
 import json
 from contextlib import suppress
@@ -12,6 +12,7 @@ from factorgraph_loc.experiments.experiment import Prepared
 from factorgraph_loc.experiments.index import collect
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.version import __version__
 
 PAGE = "report.html"
@@ -19,17 +20,17 @@ PAGE = "report.html"
 
 @dataclass(frozen=True)
 class Report:
-    """The ``page`` that was written, and the ``damaged`` runs that it leaves out, in words."""
+    """The ``page`` that was written, and descriptions of the ``damaged`` runs that it excludes."""
 
     page: Path
     damaged: list[str]
 
 
 def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
-    """Write the page of all results of an experiment that are there, by default into its folder.
+    """Write the report of all existing results of an experiment, by default into its folder.
 
-    All results are compared with their checksums; damaged ones are named and left out. What the logs look like is kept in the
-    store, so that they are read once. InputError without any results, or if the page cannot be written.
+    All results are compared with their checksums; damaged ones are named and excluded. Scenes of the logs are kept in the store.
+    Raises InputError without any results, or if the page cannot be written.
     """
     prepared = prepared.verified()
     damaged = [run.shown for run in prepared.damaged()]
@@ -46,32 +47,30 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
     path = out or prepared.folder / PAGE
     settings = prepared.experiment.report
     is_there = settings.baseline in (rows["label"].to_list() if len(rows) else ())
-    try:
+    with writing(path):
         write_report(
             rows,
             files,
             path,
             metrics=settings.metrics,
-            baseline=settings.baseline if is_there else None,  # of results that are still being made
+            baseline=settings.baseline if is_there else None,  # the baseline may be missing from partial results
             title=prepared.experiment.name,
             experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
             damaged=damaged,
             versions={"factorgraph-loc": __version__, "its source, sha256": code_version(), **library_versions()},
         )
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     return Report(path, damaged)
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
-    """Of a run's log; None if the log has vanished."""
+    """The scene of a run's log; None if the log has disappeared."""
     with suppress(OSError, ValueError):
         return Scene.read(kept)
     try:
         scene = Scene.of(run.source.load())
     except InputError:
         return None
-    with suppress(OSError):  # a page of results that may only be read
+    with suppress(OSError):  # results may be read-only
         kept.parent.mkdir(parents=True, exist_ok=True)
         scene.write(kept)
     return scene

@@ -1,4 +1,4 @@
-"""One log run by one estimator: feed the measurements in the order of arrival, keep what it says, and time it."""
+"""One run of an estimator on a log: process measurements in the order of arrival, and store and time the estimates."""
 
 import importlib.metadata
 import platform
@@ -39,13 +39,13 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What is run on a log.
+    """The configuration of a run on a log.
 
-    ``estimator``: its name in the registry; ``settings``: overrides of its settings. ``sensors``: names of the streams that it
-    may use, None for those of the rig; ``rssi`` and ``phase`` are what the reads of ``rfid`` tell besides. ``prior``: see
-    :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator.
-    ``max_gap`` [s]: how far apart estimates may lie between which the score interpolates; it changes no estimate. ``tick_gap`` [s]:
-    there are no estimates inside gaps between measurements that are longer than this.
+    ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
+    None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
+    :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap`` [s]: the
+    largest interval between estimates that is interpolated for scoring; it changes no estimate. ``tick_gap`` [s]: there are no
+    estimates inside longer gaps between measurements.
     """
 
     estimator: str
@@ -65,21 +65,21 @@ def run(
 ) -> RunResult:
     """Run an estimator on a log.
 
-    The grid of ticks has 10 Hz and starts at the prior's time; there are none inside long gaps between measurements (``tick_gap``).
-    A tick comes after all measurements that arrived up to its time; the estimate after it is the causal one. Odometry older than
-    the prior is fed before the estimator is initialized, because its velocity holds on; other measurements older than the prior are
-    counted as ignored. With an unknown start the grid begins at the first measurement, and the final trajectory, empty if nothing
-    told the pose, where the estimator began to believe something. A log with neither start nor reference, and without a map that
-    its sensors see, begins at (0, 0, 0).
-    ``progress`` is given the share done; where features of images are looked for first, that is its first half.
-    ``watch`` is given the time and the estimator after each tick, to look at what it believes.
+    The ticks are at 10 Hz from the prior's time on, except inside long gaps between measurements (``tick_gap``). A tick comes
+    after all measurements that arrived up to its time; the estimate after it is the causal one. Odometry older than the prior is
+    processed before the estimator is initialized, because its velocity is held; other measurements older than the prior are
+    counted as ignored. With an unknown start the ticks begin at the first measurement, and the final trajectory begins at the
+    first belief and may be empty. A log with neither start nor reference, and without a map that its sensors observe, begins at
+    (0, 0, 0). ``progress`` is called with the fraction done, of which feature extraction, if needed, is the first half. ``watch``
+    is called with the time and the estimator after each tick, to inspect its belief.
 
-    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or tells a pose that is not
-    finite or a covariance that is not positive, with the time and the measurement; see :mod:`factorgraph_loc.fusion.guarded`.
+    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or returns a pose that is
+    not finite or a covariance that is not positive definite, with the time and the measurement; see
+    :mod:`factorgraph_loc.fusion.guarded`.
     """
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
-    require_bounds(log)  # of one that a program made, too
+    require_bounds(log)  # the log may have been made by a program
     require_one_span(log)
     sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
@@ -93,7 +93,7 @@ def run(
         estimator = registry.create(config.estimator, setup, settings)
     if not moving(log.streams, "floor") and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
         raise InputError(
-            f"{log.name}: {config.estimator} knows a robot on a floor alone, this one moves in space, "
+            f"{log.name}: {config.estimator} works for a robot on a floor only, this one moves in space, "
             f"expected one of {', '.join(registry.in_space())}"
         )
     unstated: tuple[str, ...] = ()
@@ -208,7 +208,7 @@ class _Loop:
         self.estimates: list[PoseEstimate] = []
 
     def run(self) -> None:
-        """Feed everything, ticks included."""
+        """Process all measurements and ticks."""
         started = perf_counter()
         initialized = self._prior is None
         for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
@@ -235,7 +235,7 @@ class _Loop:
         self._progress(1.0)
 
     def timings(self, final_seconds: float, prepared: Prepared) -> Timings:
-        """The times of the loop, with those of what came before and of the final trajectory."""
+        """The times of the loop, of the preparation, and of the final trajectory."""
         return Timings(
             update_t=np.array(self._update_t),
             update_ms=np.array(self._update_s) * 1e3,
@@ -268,7 +268,7 @@ class _Loop:
         with self._guard.telling(f"the estimate at {t:.3f} s"):
             e = sound(self._estimator.estimate(t))
         self._guard.process(self._estimator, Tick(t))
-        # own copies, stamped by the tick: an estimator may reuse its arrays, and one without an estimate has no time
+        # copies with the tick's time: an estimator may reuse its arrays, and an unlocalized estimate has no time
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
         )
@@ -281,7 +281,7 @@ class _Loop:
 
 
 def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
-    """The poses in space of localized estimates; None where there is none."""
+    """The poses in space of localized estimates; None if there are none."""
     rows = [(e.t, e.space) for e in estimates if e.space is not None and e.status == "localized"]
     if not rows:
         return None
@@ -291,7 +291,7 @@ def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
 
 
 def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float:
-    """The time of the first tick; InputError where nothing is measured from then on."""
+    """The time of the first tick. Raises InputError if there are no measurements from then on."""
     first, last = _span(log, sensors)
     begin = first if prior is None else prior.t
     if not begin <= last:
@@ -308,7 +308,7 @@ def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 
 def _once(*warnings: str) -> tuple[str, ...]:
-    """Those that are said twice only once."""
+    """The warnings without duplicates."""
     return tuple(dict.fromkeys(warnings))
 
 
@@ -322,7 +322,7 @@ def _versions() -> dict[str, str]:
 
 
 def _peak_memory_mb() -> float:
-    # getrusage counts what the parent of this process had when it was forked; the kernel's own figure does not
+    # getrusage includes the parent's memory at the fork; the kernel's own figure does not
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return float(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6

@@ -1,14 +1,14 @@
-"""Seeds as people write them: ``0:10``, ``3``."""
+"""Parsing of seeds: ``0:10``, ``3``."""
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
 MOST_SEEDS = 10_000
-LARGEST_SEED = 2**63 - 1  # as tables hold them
+LARGEST_SEED = 2**63 - 1  # as in tables
 
 
 def parse_seeds(text: str, source: object = "--seeds") -> range:
-    """``0:10`` as the seeds 0 to 9, ``3`` as the seed 3 alone; InputError names ``source``."""
+    """Parse ``0:10`` as the seeds 0 to 9, ``3`` as the seed 3. Raises InputError with ``source``."""
     first, colon, end = text.partition(":")
     try:
         seeds = range(int(first), int(end) if colon else int(first) + 1)

@@ -1,8 +1,8 @@
-"""Results of runs on disk, a folder each by its key, whole or not there at all.
+"""Store of run results on disk: a folder per key, which is complete or missing.
 
-A run's files are written beside the store's folders, synced, and moved into place by one rename. Its ``manifest.json`` holds the
-sha256 of each file but those of timings. Who computes a run holds a lock on a file named by its key; the system lets go of it
-when its process ends, however it ends, so that no claim outlives its owner.
+A run's files are written beside the store's folders, synced, and moved into place by one rename. Its ``manifest.json`` contains
+the sha256 of each file except for timings. Whoever computes a run holds a lock on a file named by its key; the system releases it
+when the process ends in any way, so that no claim outlives its owner.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
 
 MANIFEST, METRICS, TIMINGS, FAILURE = "manifest.json", "metrics.json", "timings.json", "failure.json"
-TIMING = "timing."  # what times begin with
+TIMING = "timing."  # prefix of timings
 State = Literal["ok", "failed", "missing", "damaged"]
 _AGAIN = "; `fgloc experiment run --verify` makes it again"
 
 
 class StoreError(RunFailedError):
-    """The store cannot be read or written: the disk is full, or the folder may not be changed."""
+    """The store cannot be read or written: the disk is full, or permissions are missing."""
 
 
 class Store:
-    """The results below ``folder``/store. StoreError where it cannot be written."""
+    """The results below ``folder``/store. Raises StoreError if it cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "store"
 
     def create(self) -> None:
-        """Make the folders, and remove what processes that died have left behind."""
+        """Create the folders, and clean up after processes that died."""
         with self._writing():
             for name in ("claims", "tmp"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ class Store:
         self.sweep()
 
     def sweep(self) -> None:
-        """Remove what processes that died have left behind: claims, and results that are half-written."""
+        """Remove claims and partial results of processes that died."""
         with self._writing():
             keys = {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}
         for key in keys:
@@ -66,8 +66,8 @@ class Store:
         return self.folder / key[:2] / key
 
     def state(self, key: str, *, thorough: bool = False) -> State:
-        """Whether results are there, and whole. Trajectories of the right size that are older than their manifest are taken as
-        they are; other files, and all if ``thorough``, are read and compared with their checksums."""
+        """The state of a run's results. Trajectories of the right size that are older than their manifest are not checked
+        further; other files, and all if ``thorough``, are compared with their checksums."""
         folder = self.path(key)
         try:
             manifest = self._manifest(key)
@@ -86,12 +86,12 @@ class Store:
         return "failed" if FAILURE in manifest.files else "ok"
 
     def read(self, key: str, name: str) -> bytes:
-        """A file of a run, compared with its checksum; DamagedError if it is missing or damaged."""
+        """Read a file of a run, verified by its checksum. Raises DamagedError if it is missing or damaged."""
         return self._read(self._manifest(key), name)
 
     def row(self, key: str) -> dict[str, Any]:
-        """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, the scalar scores of a run, timings among them, and its
-        ``warnings``, a line each. DamagedError as of :meth:`read`."""
+        """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, the scalar scores of a run including timings, and its
+        ``warnings``, one per line. Raises DamagedError as :meth:`read` does."""
         return self._row(self._manifest(key))
 
     def _row(self, manifest: Manifest) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class Store:
             state = {"status": "failed", "kind": failure.kind, "reason": failure.reason}
         else:
             scores = parse_stored(Figures, self._read(manifest, METRICS), folder / METRICS).model_dump()
-        with suppress(DamagedError):  # times are not worth a run
+        with suppress(DamagedError):  # timings are optional
             times = parse_stored(Figures, self._read(manifest, TIMINGS), folder / TIMINGS)
             scores |= {name: value for name, value in times.model_dump().items() if name.startswith(TIMING)}
         return row_of(state | {name: value for name, value in scores.items() if name not in state})
@@ -138,7 +138,7 @@ class Store:
         return read_track(self.read(key, "estimates.parquet"))
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
-        """Write the files of a run, at once or not at all, in place of those that are there; its claim must be held."""
+        """Write the files of a run atomically, replacing existing ones; its claim must be held."""
         said = {
             name: {"bytes": len(content), "sha256": _sha256(content)}
             for name, content in files.items()
@@ -150,7 +150,10 @@ class Store:
             _remove(temporary)
             (temporary / "run").mkdir(parents=True)
             try:
-                for name, content in (*files.items(), (MANIFEST, manifest)):  # last, so that none is younger
+                for name, content in (
+                    *files.items(),
+                    (MANIFEST, manifest),
+                ):  # the manifest last, so that none is younger
                     _write(temporary / "run" / name, content)
                 _sync(temporary / "run")
                 if self.path(key).parent.is_file():
@@ -165,7 +168,7 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Whether the run is ours while the block lasts; it is not if another process that lives has claimed it."""
+        """Context that claims a run; yields False if another live process has claimed it."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -193,14 +196,14 @@ class Store:
 
 
 def _remove(path: Path) -> None:
-    """Remove a folder, or a file that lies in its place, as far as that can be done."""
+    """Remove a folder, or a file in its place, as far as possible."""
     shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink()
 
 
 def _lock(handle: int, path: Path) -> bool:
-    """Lock a file; False if another has it, or has just removed it."""
+    """Lock a file; False if another process has locked or just removed it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,4 +1,4 @@
-"""What the small files of the store hold; one that holds anything else is damaged."""
+"""Content of the small files in the store, with validation."""
 
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -7,17 +7,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factorgraph_loc.errors import InputError
 
-Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as tables hold them
+Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
 Figure = Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]  # of a file within the run's folder
 
 
 class DamagedError(InputError):
-    """A stored file is not there, or not as it was written."""
+    """A stored file is missing, or differs from what was written."""
 
 
 class StoredFile(BaseModel):
-    """Base of what the store keeps as JSON."""
+    """Base of the store's JSON files."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 
@@ -44,7 +44,7 @@ class Failure(StoredFile):
 
 
 class Figures(StoredFile):
-    """Scores or times of a run: beside the ``warnings`` numbers, None, and lists of these."""
+    """Scores or times of a run: numbers, None, and lists of these, besides the ``warnings``."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Figure | list[Figure]] = Field(init=False)
@@ -55,7 +55,7 @@ Kind = TypeVar("Kind", bound=StoredFile)
 
 
 def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
-    """The JSON ``content`` of the file ``path``; DamagedError if it is not of that ``kind``."""
+    """Parse the JSON ``content`` of the file ``path``. Raises DamagedError if it is not of that ``kind``."""
     try:
         return kind.model_validate_json(content)
     except ValidationError as error:

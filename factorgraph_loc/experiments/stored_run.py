@@ -1,6 +1,6 @@
-"""The files of one run as the store keeps them: those of ``fgloc run``, with all times in ``timings.json``.
+"""The files of one run in the store: those of ``fgloc run``, with all times in ``timings.json``.
 
-What the same run gives on another day is the same to the byte but for that file.
+All other files of a run are reproducible to the byte.
 """
 
 import json
@@ -26,9 +26,9 @@ from factorgraph_loc.model.result import RunResult
 
 
 def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
-    """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty there.
+    """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty.
 
-    ``started``: when it was, by ``perf_counter``, for the time that it took as a whole.
+    ``started``: the value of ``perf_counter`` at the start, for the total time.
     """
     scores = score(result, log)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
@@ -40,7 +40,7 @@ def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
 
 
 def timings_file(timings: Mapping[str, Any]) -> bytes:
-    """The content of ``timings.json``; what is not finite is null."""
+    """The content of ``timings.json``; non-finite values are null."""
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in timings.items()}
     return (json.dumps(plain, indent=2) + "\n").encode()
 

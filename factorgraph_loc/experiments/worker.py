@@ -1,4 +1,4 @@
-"""A process that makes one planned run after the other. What it imports first must be light: threads are chosen before numpy is."""
+"""A worker process for planned runs. Its first imports must be light: the number of threads is set before numpy is imported."""
 
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -9,7 +9,7 @@ READY = "ready"
 
 
 def serve(connection: Connection, folder: Path, again: bool) -> None:
-    """Say ``READY``, then answer each planned run that comes with its outcome, or with the error that stops the experiment."""
+    """Send ``READY``, then answer each planned run with its outcome, or with the error that stops the experiment."""
     _import()
     from factorgraph_loc.experiments.execute import run_planned  # noqa: PLC0415
 
@@ -17,7 +17,7 @@ def serve(connection: Connection, folder: Path, again: bool) -> None:
     while True:
         try:
             run = connection.recv()
-        except EOFError:  # nobody is there to ask for more
+        except EOFError:  # the parent has ended
             return
         try:
             connection.send(run_planned(run, folder, again=again))
@@ -26,7 +26,7 @@ def serve(connection: Connection, folder: Path, again: bool) -> None:
 
 
 def _import() -> None:
-    """Load what takes seconds, so that no run pays for it."""
+    """Import slow modules before the first run."""
     import cv2  # noqa: PLC0415
 
     import factorgraph_loc.experiments.stored_run  # noqa: F401, PLC0415

@@ -1,7 +1,8 @@
-"""A log and runs of it as an MCAP file (https://mcap.dev) that Foxglove opens: poses, covariances, paths, tags, landmarks, images.
+"""Export of a log and its runs as an MCAP file (https://mcap.dev) for Foxglove: poses, covariances, paths, tags, landmarks,
+images.
 
-Messages are JSON, stamped with the absolute time of the log. Frames: ``world``, and for each run the robot where it was estimated,
-by the run's name. The library ``mcap`` is optional, and imported where it is used only.
+Messages are JSON, stamped with the absolute time of the log. Frames: ``world``, and one per run, named after it, for the
+robot's estimated pose. The library ``mcap`` is optional and imported only where it is used.
 """
 
 import base64
@@ -21,22 +22,23 @@ from factorgraph_loc.exports.foxglove_schemas import OTHERS, SCHEMAS
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, SEEN, Colour, colours
 from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import draw
 from factors.se2 import Array
 
 WORLD = "world"
-MARK, THIN = 0.12, 0.02  # m: the diameter of a tag or landmark, the thickness of a line
+MARK, THIN = 0.12, 0.02  # m: the diameter of a tag or landmark, the width of a line
 LETTERS = 0.15  # m
-STRIP, LIST = 0, 2  # of a line: connected, or pairs of points
-POINTS = 1  # of an annotation
+STRIP, LIST = 0, 2  # line types: connected, or pairs of points
+POINTS = 1  # annotation type
 INFO = 2  # level of an event
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message to write, at the time ``t`` [s] of the log."""
+    """A message to be written, with its time ``t`` [s] of the log."""
 
     t: float
     topic: str
@@ -47,55 +49,52 @@ class Message:
 def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
     """Write an MCAP file.
 
-    Topics: ``/map``, ``/tags``, ``/landmarks`` (what is lit when it is read or seen), ``/reference/pose`` and ``/reference/path``,
+    Topics: ``/map``, ``/tags``, ``/landmarks`` (those being read or sighted), ``/reference/pose`` and ``/reference/path``,
     ``/camera/image`` and ``/camera/landmarks``; for each run ``/NAME/pose``, ``/NAME/transform``, ``/NAME/path`` (of the final
-    trajectory), ``/NAME/ellipse``, ``/NAME/estimate`` (numbers for plots, with the covariance (3, 3) of x, y, heading by rows),
+    trajectory), ``/NAME/ellipse``, ``/NAME/estimate`` (values for plots, with the covariance (3, 3) of x, y, heading by rows),
     ``/NAME/landmarks`` (learnt ones) and ``/NAME/events``.
 
-    InputError where ``mcap`` is not installed, or an image cannot be read.
+    Raises InputError if ``mcap`` is not installed or an image cannot be read.
     """
     try:
         from mcap.writer import Writer  # noqa: PLC0415 - an optional library
     except ImportError as error:
         raise InputError("writing .mcap needs mcap: pip install 'factorgraph-loc[foxglove]'") from error
     start = _start(log, runs)
-    zero_ns = max(log.t0_ns, math.ceil(-start) * 10**9)  # the format knows no times before 1970
-    try:
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            writer = Writer(file)
-            writer.start(library="fgloc")
-            writer.add_metadata("log", {"name": log.name, **{key: str(value) for key, value in log.metadata.items()}})
-            schemas = {
-                s["title"]: writer.register_schema(s["title"], "jsonschema", json.dumps(s).encode()) for s in SCHEMAS
-            }
-            channels: dict[str, int] = {}
-            for message in heapq.merge(*_streams(log, runs, start), key=lambda m: m.t):
-                if message.topic not in channels:
-                    channels[message.topic] = writer.register_channel(message.topic, "json", schemas[message.schema])
-                ns = zero_ns + round(message.t * 1e9)
-                try:
-                    data = json.dumps(_stamped(message.content, ns), separators=(",", ":"), allow_nan=False).encode()
-                except ValueError as error:
-                    where = f"{message.topic} at {message.t:.3f} s"
-                    raise InputError(f"{path}: {where} has a value that is not finite") from error
-                writer.add_message(channels[message.topic], log_time=ns, publish_time=ns, data=data)
-            writer.finish()  # type: ignore[no-untyped-call]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    zero_ns = max(log.t0_ns, math.ceil(-start) * 10**9)  # the format has no times before 1970
+    with writing(path), replacing(path) as temporary, temporary.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="fgloc")
+        writer.add_metadata("log", {"name": log.name, **{key: str(value) for key, value in log.metadata.items()}})
+        schemas = {
+            s["title"]: writer.register_schema(s["title"], "jsonschema", json.dumps(s).encode()) for s in SCHEMAS
+        }
+        channels: dict[str, int] = {}
+        for message in heapq.merge(*_streams(log, runs, start), key=lambda m: m.t):
+            if message.topic not in channels:
+                channels[message.topic] = writer.register_channel(message.topic, "json", schemas[message.schema])
+            ns = zero_ns + round(message.t * 1e9)
+            try:
+                data = json.dumps(_stamped(message.content, ns), separators=(",", ":"), allow_nan=False).encode()
+            except ValueError as error:
+                where = f"{message.topic} at {message.t:.3f} s"
+                raise InputError(f"{path}: {where} has a value that is not finite") from error
+            writer.add_message(channels[message.topic], log_time=ns, publish_time=ns, data=data)
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _start(log: Log, runs: Sequence[StoredRun]) -> float:
-    """The first time of all [s]."""
+    """The earliest time [s] of anything exported."""
     stamps = [run_t for run in runs for run_t in (run.causal.t, run.final.t)]
     if log.reference is not None:
         stamps.append(log.reference.t)
     return min(
         [log.span()[0] - 1.0, *(float(t[0]) for t in stamps if len(t))]
-    )  # what a tag's read is older than its round
+    )  # the age of a read at the end of its round
 
 
 def _stamped(content: Mapping[str, Any], ns: int) -> dict[str, Any]:
-    """A message and its parts with their time."""
+    """A message with the timestamp set in all its parts."""
     stamp = {"sec": ns // 10**9, "nsec": ns % 10**9}
     parts = {
         key: [{"timestamp": stamp, **part} for part in content[key]]
@@ -106,7 +105,7 @@ def _stamped(content: Mapping[str, Any], ns: int) -> dict[str, Any]:
 
 
 def _streams(log: Log, runs: Sequence[StoredRun], start: float) -> Iterator[Iterator[Message]]:
-    """All messages, in streams that are ordered by time each."""
+    """All messages, as streams ordered by time."""
     yield iter([Message(start, "/map", "foxglove.SceneUpdate", _map(log))])
     for marks, positions, lights in scene.layers(log):
         yield _lamps(f"/{marks.layer}", positions, lights)
@@ -150,7 +149,7 @@ def _path(at: str, trajectory: Trajectory, start: float) -> Message:
 
 
 def _places(trajectory: Trajectory) -> list[dict[str, Any]]:
-    """The poses; of one whose heading means nothing without a turn."""
+    """The poses, with identity rotation where the heading is undefined."""
     known = np.array((1.0, 1.0, float(trajectory.has_heading)))
     return [_pose(*pose) for pose in np.where(known, trajectory.poses, 0.0).tolist()]
 
@@ -244,7 +243,7 @@ def _entity(name: str, **shapes: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _marks(positions: Mapping[str, Array], colour: Colour, size: float) -> dict[str, list[dict[str, Any]]]:
-    """A ball and a name at each position (3,)."""
+    """A sphere and a text label at each position (3,)."""
     spheres, texts = [], []
     for name, (x, y, z) in ((name, p.tolist()) for name, p in positions.items()):
         spheres.append(

@@ -1,6 +1,6 @@
-"""The messages of Foxglove that we write, as JSON schemas; the viewer knows them by their names.
+"""JSON schemas of the Foxglove messages that are written.
 
-Fields and their meaning: https://docs.foxglove.dev/docs/sdk/schemas. Ours alone is ``fgloc.Estimate``.
+Fields: https://docs.foxglove.dev/docs/sdk/schemas. Only ``fgloc.Estimate`` is our own.
 """
 
 from typing import Any
@@ -50,7 +50,7 @@ LABEL = _object(
     color=COLOUR,
     text=TEXT,
 )
-OTHERS = ("arrows", "cubes", "cylinders", "triangles", "models")  # of a scene, that we leave empty
+OTHERS = ("arrows", "cubes", "cylinders", "triangles", "models")  # fields of a scene that are left empty
 ENTITY = _object(
     "foxglove.SceneEntity",
     timestamp=TIME,

@@ -1,8 +1,8 @@
-"""The pose graph of a run as a g2o file, for other optimisers.
+"""Export of the pose graph of a run as a g2o file.
 
-R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, "g2o: a general framework for graph optimization", ICRA 2011, and
-the formats of its types ``slam2d``. What such a graph can say is in it: the motion between poses (``EDGE_SE2``), and landmarks
-whose range and bearing were measured at once (``EDGE_SE2_XY``). Ranges or bearings alone, reads of tags and pixels are not.
+R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, "g2o: a general framework for graph optimization", ICRA 2011,
+types ``slam2d``. The file contains the motion between poses (``EDGE_SE2``) and landmarks with simultaneous range and bearing
+(``EDGE_SE2_XY``); ranges or bearings alone, tag reads and pixels cannot be represented.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -24,12 +25,12 @@ from factorgraph_loc.text import listed
 from factors.motion import Increment
 from factors.se2 import Array
 
-LEAST = 1e-12  # m^2 or rad^2: the least variance of an edge, as no information is infinite
+LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, for a finite information
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], seen from the pose ``index``."""
+    """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], sighted from the pose ``index``."""
 
     index: int
     landmark: str
@@ -39,8 +40,9 @@ class Sighting:
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """``t`` (N,) and ``poses`` (N, 3): where the robot is believed to have been; ``motions``: N - 1, from each pose to the next.
-    ``landmarks``: (2,) each, by name; ``known``: whether the map has them, and they are held fast."""
+    """``t`` (N,) and estimated ``poses`` (N, 3); ``motions``: N - 1, between consecutive poses. ``landmarks``: positions (2,)
+    by name; ``known``: whether they come from the map and are fixed.
+    """
 
     t: Array
     poses: Array
@@ -53,10 +55,10 @@ class PoseGraph:
 def pose_graph(
     log: Log, trajectory: Trajectory, sensors: Sequence[str], learnt: Mapping[str, LearntPoint] | None = None
 ) -> PoseGraph:
-    """The pose graph of a log: poses at the stamps of ``trajectory`` and of the sightings between them.
+    """The pose graph of a log, with poses at the stamps of ``trajectory`` and of the sightings between them.
 
-    ``sensors``: which of the log's streams are used. Landmarks are those of the map, or, where it has none, those ``learnt``.
-    InputError without two poses, or if the log does not say how the robot moved.
+    ``sensors``: the channels of the log to use. Landmarks are those of the map or, if it has none, ``learnt``. Raises
+    InputError for fewer than two poses, or a log without odometry.
     """
     used = [name for name in log.streams if name in sensors]
     if not moving(used, "floor"):
@@ -81,7 +83,7 @@ def pose_graph(
 
 
 def write_g2o(graph: PoseGraph, path: Path) -> None:
-    """Write a g2o file. Poses are numbered from 0 on, then come the landmarks. Those of a map are fixed, else the first pose is."""
+    """Write a g2o file: poses, numbered from 0, then landmarks. Landmarks of a map are fixed, otherwise the first pose is."""
     number = {name: len(graph.t) + i for i, name in enumerate(graph.landmarks)}
     lines = [f"VERTEX_SE2 {i} {_numbers(pose)}" for i, pose in enumerate(graph.poses)]
     lines += [f"VERTEX_XY {number[name]} {_numbers(place)}" for name, place in graph.landmarks.items()]
@@ -89,12 +91,10 @@ def write_g2o(graph: PoseGraph, path: Path) -> None:
         lines.append(f"EDGE_SE2 {i} {i + 1} {_numbers(motion.delta)} {_information(motion.covariance)}")
     for s in graph.sightings:
         lines.append(f"EDGE_SE2_XY {s.index} {number[s.landmark]} {_numbers(s.point)} {_information(s.covariance)}")
-    # last, as GTSAM reads no further
+    # last, as GTSAM stops reading here
     lines += [f"FIX {i}" for i in (number.values() if graph.known and number else (0,))]
-    try:
+    with writing(path):
         write_text(path, "\n".join(lines) + "\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _numbers(values: Array) -> str:
@@ -102,7 +102,7 @@ def _numbers(values: Array) -> str:
 
 
 def _information(covariance: Array) -> str:
-    """The upper triangle, by rows, of the inverse of a covariance (D, D); a robot at rest moves without any error."""
+    """The upper triangle, by rows, of the inverse of a covariance (D, D), regularised for a robot at rest."""
     variances, axes = np.linalg.eigh(covariance)
     inverse = (axes / np.maximum(variances, LEAST)) @ axes.T
     return _numbers(inverse[np.triu_indices(len(covariance))])

@@ -1,4 +1,4 @@
-"""The particles of a run, as viewers show them."""
+"""The particles of a run, for viewers."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,9 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Particles:
-    """``t`` (N,) [s of the log] and ``poses``: N arrays (K, 3), of equal weight, none where the estimator has no particles then.
-    ``difference`` [m]: the largest between the causal positions of the run and of the one that was made again."""
+    """``t`` (N,) [s of the log] and ``poses``: N arrays (K, 3) of equally weighted particles, empty where there are none.
+    ``difference`` [m]: the largest difference between the causal positions of the stored run and of the repeated run.
+    """
 
     t: Array
     poses: tuple[Array, ...]

@@ -1,4 +1,4 @@
-"""What the camera saw, in a recording of Rerun: images, identified points in them, and where the points of the map should be."""
+"""Camera data in a Rerun recording: images, identified points, and predicted positions of map points."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     import rerun as rr
 
 TIMELINE = "log_time"
-WORLD, CAMERA = "/world", "/camera"  # the latter of a robot whose place is not known
+WORLD, CAMERA = "/world", "/camera"  # the latter without a robot pose
 FRUSTUM = 0.4  # m from the camera to its image
-BATCH = 16  # pictures that are sent at once
-NEAREST = 300  # points of the map that are drawn into an image
+BATCH = 16  # images sent at once
+NEAREST = 300  # map points drawn into an image
 
 
 def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
-    """What the camera saw, as a picture before the first robot; identified points in it, and where the map's points should be."""
+    """Record images with the identified points and the predicted map points, as a picture in front of the first robot."""
     import rerun as rr  # noqa: PLC0415
 
     settings = log.rig.find(CameraSettings)
@@ -77,7 +77,9 @@ def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[f
 def _pixels_over_time(
     recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
 ) -> None:
-    """The points (K, 2) in each picture; the viewer counts pixels from the corner of the first, not from its centre."""
+    """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is the corner of the first pixel, not its
+    centre.
+    """
     import rerun as rr  # noqa: PLC0415
 
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
@@ -85,7 +87,7 @@ def _pixels_over_time(
 
 
 def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """The pixels (K, 2) of the nearest ``points`` (P, 3) that are in the picture from ``pose`` (3,), if that is known."""
+    """Pixels (K, 2) of the nearest ``points`` (P, 3) visible from ``pose`` (3,), none if the pose is unknown."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)
@@ -94,13 +96,13 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
 
 
 def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
-    """The poses of the robot whose camera is drawn: of the first run that has some, else the reference."""
+    """Trajectory of the robot that carries the drawn camera: of the first run that has one, else the reference."""
     found = [run.played() for run in runs if len(run.played())]
     return found[0] if found else log.reference
 
 
 def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
-    """The entity of the camera: on the first robot that is drawn, if there is one."""
+    """The entity path of the camera: below the first robot drawn, if there is one."""
     robots = [run.name for run in runs if len(run.played())]
     if log.reference is not None or log.reference3 is not None:
         robots.append("reference")
@@ -108,7 +110,7 @@ def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
 
 
 def times(t: Array) -> list[rr.TimeColumn]:
-    """Seconds of the log as what Rerun calls an index."""
+    """Seconds of the log as a Rerun time column."""
     import rerun as rr  # noqa: PLC0415
 
     return [rr.TimeColumn(TIMELINE, duration=t)]

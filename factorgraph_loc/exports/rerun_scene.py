@@ -1,8 +1,8 @@
-"""A log and runs of it as a recording of Rerun (https://rerun.io), to be looked at along the time of the log.
+"""Export of a log and its runs as a Rerun recording (https://rerun.io), along the time of the log.
 
-Everything is in the world's frame [m], z up; the time line ``log_time`` counts seconds from the log's start. Everything
-is sent in columns: what is logged piece by piece with ``set_time(duration=...)`` is a file that Rerun 0.41 cannot end. The library
-``rerun-sdk`` is optional, and imported where it is used only.
+Everything is in the world frame [m], z up; the timeline ``log_time`` counts seconds from the log's start. All data are sent as
+columns: Rerun 0.41 writes broken files for single values logged with ``set_time(duration=...)``. The library ``rerun-sdk`` is
+optional and imported only where it is used.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, r
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -43,23 +44,20 @@ ARROW = 0.6  # m
 def write_rrd(
     log: Log, runs: Sequence[StoredRun], path: Path, particles: Mapping[str, Particles] = MappingProxyType({})
 ) -> None:
-    """Write a file that ``rerun FILE`` opens. ``particles``: those of runs, by the runs' names.
+    """Write a file that ``rerun FILE`` opens. ``particles``: by name of the run.
 
-    InputError where ``rerun-sdk`` is not installed, or an image cannot be read.
+    Raises InputError if ``rerun-sdk`` is not installed or an image cannot be read.
     """
     recording = _recording()
-    try:
-        with replacing(path) as temporary:
-            recording.save(temporary, _blueprint(log, runs))
-            _record(recording, log, runs, particles)
-            recording.flush()
-            recording.disconnect()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    with writing(path), replacing(path) as temporary:
+        recording.save(temporary, _blueprint(log, runs))
+        _record(recording, log, runs, particles)
+        recording.flush()
+        recording.disconnect()
 
 
 def show(log: Log, runs: Sequence[StoredRun], particles: Mapping[str, Particles] = MappingProxyType({})) -> None:
-    """Open the viewer, or use one that is open; InputError as of :func:`write_rrd`, and without a display."""
+    """Open the viewer, or use one that is open. Raises InputError as :func:`write_rrd` does, and without a display."""
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
     recording = _recording()
@@ -96,7 +94,7 @@ def _record(
 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
-    """Walls, and what sensors find in the map: landmarks, tags, points; and which of it is lit when."""
+    """Walls and mapped objects (landmarks, tags, points), and when each was observed."""
     import rerun as rr  # noqa: PLC0415
 
     if log.world.walls:
@@ -130,7 +128,7 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
 
 
 def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
-    """What a run estimated, and how far it was off."""
+    """The estimates of a run and their errors."""
     import rerun as rr  # noqa: PLC0415
 
     at = f"{WORLD}/{run.name}"
@@ -179,7 +177,7 @@ def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour
 
 
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """The way up to each time: its pieces, of which the view shows those of the past; none across a gap."""
+    """The path driven so far, as segments shown from their time on; none across a gap."""
     positions = trajectory.poses[:, :2]
     near = np.diff(trajectory.t) <= scene.GAP
     pieces = np.stack((positions[:-1], positions[1:]), axis=1)
@@ -187,7 +185,7 @@ def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
-    """One line (L, 2) of ``lines`` (K, L, 2) from each of the times ``t`` (K,) on."""
+    """A line (L, 2) of ``lines`` (K, L, 2) for each of the times ``t`` (K,)."""
     import rerun as rr  # noqa: PLC0415
 
     if len(t):
@@ -196,7 +194,7 @@ def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Ar
 
 
 def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """The robot where it was, as an arrow where its heading is known."""
+    """The robot over time, as an arrow where its heading is known."""
     import rerun as rr  # noqa: PLC0415
 
     if not len(trajectory):
@@ -212,7 +210,7 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _in_space(recording: rr.RecordingStream, at: str, trajectory: Trajectory3) -> None:
-    """The way of a robot that is not on a floor, and where it was."""
+    """Path and position over time of a robot in space."""
     import rerun as rr  # noqa: PLC0415
 
     recording.log(
@@ -224,7 +222,7 @@ def _in_space(recording: rr.RecordingStream, at: str, trajectory: Trajectory3) -
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
-    """How the viewer is arranged: the plan, seen from above; beside it camera, errors and events, where there are any."""
+    """Layout of the viewer: the plan from above; beside it camera, errors and events, where there are any."""
     import rerun as rr  # noqa: PLC0415
     import rerun.blueprint as rrb  # noqa: PLC0415
 
@@ -259,7 +257,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 
 
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
-    """The middle (2,) of all that is drawn, and its larger side [m]; at least 5, not to look at a small scene from within."""
+    """Centre (2,) and larger side [m] of everything drawn; at least 5 m, to keep the viewpoint outside of a small scene."""
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
     parts += [marks.positions[:, :2] for marks, _, _ in scene.layers(log) if not marks.dense]
     if log.reference is not None:

@@ -1,4 +1,4 @@
-"""Runs read back from the folders that ``fgloc run`` and ``fgloc compare`` write."""
+"""Results of runs, read from the folders that ``fgloc run`` and ``fgloc compare`` write."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
-COMPLETE = FILES[-1]  # written last: where it is, the others are
+COMPLETE = FILES[-1]  # written last, so that its presence marks a complete run
 OUTSIDE = 60.0  # s that an estimate may lie outside of its log
 SERIES = ("error_position", "error_heading", "nees")
 
@@ -34,13 +34,13 @@ class _Landmark(FileModel, extra="ignore"):
 
 
 class _Learnt(FileModel, extra="ignore"):
-    """What is read of ``learnt.json``."""
+    """The part of ``learnt.json`` that is read."""
 
     landmarks: dict[str, _Landmark]
 
 
 class StoredConfig(FileModel, extra="ignore"):
-    """What is read of ``config.toml``, the effective configuration of a run."""
+    """The part of ``config.toml``, the effective configuration of a run, that is read."""
 
     log: Annotated[str, Field(min_length=1)]
     estimator: Annotated[str, Field(min_length=1)]
@@ -52,7 +52,7 @@ class StoredConfig(FileModel, extra="ignore"):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Where a run is kept, and what it is of."""
+    """The folder of a run, with its log, estimator and seed."""
 
     path: Path
     config: StoredConfig
@@ -68,11 +68,11 @@ class RunFolder:
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as it was written; times in seconds from the start of its log.
+    """A stored run; times in seconds from the start of its log.
 
-    ``causal``: the estimates from the first localized one on; ``final``: the best estimate of the whole past; both may be empty.
-    ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) of the estimates
-    that :meth:`played` gives. ``landmarks``: those that the estimator learnt. ``events``: time and text.
+    ``causal``: the estimates from the first localized one on; ``final``: the trajectory estimated from the whole log; both may
+    be empty. ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) for
+    the estimates of :meth:`played`. ``landmarks``: learnt by the estimator. ``events``: time and text.
     """
 
     name: str
@@ -84,17 +84,17 @@ class StoredRun:
     events: tuple[tuple[float, str], ...]
 
     def played(self) -> Trajectory:
-        """What is shown along time: the causal estimates, or the final ones of an estimator that has no others."""
+        """The trajectory shown over time: the causal one, or the final one of an estimator without causal estimates."""
         return self.causal if len(self.causal) else self.final
 
 
 def is_results(path: Path) -> bool:
-    """Whether ``path`` is a folder with the results of a run or of a comparison."""
+    """Whether ``path`` is a result folder of a run or of a comparison."""
     return (path / COMPLETE).is_file() or any(path.glob(f"runs/*/*/seed*/{COMPLETE}"))
 
 
 def find_runs(path: Path) -> list[RunFolder]:
-    """The runs below ``path``, a folder of ``fgloc run`` or ``fgloc compare``; InputError if there is none."""
+    """The runs below a result folder of ``fgloc run`` or ``fgloc compare``. Raises InputError if there is none."""
     folders = (
         [path] if (path / COMPLETE).is_file() else sorted(p.parent for p in path.glob(f"runs/*/*/seed*/{COMPLETE}"))
     )
@@ -104,9 +104,9 @@ def find_runs(path: Path) -> list[RunFolder]:
 
 
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
-    """The runs in ``folders``, of ``log``; each is named by its estimator, and by its seed or folder where that is not enough.
+    """Read the runs in ``folders`` on ``log``; each is named by its estimator, and by seed or folder where that is not unique.
 
-    InputError if a run is not of this log, or if one of its files is not as it was written.
+    Raises InputError if a run is not of this log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
     with_seeds = [f"{folder.estimator}-seed{folder.config.seed}" for folder in folders]
@@ -148,7 +148,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
 
 
 def _check_times(run: StoredRun, log: Log) -> None:
-    """A run of another log of the same name is told by its times."""
+    """Raise InputError if the times do not overlap: a run of another log of the same name."""
     first, last = log.span()
     for trajectory in (run.causal, run.final):
         if len(trajectory) and (trajectory.t[0] < first - OUTSIDE or trajectory.t[-1] > last + OUTSIDE):

@@ -1,4 +1,4 @@
-"""What viewers draw of a log, whatever the viewer: what is read or seen when, ellipses, paths."""
+"""Elements of a log that all viewers draw: observed objects, ellipses, paths."""
 
 import itertools
 import math
@@ -13,10 +13,10 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.marks import Marks, marks
 from factors.se2 import Array
 
-LIT_FOR = 0.5  # s that a tag or landmark stays lit after it was read or seen
-GAP = 1.0  # s between poses, above which nothing is said of the way between them
-CORNERS = 32  # of an ellipse
-SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # sigmas at which a Gaussian of two dimensions holds 95 %
+LIT_FOR = 0.5  # s that a tag or landmark stays highlighted after an observation
+GAP = 1.0  # s between poses, above which the path is interrupted
+CORNERS = 32  # of the polygon of an ellipse
+SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that contain 95 % of a two-dimensional Gaussian
 Colour = tuple[int, int, int]  # red, green, blue of 255
 REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
@@ -25,7 +25,7 @@ _CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
 @dataclass(frozen=True)
 class Lights:
-    """Which things are lit from each time on: ``t`` (N,) seconds, ``names``: N tuples."""
+    """The highlighted objects from each time on: ``t`` (N,) seconds, ``names``: N tuples."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]
@@ -33,23 +33,23 @@ class Lights:
 
 def colours() -> Iterator[Colour]:
     """The colour of the first, second, ... run, as in the plots."""
-    for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):  # the last is black, as is the ground of viewers
+    for colour in itertools.cycle(
+        drawing_figures.COLOURS[:-1]
+    ):  # without the last, black, which viewers have as background
         red, green, blue = bytes.fromhex(colour[1:])
         yield red, green, blue
 
 
 def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
-    """What sensors draw of a log and its map, layer by layer: where each thing is (3,) [m], and when it is lit, each for
-    :data:`LIT_FOR` seconds from when it is read or seen."""
+    """The map objects of each sensor: their positions (3,) [m], and when each is highlighted, for :data:`LIT_FOR` seconds from
+    an observation.
+    """
     found = sorted(marks(log), key=lambda one: one.order)
     return [(one, dict(zip(one.names, one.positions, strict=True)), _lights(one.t.tolist(), one.seen)) for one in found]
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Stamps (K,) and closed outlines (K, CORNERS + 1, 2) of the ellipses that hold 95 % of each position's Gaussian.
-
-    Poses without a covariance have none.
-    """
+    """Stamps (K,) and closed outlines (K, CORNERS + 1, 2) of the 95 % ellipses of the positions, for poses with a covariance."""
     if trajectory.covariances is None:
         return np.empty(0), np.empty((0, CORNERS + 1, 2))
     covariances = trajectory.covariances[:, :2, :2]
@@ -58,14 +58,16 @@ def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def outlines(centres: Array, covariances: Array) -> Array:
-    """Closed outlines (K, CORNERS + 1, 2) of the ellipses that hold 95 % of Gaussians (K, 2), (K, 2, 2)."""
+    """Closed outlines (K, CORNERS + 1, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2,
+    2).
+    """
     variances, axes = np.linalg.eigh(covariances)
     lengths = SCALE_95 * np.sqrt(np.maximum(variances, 0.0))
     return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
-    """Each name is lit from each of its times on, for :data:`LIT_FOR` seconds."""
+    """Each name is highlighted from each of its times on, for :data:`LIT_FOR` seconds."""
     switches = sorted(
         s for start, name in zip(t, names, strict=True) for s in ((start, 1, name), (start + LIT_FOR, -1, name))
     )

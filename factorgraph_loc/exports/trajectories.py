@@ -1,15 +1,15 @@
-"""Trajectories as files of KITTI; those of TUM are written by :func:`~factorgraph_loc.model.trajectory.write_tum`.
+"""Export of trajectories in KITTI format; for TUM see :func:`~factorgraph_loc.model.trajectory.write_tum`.
 
-A row of KITTI is the upper three rows of a pose (4, 4), row by row: A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous
-driving? The KITTI vision benchmark suite", CVPR 2012. The stamps are in a file of their own, one a row.
+Each row contains the upper three rows of a pose (4, 4), row by row: A. Geiger, P. Lenz, R. Urtasun, "Are we ready for
+autonomous driving? The KITTI vision benchmark suite", CVPR 2012. Stamps are in a separate file, one per row.
 """
 
 from pathlib import Path
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.results import writing
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.se2 import Array
@@ -32,15 +32,13 @@ def matrices(trajectory: Trajectory | Trajectory3) -> Array:
 
 
 def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:
-    """Write poses of KITTI, and their stamps [s from the log's start] beside them, as ``NAME.times.txt``, whose path is returned.
+    """Write poses in KITTI format, and their stamps [s from the log's start] to ``NAME.times.txt`` beside it; return that path.
 
-    The frame is the robot's, x forward, z up, and not that of a camera; nothing is shifted to start at the origin.
+    Poses are of the robot's frame (x forward, z up), not of a camera, and not relative to the first one.
     """
     rows = matrices(trajectory).reshape(-1, 12)
     times = path.with_name(path.stem + TIMES_SUFFIX)
-    try:
+    with writing(path):
         write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows.tolist()))
         write_text(times, "".join(f"{t:.9f}\n" for t in trajectory.t.tolist()))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     return times

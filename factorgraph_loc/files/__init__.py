@@ -11,6 +11,7 @@ __all__ = [
     "npz",
     "parquet",
     "quiet",
+    "results",
     "shipped",
     "tables",
     "temporary",

@@ -9,13 +9,14 @@ from factors.se2 import Array
 
 
 def planar_estimate(t: float, pose: SpacePose) -> PoseEstimate:
-    """A localized estimate of (x, y) and of the direction of the first axis as seen from above, with their covariance; it holds
-    the pose in space too."""
+    """A localized estimate of (x, y) and of the direction of the robot's first axis, seen from above, with covariance; it
+    contains the pose in space too.
+    """
     rotation = pose.rotation
     x, y = rotation[0, 0], rotation[1, 0]
     jacobian = np.zeros((3, 6))
     jacobian[:2, 3:] = rotation[:2]
-    # a small turn (a, b, c) moves the first axis by c times the second less b times the third
+    # a small rotation (a, b, c) moves the first axis by c times the second minus b times the third
     across = np.array((-y, x)) / max(x * x + y * y, 1e-12)
     jacobian[2, 1], jacobian[2, 2] = -across @ rotation[:2, 2], across @ rotation[:2, 1]
     seen: Array = np.array((pose.position[0], pose.position[1], np.arctan2(y, x)))
@@ -23,7 +24,7 @@ def planar_estimate(t: float, pose: SpacePose) -> PoseEstimate:
 
 
 def planar_trajectory(found: Trajectory3) -> Trajectory:
-    """A trajectory in space, with covariances, as seen from above."""
+    """A trajectory in space, with covariances, seen from above."""
     assert found.covariances is not None, "an estimate has covariances"
     rows = zip(found.t.tolist(), found.positions, found.rotations, found.covariances, strict=True)
     seen = [planar_estimate(t, SpacePose(*pose)) for t, *pose in rows]

@@ -1,15 +1,14 @@
 """ActiveMCL, the paper's Algorithm 2, with one particle filter.
 
-As it is printed, each action has particles of its own that are weighed by a scan that was not made, and the index m is both the map
-and the particle. Here one step is: propose ways; predict for each what would be read along it, drawn from the model of the
-antennas, and what would be left of the entropy; choose; move; and update the particles once, by what was really read. The first
-three are :mod:`~factorgraph_loc.planning.policies`, the loop is :mod:`~factorgraph_loc.planning.closed_loop`, and the particles are
-here.
+As printed, each action has particles of its own, weighted by a scan that was not made, and the index m is both the map and the
+particle. Here one step is: propose paths; predict the reads along each, drawn from the antenna model, and the remaining entropy;
+choose; move; and update the particles once, by the actual reads. The first three are in
+:mod:`~factorgraph_loc.planning.policies`, the loop in :mod:`~factorgraph_loc.planning.closed_loop`, the particles here.
 
-They begin evenly over free space. A scan is weighed a share at a time, with resampling from a kernel density in between
+They start uniform over free space. The likelihood of a scan is applied in steps, with resampling from a kernel density in between
 (progressive correction: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4). Their
-number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). Where tags are read that none
-of them expects, all begin anew (after sensor resetting: Lenser, Veloso, ICRA 2000, which replaces a share).
+number adapts to the size of the posterior (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). If tags are read that none of the
+particles predicts, all are drawn anew (after sensor resetting: Lenser, Veloso, ICRA 2000, which replaces a fraction).
 """
 
 import math
@@ -39,23 +38,26 @@ from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
-OUTSIDE = -1.0  # log-weight per motion of a particle that is where no robot can be
-KERNEL, NEIGHBOURS = 0.5, 4  # of the distance to the so many-th neighbour
-LEVER, WIDEST = 1.5, 0.7  # m: what a turn by a radian counts; the widest kernel
-LOST = math.log(1e-3)  # of the robot being anywhere, at a scan that reads tags
-ONE_PLACE, ONE_HEADING = 1.0, 0.8  # m, rad: largest standard deviations of a place
-MORE = 10  # times as many particles while they are everywhere
+RESAMPLE_BELOW, ENOUGH = (
+    0.5,
+    0.2,
+)  # relative effective sample size: below which to resample; which one step of a correction leaves
+OUTSIDE = -1.0  # log-weight per motion of a particle outside of free space
+KERNEL, NEIGHBOURS = 0.5, 4  # kernel width relative to the distance of the n-th neighbour, and n
+LEVER, WIDEST = 1.5, 0.7  # m: length equivalent of a radian; the widest kernel
+LOST = math.log(1e-3)  # probability of the robot being anywhere else, at a scan that reads tags
+ONE_PLACE, ONE_HEADING = 1.0, 0.8  # m, rad: largest standard deviations of a mode
+MORE = 10  # factor on the number of particles while the pose is unknown
 
 
 class ActiveMclSettings(FilterSettings):
-    """``particles``: their number where the place is known; while it may be anywhere there are up to :data:`MORE` times as many."""
+    """``particles``: their number once localized; before there are up to :data:`MORE` times as many."""
 
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
 
 
 class _View:
-    """What sensors see of the filter, at its time."""
+    """The view of the filter for sensors, at its time."""
 
     offset = None
     newest = True
@@ -89,7 +91,7 @@ class _View:
 
 
 class ActiveMcl(Filter):
-    """The particles of ActiveMCL; see the module. ``space``: where the robot may be."""
+    """The particle filter of ActiveMCL; see the module. ``space``: where the robot may be."""
 
     deterministic = False
     supports_unknown_start = True
@@ -109,7 +111,7 @@ class ActiveMcl(Filter):
         return Belief(cloud.modes(), cloud.poses, cloud.weights)
 
     def trajectory(self) -> Trajectory:
-        """The same as the causal estimates."""
+        """The causal estimates."""
         poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
         covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
         times = np.array([r.t for r in self._records])
@@ -119,7 +121,7 @@ class ActiveMcl(Filter):
         return _cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._count))
 
     def _seek(self, m: Measurement) -> Cloud:
-        """Evenly over free space and all headings."""
+        """Draw particles uniformly over free space and all headings."""
         self._state = self._everywhere()
         if self._sensors[m.modality].finder is None:
             self._see(m)
@@ -129,7 +131,7 @@ class ActiveMcl(Filter):
         count = MORE * self._count
         cells = np.floor((np.arange(count) + self._rng.random()) * len(self._space.centres) / count)
         places = self._space.centres[cells.astype(np.int64)] + CELL * (self._rng.random((count, 2)) - 0.5)
-        # a sequence of low discrepancy, so that neighbours look everywhere (golden ratio)
+        # a low-discrepancy sequence (golden ratio), so that neighbouring cells get different headings
         shares = (np.arange(count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
         return _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
 
@@ -145,12 +147,12 @@ class ActiveMcl(Filter):
             if isinstance(seen, NewVariable) or not seen.is_judged:  # strength and phase have many optima
                 continue
             if seen.found and sensor.finder is None:
-                # what is read where none of the particles is: they have lost the robot
+                # the reads are explained by none of the particles: the robot is lost
                 anywhere = self._everywhere()
                 told, else_told = (_evidence(c, seen.log_likelihood(c.poses, {})) for c in (self._state, anywhere))
                 if told < else_told + LOST:
                     self._state = anywhere
-                    sensor.restart(-math.inf)  # silences that were taken for those of another place
+                    sensor.restart(-math.inf)  # discard missed reads attributed to the old pose
             if self._is_one_place(self._state):
                 view = _View(self)
                 correction = seen.correct(view.pose, view.covariance, {}, {}, 1)
@@ -159,12 +161,12 @@ class ActiveMcl(Filter):
             self._state = self._tempered(self._state, partial(seen.log_likelihood, values={}))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weigh the particles by free lengths (D,) [m] that a proximity sensor has read; before the first scan there are none."""
+        """Weight the particles by free lengths (D,) [m] read by a proximity sensor; no effect before the first scan."""
         if self._state is not None:
             self._state = self._tempered(self._state, lambda poses: sensor.log_likelihood(poses, lengths))
 
     def _tempered(self, cloud: Cloud, log_likelihood: Callable[[Array], Array]) -> Cloud:
-        """Weighed by a likelihood, a share at a time."""
+        """The cloud weighted by a likelihood, in steps."""
         left = 1.0
         while left > 0.0:
             found = weighable(log_likelihood(cloud.poses), cloud.log_weights, self._t)
@@ -192,10 +194,10 @@ class ActiveMcl(Filter):
 
 
 def _drawn(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Particles (K, 3) drawn from kernels on the particles ``rows`` (K,) of ``poses`` (N, 3).
+    """Particles (K, 3) drawn from kernels at the particles ``rows`` (K,) of ``poses`` (N, 3).
 
-    Each kernel is as wide as befits the distance to the particles that are next to it: of many few are left where a scan tells
-    much, and what lies between them would be lost.
+    The width of each kernel adapts to the distance of the neighbouring particles, so that the posterior stays covered where an
+    informative scan leaves few particles.
     """
     different, which = np.unique(rows, return_inverse=True)
     kept = poses[different]

@@ -1,4 +1,4 @@
-"""What an active run was like: a robot that drives until it knows where it is."""
+"""Results of an active run: a robot that drives until it is localized."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class PlanningStep:
-    """One choice of a way.
+    """One choice of a path.
 
-    At ``t`` [s] after ``metres`` [m], the robot being at ``truth`` (3,) and estimated at ``pose`` (3,) with ``covariance`` (3, 3),
-    both NaN before anything was seen. ``particles`` (K, 3): equally likely ones of the belief. ``candidates``: ways (S, 3) from the
-    robot's true place, in the world's frame; ``values`` (C,): what the policy thought of them, higher is better, empty where it
-    compares none. ``chosen``: the way that was taken, as a candidate is, None where there was none. ``planning_ms``: time
-    that it took to choose.
+    At ``t`` [s] after ``metres`` [m], with true pose ``truth`` (3,), estimated ``pose`` (3,) and ``covariance`` (3, 3), both NaN
+    before the first observation. ``particles`` (K, 3): an equally weighted sample of the belief. ``candidates``: paths (S, 3)
+    from the true pose, in the world frame; ``values`` (C,): the policy's scores, higher is better, empty if it does not compare.
+    ``chosen``: the chosen path, None if there was none. ``planning_ms``: computing time.
     """
 
     t: float
@@ -36,9 +35,9 @@ class PlanningStep:
 class ActiveRun:
     """A run of one policy with one estimator in one world.
 
-    ``localized``: it knew where it was, and truly, after ``metres`` [m] and ``seconds`` [s], with ``error_position`` [m] and
-    ``error_heading`` [rad]; otherwise these are those at the end. ``claimed_wrong``: at some time it said that it knew, and was
-    wrong by more than three times the limits. ``truth``: where it went. ``steps``: its choices.
+    ``localized``: the robot was localized correctly, after ``metres`` [m] and ``seconds`` [s], with ``error_position`` [m] and
+    ``error_heading`` [rad]; otherwise these are the values at the end. ``claimed_wrong``: at some time the estimator claimed to
+    be localized with an error above three times the limits. ``truth``: the true trajectory. ``steps``: the choices.
     """
 
     seed: int
@@ -57,5 +56,5 @@ class ActiveRun:
 
     @property
     def planning_ms(self) -> Array:
-        """The time (N,) [ms] that each choice took."""
+        """Computing times (N,) [ms] of the choices."""
         return np.array([step.planning_ms for step in self.steps])

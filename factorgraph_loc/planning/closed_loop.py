@@ -1,4 +1,4 @@
-"""A simulated robot that chooses where to drive until it knows where it is."""
+"""Closed loop of a simulated robot that chooses its paths until it is localized."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -36,25 +36,24 @@ from factors import se2
 from factors.se2 import Array
 
 ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
-NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes that are no farther apart are one place
-SHOWN = 300  # particles of a belief that are kept
-SPREAD = 2000  # poses that stand for a belief without particles
-WRONG = 3.0  # times the limits: an error that is no bad luck
-MODES, LIKELY = 3, 0.05  # places, at most, and their least weight, from which ways lead to others
-TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, and nearest of places that are spread over free space
-LOOK = 0.5  # m that the robot drives between looks at the walls
-PAUSE = 1.0  # s that a robot waits that cannot go anywhere
-SLACK = 0.2  # m that particles may be nearer to walls than the robot: a cell's size
+NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes closer to each other are one place
+SHOWN = 300  # particles of a belief that are stored
+SPREAD = 2000  # samples of a belief without particles
+WRONG = 3.0  # times the limits: larger errors are false claims
+MODES, LIKELY = 3, 0.05  # maximum number of modes, and their least weight, from which distant places are planned
+TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, nearest of the places spread over free space, and number of those
+LOOK = 0.5  # m between proximity readings
+PAUSE = 1.0  # s that a robot waits if it has no path
+SLACK = 0.2  # m that particles may be nearer to walls than the robot: the size of a cell
 
 
 def run_active(
     simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings | None = None
 ) -> ActiveRun:
-    """Drive from an unknown start until the place is known, or until the robot gives up.
+    """Drive from an unknown start until the robot is localized or gives up.
 
-    Runs of one seed share world, start, and the sequences that noise is drawn from, whatever the policy and the estimator.
-    InputError names a wrong policy, estimator or start, and a sensor that is faster than the robot's control; RunFailedError tells
-    that the estimator failed, when, and by what.
+    Runs with the same seed share world, start, and noise sequences, for all policies and estimators. Raises InputError for a
+    wrong policy, estimator or start, and for a sensor faster than the robot's control; RunFailedError if the estimator fails.
     """
     settings = settings or ActiveSettings()
     for name, rate in _rates(simulation):
@@ -97,7 +96,7 @@ def run_active(
 
 
 class _Loop:
-    """Propose, predict, choose, move, and update by what was really read."""
+    """One run: propose, predict, choose, move, and update by the actual reads."""
 
     def __init__(
         self,
@@ -117,17 +116,17 @@ class _Loop:
         self._guard = guard
         self._space, self._settings, self._rng = space, settings, rng
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
-        self._looked_at = -math.inf  # metres driven when the particles were last told of the walls
+        self._looked_at = -math.inf  # metres driven at the last proximity update of the particles
         self._turned_at = -math.inf  # metres driven when the robot last turned around
         self._sensors = Sensors.of(
             setup.world, setup.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
         )
-        # where a robot is nearest to each tag
+        # positions of the robot next to each tag
         nearest_cells = cKDTree(space.centres).query(self._sensors.goals)[1]
         self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, SPREAD_OVER), PLACES))
 
     def run(self) -> bool:
-        """Whether the robot found out where it is."""
+        """Run to the end; whether the robot was localized."""
         robot, settings = self._robot, self._settings
         done = self._take(robot.begin())
         while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:
@@ -142,17 +141,17 @@ class _Loop:
         return done
 
     def errors(self) -> tuple[float, float]:
-        """Of the estimate, in position [m] and heading [rad]; not a number where there is none."""
+        """Errors of the estimate in position [m] and heading [rad], NaN without an estimate."""
         error = self._estimate().pose - self._robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Whether the place is known, and truly, on the way of these reports."""
+        """Process the reports; whether the robot is localized correctly after one of them."""
         for report in reports:
             self._feed(report)
             if isinstance(self._estimator, ActiveMcl) and self._robot.metres >= self._looked_at + LOOK:
                 self._looked_at = self._robot.metres
-                # filters move at scans and ticks alone
+                # filters move at scans and ticks only
                 self._feed(Tick(self._robot.t))
                 with self._guard.telling(f"the walls at {self._robot.t:.3f} s"):
                     self._estimator.see(self._robot.proximity, self._robot.look())
@@ -223,7 +222,7 @@ class _Loop:
         return choice
 
     def _far(self, modes: Sequence[Mode]) -> list[Path]:
-        """The shortest ways to places from each of those where the robot may well be: what tells them apart may be far away."""
+        """The shortest paths to places from each likely mode: what distinguishes the modes may be far away."""
         out: list[Path] = []
         policy = self._settings.policy
         for mode in modes:
@@ -238,7 +237,7 @@ class _Loop:
 
 
 def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
-    """How often per second the sensors of the robot measure, by the settings that say so."""
+    """Rates [Hz] of the robot's sensors, with the names of their settings."""
     yield "rounds_per_second", simulation.rounds_per_second
     for sensor in sensors().values():
         for section in sensor.simulation if sensor.on_robot else ():
@@ -255,7 +254,7 @@ def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) ->
 
 
 def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
-    """The true pose (3,) at first."""
+    """The true start pose (3,)."""
     place = space.centres[rng.integers(len(space.centres))] + CELL * (rng.random(2) - 0.5)
     drawn = np.array((*place, rng.uniform(-math.pi, math.pi)))
     if settings.start is None:
@@ -272,7 +271,7 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
 
 
 def _places(belief: Belief) -> tuple[Mode, ...]:
-    """The places of a belief that count, at most :data:`MODES`; two modes that are next to each other are one, the heavier."""
+    """The significant modes of a belief, at most :data:`MODES`; neighbouring ones are merged into the heavier."""
     places: list[Mode] = []
     for mode in belief.modes:
         if not np.all(np.isfinite(mode.pose)):
@@ -288,7 +287,7 @@ def _places(belief: Belief) -> tuple[Mode, ...]:
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
-    """A belief as particles (M, 3) with weights (M,): its own, or drawn from its modes; before it has any, from free space."""
+    """A belief as particles (M, 3) with weights (M,): its own, or drawn from its modes, or from free space if it has none."""
     if belief.particles is not None and belief.weights is not None and len(belief.particles):
         return belief.particles, belief.weights
     even = np.full(SPREAD, 1.0 / SPREAD)

@@ -1,12 +1,11 @@
-"""How much a robot expects to learn on a path: entropy of its belief now, less the mean entropy after the scans of the path.
+"""Expected information of a path: entropy of the belief, minus the mean entropy after the scans on the path.
 
-``h[p(x)] - E_z h[p(x | z, a)]``, to be maximised. Scans are drawn from the antenna model at particles of the belief, all particles
-are weighed by them, and the entropy is that of the weighted particles: Monte-Carlo over the belief, with the same particles and
-random numbers for all paths, so that the differences between paths are less noisy than the gains (common random numbers:
-Glasserman, Yao, Management Science 38(6), 1992).
+``h[p(x)] - E_z h[p(x | z, a)]``, to be maximised. Scans are drawn from the antenna model at particles of the belief, all
+particles are weighted by them, and the entropy is that of the weighted particles. All paths use the same particles and random
+numbers, so that the differences between paths have less variance than the gains (common random numbers: Glasserman, Yao,
+Management Science 38(6), 1992).
 
-Entropies are differential, in nats: of a Gaussian with the particles' covariance while the belief has one mode, of a histogram
-while it has several.
+Entropies are differential, in nats: of a Gaussian with the particles' covariance for a unimodal belief, else of a histogram.
 """
 
 import math
@@ -28,29 +27,30 @@ from factors.se2 import Array
 
 DIMS = ("x", "y", "heading")
 POSITION = ("x", "y")
-CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: of histograms; a whole number of headings
+CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; an integer number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
-LOOK = 1.5  # m, between looks, each of which stands for the rounds of so much of the way, or of turns that take as long
-LOOKS = 10  # at most: on a longer way they are farther apart
-SAMPLES, SCANS = 256, 48  # particles that are weighed, and those that scans are drawn from
-FEWEST = 10  # particles, of which each may stand for many
-SEVERAL = 0.5  # nats: a belief of one mode has at most so much less entropy than a Gaussian with its covariance
-WIDEST_HEADING = 0.8  # rad: no Gaussian in heading is wider
+LOOK = 1.5  # m between stations, each of which stands for the rounds on that distance, or in turns of the same duration
+LOOKS = 10  # maximum number of stations; on a longer path they are farther apart
+SAMPLES, SCANS = 256, 48  # particles that are weighted, and those that scans are drawn from
+FEWEST = 10  # least number of particles
+SEVERAL = 0.5  # nats by which the entropy of a unimodal belief may be below that of a Gaussian with its covariance
+WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
 
 
 def gaussian_entropy(covariance: Array, dims: Sequence[str] = DIMS) -> Array:
-    """Entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y, heading, in the dimensions ``dims``:
-    ``log(det(2 pi e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1)."""
+    """Entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y, heading, in the dimensions ``dims``: ``log(det(2
+    pi e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
+    """
     chosen = _columns(dims)
     part = np.asarray(covariance)[..., chosen, :][..., chosen]
     return np.asarray(0.5 * (len(chosen) * math.log(2.0 * math.pi * math.e) + np.linalg.slogdet(part)[1]))
 
 
 def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, cell: Array = CELL) -> Array:
-    """Entropy (...) [nats] of the density that has the weight of particles ``poses`` (M, 3), with ``weights`` (..., M), evenly over
-    each cell of size ``cell`` (3,) [m, m, rad], in the dimensions ``dims``.
+    """Histogram entropy (...) [nats] of particles ``poses`` (M, 3) with ``weights`` (..., M), in the dimensions ``dims``.
 
-    Comparable with :func:`gaussian_entropy` where the belief is wider than a cell and the particles are more than the cells.
+    ``cell`` (3,) [m, m, rad]: size of the cells. Comparable with :func:`gaussian_entropy` for beliefs wider than a cell and more
+    particles than cells.
     """
     chosen = _leading(dims)
     flat = np.atleast_2d(weights).reshape(-1, len(poses)).astype(np.float32)
@@ -61,12 +61,13 @@ def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, c
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """Whether particles (M, 3) with weights (M,) are not well described by a Gaussian: in place its entropy would be larger than
-    theirs, by :data:`SEVERAL`, or the heading is not known."""
+    """Whether particles (M, 3) with weights (M,) are poorly described by a Gaussian: the entropy of its position exceeds theirs
+    by more than :data:`SEVERAL`, or the heading is unknown.
+    """
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True
-    # a histogram spreads each particle over a cell: the variance of that is added to the Gaussian's (Sheppard)
+    # a histogram spreads each particle over a cell: add that variance to the Gaussian's (Sheppard's correction)
     gaussian = gaussian_entropy(covariance + np.diag(CELL**2 / 12.0), POSITION)
     return bool(gaussian - particle_entropy(poses, weights, POSITION) > SEVERAL)
 
@@ -85,12 +86,13 @@ def expected_gain(
     samples: int = SAMPLES,
     scans: int = SCANS,
 ) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths, of a belief of particles (M, 3) in the world with weights (M,).
+    """Expected reduction of entropy (C,) [nats] on each of C paths, for a belief of particles (M, 3) in the world with weights
+    (M,).
 
-    The entropy afterwards is that of where the robot is then. ``dims``: position alone, or position and heading. ``space``: a
-    particle whose way leads to a wall stops there, and measures no more. ``places`` (M,): which place each particle stands for;
-    then the entropy is that of the place, not of where in it. ``noise``: of the odometry on the way, none by default. ``samples``:
-    of the particles so many are weighed, and ``scans`` of those draw measurements of all ``sensors``.
+    The entropy afterwards is that of the pose at the end. ``dims``: position, or position and heading. ``space``: a particle
+    whose path leads into a wall stops there and measures no more. ``places`` (M,): the mode of each particle; the entropy is then
+    that of the mode index. ``noise``: of the odometry on the path, none by default. ``samples``: number of particles that are
+    weighted; ``scans`` of these draw measurements of all ``sensors``.
     """
     if not paths:
         return np.empty(0)
@@ -100,7 +102,7 @@ def expected_gain(
         systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
     )
     poses = np.ascontiguousarray(particles[rows], dtype=float)
-    # a cell for each place
+    # one cell per mode
     cells = None if places is None else np.multiply.outer(places[rows] + 0.5, (CELL[0], 0.0, 0.0))[None]
     count = len(poses)
     scans = min(scans, count)
@@ -121,17 +123,17 @@ def expected_gain(
         for forecast in sensors.forecasts:
             forecast.add_log_weights(at[1:-1], float(passed[c][-1]), stops, seed, log_weights)
         log_weights -= log_weights.max(axis=1, keepdims=True)
-        # a robot that gets to the end is there; one that is stopped is near its last look
+        # a robot that reaches the end is there; a stopped one is near its last station
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
         if cells is not None or (several and noise is None):
-            # the same as at the end, as the way moves all alike, but for how the places lie in the histogram's cells
+            # the entropy at the end of the path, up to the alignment with the histogram's cells
             index = np.zeros_like(index)
         after[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
     return np.asarray(before - after.mean(axis=1))
 
 
 def _columns(dims: Sequence[str]) -> list[int]:
-    """Columns of a pose; InputError names a wrong dimension."""
+    """Columns of a pose. Raises InputError for a wrong dimension."""
     if not dims:
         raise InputError(f"dims: are none, expected some of {', '.join(DIMS)}")
     for name in dims:
@@ -141,7 +143,7 @@ def _columns(dims: Sequence[str]) -> list[int]:
 
 
 def _leading(dims: Sequence[str]) -> int:
-    """How many of a pose's coordinates ``dims`` are, from the first on; InputError if there is a gap."""
+    """Number of leading coordinates in ``dims``. Raises InputError if there is a gap."""
     columns = _columns(dims)
     if columns != list(range(len(columns))):
         raise InputError(f"dims: are {', '.join(dims)}, expected x, y or x, y, heading")
@@ -160,8 +162,9 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
 
 
 def _stations(passed: Array, each: float) -> Places:
-    """Places among the poses of a path, by the metres (S,) that have ``passed`` there: the start, the looks, each in the middle of
-    about ``each`` metres, and the end."""
+    """Indices of the stations among the poses of a path, given the metres ``passed`` (S,): the start, the observations, each in
+    the middle of about ``each`` metres, and the end.
+    """
     count = min(max(1, round(passed[-1] / each)), LOOKS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
     looks = np.searchsorted(passed, middles - 1e-9)
@@ -169,7 +172,7 @@ def _stations(passed: Array, each: float) -> Places:
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
-    """Standard deviations (S, 3) of the motion from one station to the next, by way and turn."""
+    """Standard deviations (S, 3) of the motion from one station to the next."""
     distance = np.diff(path.way[steps])
     rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))

@@ -1,4 +1,4 @@
-"""Paths that a robot may take: arcs and straight runs, ways to places in free space, and how far walls let it go on them."""
+"""Candidate paths: arcs and straight lines, shortest paths in free space, and the free length before walls."""
 
 from __future__ import annotations
 
@@ -18,51 +18,54 @@ from factors import se2
 from factors.se2 import Array
 
 STEP = 0.25  # m, between the poses of a path
-DIRECTIONS = 12  # to which a robot may turn before it sets off
+DIRECTIONS = 12  # number of initial turns
 CURVATURES = (-0.6, -0.25, 0.0, 0.25, 0.6)  # rad/m
-SHORT = 0.5  # of the length: straight runs that end earlier
+SHORT = 0.5  # relative length of the short straight paths
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """``poses`` (S, 3) in the frame of the robot's pose at the start, which is the first of them: one about every :data:`STEP` of
-    the way, and the end; a turn in place is a pose more at the same place. ``kind``: where the path comes from."""
+    """``poses`` (S, 3) in the frame of the start pose, the first of them, at intervals of about :data:`STEP`, and the end; a turn
+    in place is an additional pose at the same position. ``kind``: how the path was proposed.
+    """
 
     poses: Array
     kind: str
 
     @cached_property
     def way(self) -> Array:
-        """Metres (S,) driven up to each pose."""
+        """Distance (S,) [m] driven up to each pose."""
         steps = se2.log(se2.between(self.poses[:-1], self.poses[1:]))
         return np.concatenate((np.zeros(1), np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
 
     @cached_property
     def turned(self) -> Array:
-        """Radians (S,) turned up to each pose, to either side."""
+        """Absolute angle (S,) [rad] turned up to each pose."""
         return np.concatenate((np.zeros(1), np.cumsum(np.abs(se2.wrap(np.diff(self.poses[:, 2]))))))
 
     @property
     def length(self) -> float:
-        """Metres driven."""
+        """Length [m]."""
         return float(self.way[-1])
 
     def passed(self, per_metre: float, per_radian: float) -> Array:
-        """What has passed (S,) up to each pose of what comes so often per metre driven or per radian turned, the more of both."""
+        """Expected counts (S,) up to each pose of events with rates ``per_metre`` and ``per_radian``, the larger of both per
+        step.
+        """
         steps = np.maximum(np.diff(self.way) * per_metre, np.diff(self.turned) * per_radian)
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
     def duration(self, speed: float, turn_rate: float) -> float:
-        """Seconds at ``speed`` [m/s] where no more than ``turn_rate`` [rad/s] is turned."""
+        """Duration [s] at ``speed`` [m/s] with a turn rate of at most ``turn_rate`` [rad/s]."""
         return float(self.passed(1.0 / speed, 1.0 / turn_rate)[-1])
 
     def until(self, length: float) -> Path:
-        """The path up to the last pose that is no farther than ``length`` [m] on the way."""
+        """The path up to the last pose within ``length`` [m]."""
         return Path(self.poses[self.way <= length + 1e-9], self.kind)
 
 
 def look_around() -> Path:
-    """A turn in place, once around: it takes time, but no way."""
+    """A full turn in place."""
     count = 2 * DIRECTIONS
     poses = np.zeros((count + 1, 3))
     poses[:, 2] = se2.wrap(2.0 * math.pi * np.arange(count + 1) / count)
@@ -70,13 +73,14 @@ def look_around() -> Path:
 
 
 def straight(turn: float, length: float) -> Path:
-    """A straight run of ``length`` [m] after a turn in place [rad]."""
+    """A straight path of ``length`` [m] after a turn in place [rad]."""
     return _arc(turn, 0.0, length)
 
 
 def primitives(length: float) -> list[Path]:
-    """Arcs and straight runs of ``length`` [m]: in each of :data:`DIRECTIONS`, after a turn in place, straight and gently curved,
-    and straight half as far; sharper curves to the front. InputError if the length is not above zero."""
+    """Arcs and straight paths of ``length`` [m]: for each of :data:`DIRECTIONS`, after a turn in place, straight, gently curved,
+    and straight of half the length; sharper curves ahead. Raises InputError if the length is not positive.
+    """
     if not (math.isfinite(length) and length > 0.0):
         raise InputError(f"horizon is {length:g} m, expected a length above 0")
     out = []
@@ -97,12 +101,12 @@ def waypoint_paths(
     beyond: float = 0.0,
     within: float = math.inf,
 ) -> list[Path]:
-    """The shortest paths through free space from ``pose`` (3,) to ``targets`` (K, 2) [m] in the world, by one search for all of
-    them (Dijkstra, 1959), straightened. The robot turns in place towards where each begins, and in its corners.
+    """The shortest paths through free space from ``pose`` (3,) to ``targets`` (K, 2) [m] in the world (Dijkstra, 1959),
+    straightened.
 
-    A pose that is too close to a wall starts from the free cell that is nearest; a target that is not in free space, or is where
-    the robot is, has no path. ``nearest``: to so many of the targets alone, of those that are at least ``beyond`` and at most
-    ``within`` [m] away on the grid.
+    The robot turns in place at the start and at corners. A pose too close to a wall starts from the nearest free cell; a target
+    outside of free space, or at the robot, has no path. ``nearest``: use only this many of the nearest targets, among those from
+    ``beyond`` to ``within`` [m] away on the grid.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
@@ -119,8 +123,9 @@ def waypoint_paths(
 
 
 def waypoints(space: FreeSpace, count: int) -> Array:
-    """At most ``count`` places (K, 2) [m] spread over free space, each the cell that is farthest from those before (Gonzalez,
-    Theoretical Computer Science 38, 1985), the first the one that is farthest from walls."""
+    """At most ``count`` places (K, 2) [m] spread over free space by farthest-point sampling (Gonzalez, Theoretical Computer
+    Science 38, 1985), starting with the one farthest from walls.
+    """
     i, j = np.nonzero(space.index >= 0)
     distance = np.empty(len(space.centres))
     distance[space.index[i, j]] = space.distance[i, j]
@@ -132,15 +137,11 @@ def waypoints(space: FreeSpace, count: int) -> Array:
     return np.asarray(space.centres[chosen])
 
 
-def free_length(space: FreeSpace, poses: Array, path: Path) -> Array:
-    """How far [m] (M,) along the path robots at ``poses`` (M, 3) in the world get before they are nearer to a wall than the
-    clearance. One that is too near at the start may drive off, as long as it gets farther away from walls."""
-    return np.asarray(path.way[free_steps(space, poses, [path])[0]])
-
-
 def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
-    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) reach; see :func:`free_length`. ``between``: parts in
-    which the way from each pose to the next is looked at."""
+    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) in the world reach with the clearance to walls.
+
+    A robot that is too close at the start may drive away from walls. ``between``: number of collision checks per step of a path.
+    """
     first = np.cumsum([0, *(len(path.poses) for path in paths)])
     along = np.concatenate([path.poses for path in paths]) if paths else np.empty((0, 3))
     out = np.empty((len(paths), len(poses)), dtype=np.int64)

@@ -1,11 +1,11 @@
-"""Policies: which way a robot that does not know its place should go.
+"""Policies that choose the path of a robot with an uncertain pose.
 
-``information``: the way of which the largest fall of the belief's entropy is expected, the entropy before minus the expected one
-after, less what the way costs. ``paper_literal``: the same with the sign as it is printed, the entropy after minus that before,
-which picks what tells least. ``random``, ``patrol`` and ``nearest_tags`` are what to compare with.
+``information``: the path with the largest expected reduction of the belief's entropy, minus its cost. ``paper_literal``: the same
+with the sign as printed in the paper, which prefers the least informative path. ``random``, ``patrol`` and ``nearest_tags`` are
+for comparison.
 
-All are given the same ways, those of which the robot's proximity sensor finds the first metre free, and where the robot has not
-turned around yet that turn. What leads to places far off is left to those that compare.
+All get the same candidates: paths whose first metre is free by the proximity sensor, and a turn in place unless the robot has
+just done one. Only policies that compare candidates use paths to distant places.
 """
 
 import math
@@ -29,22 +29,23 @@ from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
 
-NOTHING = 0.3  # nats: a gain that is as good as none, within the noise of the expectation
-FEW = 0.6  # weight of few places, that ways may lead from
-EACH, OF_MODES = 48, 96  # particles that stand for each of these, and that are looked at
-COMMITTED = 0.5  # of an arc, before another is chosen
-FAR = "waypoint"  # kind of ways to places
-FAR_PER_METRE = 0.02  # nats: of ways that tell the same the shorter is gone
+NOTHING = 0.3  # nats: gains below are within the noise of the expectation
+FEW = 0.6  # total weight of the modes that paths may start from
+EACH, OF_MODES = 48, 96  # particles per mode, and in total
+COMMITTED = 0.5  # fraction of an arc to complete before choosing again
+FAR = "waypoint"  # kind of paths to places
+FAR_PER_METRE = 0.02  # nats: prefers the shorter of equally informative paths
 AHEAD = 1.0  # m that must be free
-BACK = math.radians(135.0)  # a turn beyond which a patrol would go back where it came from
-NEAR = 3  # tags that tell a place
+BACK = math.radians(135.0)  # a turn beyond which a patrol would go back
+NEAR = 3  # tags that determine a place
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What a policy knows: the belief as ``particles`` (M, 3) with ``weights`` (M,), what ``sensors`` would tell on a way, where
-    walls are (``space``), and the ``candidates`` with how far [m] each is ``free`` (C,), as far as the sensor sees. ``modes``: the
-    places that count."""
+    """The input of a policy: the belief as ``particles`` (M, 3) with ``weights`` (M,), ``sensors`` for forecasts, walls
+    (``space``), and ``candidates`` with their ``free`` (C,) length [m] within the range of the proximity sensor. ``modes``: the
+    significant ones.
+    """
 
     particles: Array
     weights: Array
@@ -59,8 +60,9 @@ class Situation:
 
 @dataclass(frozen=True)
 class Choice:
-    """The way to go, None where there is none, for at most ``metres``; ``values`` (C,): of the candidates, not a number where one
-    is not looked at, or (0,) if they are not compared."""
+    """The chosen path, None if there is none, to follow for at most ``metres``; ``values`` (C,): scores of the candidates, NaN if
+    not evaluated, or (0,) if the policy does not compare.
+    """
 
     path: Path | None
     metres: float
@@ -68,16 +70,16 @@ class Choice:
 
 
 class Policy(Protocol):
-    """Chooses a way."""
+    """Chooses a path."""
 
     def choose(self, situation: Situation) -> Choice: ...
 
 
 class Information:
-    """By expected information; ``sign`` -1: as the paper prints it.
+    """Chooses by expected information; ``sign`` -1: as printed in the paper.
 
-    What is near comes first. Where nothing near is worth its way, places far off are looked at, that tell few possible poses apart;
-    where these tell nothing either, or the robot may be anywhere, it patrols.
+    Near paths come first. If none is worth its cost, distant places that distinguish few possible poses are evaluated; if these
+    yield nothing either, or the pose is unknown, the robot patrols.
     """
 
     def __init__(self, sign: float = 1.0) -> None:
@@ -103,14 +105,14 @@ class Information:
             values[far] = self._sign * gains - _costs(s, far, FAR_PER_METRE)
             if np.max(gains) >= NOTHING:
                 best = s.candidates[far[int(np.argmax(values[far]))]]
-                # who goes far away for something is on the way for long, and would turn back for less
+                # a long path is followed to its end, not abandoned for a small gain
                 return Choice(best, best.length, values)
         patrol = self._otherwise.choose(s)
         return Choice(patrol.path, settings.replan, patrol.values)
 
     @staticmethod
     def _near(s: Situation, paths: Sequence[Path]) -> Array:
-        """Of all that the belief says."""
+        """Gains with respect to the whole belief."""
         settings = s.settings.policy
         if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
             return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
@@ -126,18 +128,19 @@ class Information:
         )
         if len(s.modes) != 1:
             return gains
-        # else it would go to and fro for what the odometry takes away again
+        # otherwise the robot would go back and forth to compensate the noise of the odometry
         alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
         return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
     @staticmethod
     def _far(s: Situation, paths: Sequence[Path]) -> Array:
-        """Of which place it is, or, where there is but one, of where in it. Particles would spread on a long way, and run into
-        walls that the robot will have turned from: it plans anew before."""
+        """Gains with respect to the mode index or, for a single mode, to the position in it. Particles would spread over a long
+        path and run into walls that the real robot avoids by planning again.
+        """
         if len(s.modes) == 1:
             (mode,) = s.modes
             return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
-        # which of equal places is the heavier is the luck of the particles
+        # which of equal modes is the heavier is random
         weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
         return expected_gain(
             s.sensors,
@@ -152,26 +155,26 @@ class Information:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Nats (K,) that the candidates ``rows`` (K,) cost."""
+    """Costs (K,) [nats] of the candidates ``rows`` (K,)."""
     paths = [s.candidates[i] for i in rows]
     seconds = [p.duration(s.settings.speed, s.settings.turn_rate) for p in paths]
     return per_metre * np.array([p.length for p in paths]) + s.settings.policy.per_second * np.array(seconds)
 
 
 class Random:
-    """Any of the arcs and short straight runs, to its end, or the turn in place."""
+    """Any of the arcs, short straight paths and turns in place, to its end."""
 
     def choose(self, situation: Situation) -> Choice:
         arcs = [p for p in situation.candidates if p.kind != FAR]
         if not arcs:
             return Choice(None, 0.0, np.empty(0))
         path = arcs[int(situation.rng.integers(len(arcs)))]
-        # a turn has no length, but takes no more way than there is
+        # a turn has length 0 and needs no free space
         return Choice(path, max(path.length, situation.settings.policy.replan), np.empty(0))
 
 
 class Patrol:
-    """Straight on until a wall is near, then to where most is free; back only where nothing else is."""
+    """Straight on until a wall is near, then in the direction with the most free space; back only if nothing else is free."""
 
     def choose(self, situation: Situation) -> Choice:
         straight = [(i, p) for i, p in enumerate(situation.candidates) if _is_straight(p)]
@@ -182,7 +185,7 @@ class Patrol:
         if turns.min() < 1e-6 and free[turns.argmin()] > AHEAD:
             best = int(turns.argmin())
         else:
-            # the freest, and of those that are as free the one that is turned to soonest
+            # the longest free path; of equal ones that with the smallest turn
             best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
         direction = _direction(straight[best][1])
         way = situation.settings.max_metres
@@ -196,7 +199,7 @@ class Patrol:
 
 
 class NearestTags:
-    """Towards where the nearest tags are nearest, in the mean of the belief."""
+    """Towards the nearest tags, on average over the belief."""
 
     def choose(self, situation: Situation) -> Choice:
         s = situation
@@ -215,7 +218,7 @@ POLICIES = ("information", "paper_literal", "random", "patrol", "nearest_tags")
 
 
 def make_policy(name: str) -> Policy:
-    """A policy by name; InputError names a wrong one."""
+    """A policy by name. Raises InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
     made: dict[str, Policy] = {
@@ -229,13 +232,13 @@ def make_policy(name: str) -> Policy:
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
-    """The ways whose first metre is free, up to where the sensor sees the first wall on them, with how far they are free."""
+    """The paths whose first metre is free, shortened to the range of the sensor, with their free lengths."""
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]
 
 
 def _direction(path: Path) -> float:
-    """Where a straight way leads [rad], from where the robot looks."""
+    """The direction of a straight path [rad] relative to the robot's heading."""
     return math.atan2(*path.poses[-1, 1::-1].tolist())
 
 

@@ -1,4 +1,4 @@
-"""A simulated robot that drives as it is told, by its own odometry, and measures on the way."""
+"""A simulated robot that follows commands by its own odometry and reports measurements."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,17 +22,17 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 from factors import se2
 from factors.se2 import Array
 
-DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")  # whose numbers stay what they are
+DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")  # the order determines the random sequences
 PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
-BETWEEN = 5  # parts of the way from one pose of a path to the next
+BETWEEN = 5  # collision checks per step of a path
 
 
 class SimulatedRobot:
-    """The robot at its true place; see the module.
+    """A simulated robot at its true pose.
 
-    Its wheels err as :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry` says: what it is told is what they report,
-    and what it does is what differs. Steps and each sensor draw from sequences of their own, so that
-    robots of one seed have the same luck as long as they drive alike.
+    Its odometry has the errors of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`: commands are followed by
+    the reported motion, and the true motion differs. Motion and sensors use separate random sequences, so that robots of one seed
+    have the same noise as long as they drive alike.
     """
 
     def __init__(
@@ -64,38 +64,38 @@ class SimulatedRobot:
         self._truth = [(0.0, *self.pose.tolist())]
 
     def trajectory(self) -> Trajectory:
-        """Where it really went."""
+        """The true trajectory."""
         rows = np.array(self._truth)
         return Trajectory(rows[:, 0], rows[:, 1:])
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What it reports, by name."""
+        """Channels of its measurements."""
         return (IncrementOdometry.sensor, *(one.channel for one in self._order))
 
     @property
     def decisive(self) -> tuple[str, ...]:
-        """The channels after each of whose reports it asks itself whether it knows its place."""
+        """The channels after whose measurements it checks whether it is localized."""
         return tuple(one.channel for one in self._order if one.decides or not self._order[0].decides)
 
     def begin(self) -> Iterator[Measurement]:
-        """What it reports before it has moved: a row of odometry without motion, and a first measurement of each sensor."""
+        """Measurements before the first motion: a row of odometry without motion, and one of each sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield from self._found()
 
     def free_ahead(self, paths: Sequence[Path]) -> Array:
-        """How far [m] (C,) each of C ways can be gone, as far as the proximity sensor sees."""
-        # as finely as it drives: the corner of a wall fits between two poses of a path
+        """Free length [m] (C,) of each of C paths, within the range of the proximity sensor."""
+        # as finely as it drives: a corner may lie between two poses of a path
         steps = free_steps(self._space, self.pose[None], paths, BETWEEN)[:, 0]
         way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
         return np.asarray(np.minimum(way, self._settings.sight))
 
     def look(self) -> Array:
-        """Free lengths [m] (D,) all around, as its proximity sensor measures them."""
+        """Free lengths [m] (D,) measured by its proximity sensor."""
         return self.proximity.read(self.pose, self._lengths)
 
     def drive(self, path: Array, metres: float) -> Iterator[Measurement]:
-        """Follow a way (S, 3) in the robot's frame for at most so many metres, not counting turns in place; stop before a wall."""
+        """Follow a path (S, 3) in the robot's frame for at most ``metres``, not counting turns in place; stop before a wall."""
         for told in self._told(path, metres):
             n1, n2, n3 = self._noise.standard_normal(3)
             root = math.sqrt(math.hypot(told[0], told[1]))
@@ -115,21 +115,21 @@ class SimulatedRobot:
             yield from self._passed(np.zeros(3))
 
     def _passed(self, told: Array) -> Iterator[Measurement]:
-        """The reports of one period."""
+        """The measurements of one period."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(told[0]), float(told[1]), float(told[2]))
         yield from self._found()
 
     def _found(self) -> Iterator[Measurement]:
-        """What its sensors report that are due."""
+        """The measurements of the sensors that are due."""
         for i, sensor in enumerate(self._order):
             if self.t * sensor.rate >= self._measured[i] - 1e-6:
                 self._measured[i] += 1
                 yield sensor.measure(self.t, self.pose)
 
     def _told(self, path: Array, metres: float) -> Array:
-        """Motions (N, 3) of one period each along a way, each in the robot's frame before it."""
+        """Reported motions (N, 3) of one period each along a path, each in the robot's frame before it."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
         seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)
@@ -143,6 +143,6 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, there: Array) -> bool:
-        """Whether the robot may go there: to a free cell, or, where it is in none, to a cell that is no nearer to a wall."""
+        """Whether the robot may move there: to a free cell or, from a cell that is not free, to one no nearer to a wall."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, there))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

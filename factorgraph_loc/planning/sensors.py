@@ -1,4 +1,4 @@
-"""What a robot looks with, as expectations of what it will learn see it."""
+"""The sensors of a robot as used for the prediction of information."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from factorgraph_loc.sensors.registry import functions
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-SPEED = 0.5  # m/s, at which the odometry's noise that grows with time is taken
-METRES_PER_RADIAN = 0.5  # of a robot that turns in place by 1 rad/s
+SPEED = 0.5  # m/s, for the noise of the odometry that grows with time
+METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
 
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """What a robot looks with on its way. ``odometry``: noise of its motion; ``forecasts``: of the sensors that find something in
-    the map; ``metres_per_radian``: that take as long as a turn in place."""
+    """``odometry``: noise of the motion; ``forecasts``: of the sensors that observe objects in the map; ``metres_per_radian``:
+    distance driven in the time of a turn by one radian.
+    """
 
     odometry: OdometryModel
     forecasts: tuple[Forecast, ...] = ()
@@ -31,7 +32,7 @@ class Sensors:
 
     @property
     def goals(self) -> Array:
-        """Places (K, 2) near which they tell most."""
+        """Places (K, 2) near which the sensors are most informative."""
         return np.concatenate([np.empty((0, 2)), *(one.goals for one in self.forecasts)])
 
     @staticmethod
@@ -43,13 +44,14 @@ class Sensors:
         turn_rate: float = SPEED / METRES_PER_RADIAN,
         only: Collection[str] | None = None,
     ) -> Sensors:
-        """All sensors of a rig that find something in the world, or ``only`` those of these names, with the rates of a simulation's
-        ``settings``."""
+        """All sensors of a rig that observe objects in the world, or ``only`` those with these names, with the rates in a
+        simulation's ``settings``.
+        """
         made = [
             forecast(world, rig, speed, settings)
             for name, forecast in functions("forecast")
             if only is None or name in only
         ]
-        # those first that lead somewhere: sums depend on the order in their last digits
+        # those with goals first: the order affects the rounding of sums
         found = sorted((one for one in made if one is not None), key=lambda one: not len(one.goals))
         return Sensors(odometry_model(rig, constants_as_noise=True), tuple(found), speed / turn_rate)

@@ -1,4 +1,4 @@
-"""What may be set of an active run: the robot, when it knows its place, and how a policy chooses."""
+"""Settings of an active run: the robot, when it counts as localized, and the policy."""
 
 import math
 from typing import Annotated, Literal
@@ -13,12 +13,12 @@ Dimension = Literal["x", "y", "heading"]
 
 
 class PolicySettings(FileModel):
-    """How the next way is chosen. ``horizon`` [m]: length of arcs and straight runs; ``far`` [m]: of the longest ways to places.
-    ``replan`` [m]: how far the robot goes at least before it chooses anew: half of a longer arc, and all of a way to a place, which
-    would be turned back from for less. ``per_metre`` and ``per_second``: what a near way costs, in nats; of far ones the seconds
-    cost as much.
-    ``samples``: particles of the belief that the expectation is taken over. ``dimensions``: whose entropy counts.
-    ``expectation``: over scans that are drawn, or, of a belief in one place, by Fisher's information in closed form."""
+    """How the next path is chosen. ``horizon`` [m]: length of arcs and straight paths; ``far`` [m]: of the longest paths to
+    places. ``replan`` [m]: least distance driven before choosing again (half of a longer arc, the whole path to a place).
+    ``per_metre`` and ``per_second``: cost of a near path in nats; far ones cost per second only. ``samples``: number of particles
+    for the expectation. ``dimensions``: whose entropy counts. ``expectation``: over sampled scans or, for a unimodal belief, by
+    the Fisher information in closed form.
+    """
 
     horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 3.0
     far: Metres = 25.0
@@ -38,12 +38,12 @@ class PolicySettings(FileModel):
 
 
 class ActiveSettings(FileModel):
-    """An active run. ``policy``: see :class:`PolicySettings`. ``particles``: of ``active_mcl``.
+    """Settings of an active run. ``policy``: see :class:`PolicySettings`. ``particles``: of ``active_mcl``.
 
-    ``speed`` and ``turn_rate`` of the robot; ``clearance`` [m] to walls, nearer than which it does not go; ``sight`` [m]: how far
-    its proximity sensor sees them. ``start``: the true (x, y, heading), by default anywhere in free space. The robot knows its
-    place once the standard deviations of position (along the longest axis) and heading are below ``position_limit`` [m] and
-    ``heading_limit`` [rad], and its errors too. It gives up after ``max_metres`` or ``max_seconds``.
+    ``speed`` and ``turn_rate`` of the robot; ``clearance`` [m]: least distance from walls; ``sight`` [m]: range of its proximity
+    sensor. ``start``: the true (x, y, heading), by default random in free space. The robot is localized once the standard
+    deviations of position (along the longest axis) and heading, and the errors, are below ``position_limit`` [m] and
+    ``heading_limit`` [rad]. It gives up after ``max_metres`` or ``max_seconds``.
     """
 
     policy: PolicySettings = PolicySettings()

@@ -1,4 +1,4 @@
-"""Logs that are made, not recorded: worlds, drives through them, and what sensors would have reported."""
+"""Simulated logs: worlds, drives through them, and sensor measurements."""
 
 from factorgraph_loc.sensors.rfid.recorded import recorded_looks
 from factorgraph_loc.simulation.filming import Film, film, with_images

@@ -1,11 +1,11 @@
-"""Generators of random numbers by the names of what is drawn, so that to change one thing leaves the others as they are."""
+"""Independent random generators by name, so that a change to one part of a simulation does not affect the others."""
 
 import hashlib
 from typing import Any
 
 import numpy as np
 
-# of a log; the numbers of the first ones stay what they are: more may follow
+# of a log; append only, as their numbers determine the sequences
 NAMES = (
     "world",
     "drive",
@@ -23,9 +23,9 @@ NAMES = (
 
 
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
-    """The generator of what is called ``name``, from the start: that of its number among ``names``, or of its name's hash.
+    """A generator for ``name``, seeded by its index among ``names`` or else by its hash.
 
-    ``seed``: a number, or the sequence of seeds of another generator.
+    ``seed``: a number, or the seed sequence of another generator.
     """
     other = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
     key = names.index(name) if name in names else other

@@ -1,4 +1,4 @@
-"""The images that the camera of a simulated robot takes on its drive, one by one or as files of a log."""
+"""Camera images of a simulated drive, one by one or as files of a log."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -28,24 +28,24 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-# a PNG is five times as large and takes ten times as long; colours at full resolution, as features look at them
+# PNG is five times as large and ten times as slow; no chroma subsampling, as features use colours
 JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
     95,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
-MOMENT = 0.02  # s to either side, over which the velocity of the robot is taken
-PERIODS = (8.0, 13.0, 29.0)  # s, in which the brightness wanders
-FEW = 40  # images, for which it does not pay to start processes
+MOMENT = 0.02  # s before and after, over which the robot's velocity is averaged
+PERIODS = (8.0, 13.0, 29.0)  # s, periods of the brightness variation
+FEW = 40  # images for which starting processes does not pay
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """N images: ``film[i]`` (H, W, 3) BGR, the same however often and in whatever order they are asked for.
+    """N images: ``film[i]`` (H, W, 3) BGR is reproducible and independent of the order of access.
 
-    ``times`` (N,) [s]: of the middle of the exposure; ``stamps`` (N,): the same by the camera's clock. ``truth``: of the robot.
-    ``renderer``: what takes them, and knows what each pixel shows.
+    ``times`` (N,) [s]: of the middle of the exposure; ``stamps`` (N,): the same by the camera's clock. ``truth``: the robot's
+    trajectory. ``renderer``: renders the images and knows what each pixel shows.
     """
 
     renderer: Renderer
@@ -69,12 +69,12 @@ class Film:
         return self.renderer.image(position, rotation, velocity=velocity, turn=turn, gain=self._gain(t), rng=noise)
 
     def __iter__(self) -> Iterator[tuple[float, Image]]:
-        """Stamps and images."""
+        """Iterate over stamps and images."""
         for i, stamp in enumerate(self.stamps.tolist()):
             yield stamp, self[i]
 
     def _velocity(self, t: float) -> Array:
-        """In the world's frame (3,) [m/s, m/s, rad/s]."""
+        """Velocity in the world frame (3,) [m/s, m/s, rad/s]."""
         a, b = max(t - MOMENT, float(self.truth.t[0])), min(t + MOMENT, float(self.truth.t[-1]))
         before, after = self.truth.at(np.array((a, b)))
         change = after - before
@@ -90,7 +90,7 @@ class Film:
 def film(settings: SimulationSettings, seed: int) -> Film:
     """The images of the log that :func:`~factorgraph_loc.simulation.simulate` makes of the same settings and seed.
 
-    InputError if the rig has no camera.
+    Raises InputError if the rig has no camera.
     """
     camera = settings.rig.find(CameraSettings)
     if camera is None:
@@ -113,10 +113,10 @@ def with_images(
     workers: int = 1,
     tell: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
-    """``log``, which was simulated with the same settings and seed, with images that are written to ``folder``.
+    """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them.
 
-    ``workers`` processes are spawned where that pays, so a script needs the usual ``if __name__ == "__main__"``; ``tell`` is
-    told how many images there are, of how many. InputError as of :func:`film`.
+    ``workers``: number of processes spawned for many images, so that a script needs ``if __name__ == "__main__"``; ``tell``:
+    called with the number of images done and of all. Raises InputError as :func:`film` does.
     """
     assert log.reference is not None, "a simulated log has one"
     times = times_of(settings.images.rate, log.reference)
@@ -138,7 +138,7 @@ def _write_in_parallel(
     workers: int,
     tell: Callable[[float, float], None],
 ) -> None:
-    """Each process makes the scene for itself, and every n-th image."""
+    """Each process makes the scene and every n-th image."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(write, parts, workers, beat=lambda: tell(sum(1 for _ in folder.glob("*.jpg")), count)):

@@ -1,7 +1,6 @@
-"""What hangs on the walls of a simulated building and stands before them, drawn by code: each a BGR picture of a size in texels.
+"""Procedural pictures of objects on and before the walls of a simulated building, as BGR arrays of a given size in texels.
 
-Nothing is copied from real pictures. All have what a detector of corners looks for in a real office: print, frames, edges of
-colour at several scales; and no two are alike.
+They are random and have corners at several scales, as print, frames and edges of colour in a real office do.
 """
 
 import colorsys
@@ -20,12 +19,12 @@ PAPER: Colour = (232, 238, 238)
 
 
 def vivid(rng: np.random.Generator) -> Colour:
-    """A strong colour."""
+    """A saturated colour."""
     return _colour(rng.random(), rng.uniform(0.3, 0.85), rng.uniform(0.3, 0.9))
 
 
 def pale(rng: np.random.Generator) -> Colour:
-    """A colour that walls are painted in."""
+    """A colour of painted walls."""
     return _colour(rng.random(), rng.uniform(0.04, 0.2), rng.uniform(0.66, 0.88))
 
 
@@ -40,21 +39,21 @@ def filled(height: int, width: int, colour: Colour) -> Canvas:
 
 
 def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> NDArray[np.float32]:
-    """Smooth noise (H, W) of deviation about 1, that changes over ``cell`` texels."""
+    """Smooth noise (H, W) of standard deviation about 1 that varies over ``cell`` texels."""
     coarse = rng.standard_normal((2 + int(height / cell), 2 + int(width / cell))).astype(np.float32)
     return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
 
 def shaded(canvas: Canvas, factor: NDArray[np.float32]) -> Canvas:
-    """The picture times ``factor`` (H, W)."""
+    """The picture multiplied by ``factor`` (H, W)."""
     out = np.empty_like(canvas)
-    for i in range(0, len(canvas), 256):  # in strips, as large ones need much memory
+    for i in range(0, len(canvas), 256):  # in strips, to bound the memory
         out[i : i + 256] = np.clip(canvas[i : i + 256] * factor[i : i + 256, :, None], 0.0, 255.0)
     return out
 
 
 def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
-    """Put a picture with its upper left corner at texel (x, y); what is beyond the canvas is cut off."""
+    """Paste a picture with its upper left corner at texel (x, y), clipped to the canvas."""
     height, width = canvas.shape[:2]
     x0, y0 = max(x, 0), max(y, 0)
     x1, y1 = min(x + picture.shape[1], width), min(y + picture.shape[0], height)
@@ -63,7 +62,7 @@ def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, colour: Colour) -> None:
-    """Lines of something like print in ``box`` (x1, y1, x2, y2): letters of 5 x 3 dots of ``size`` texels."""
+    """Draw lines that look like print in ``box`` (x1, y1, x2, y2): letters of 5 x 3 dots of ``size`` texels."""
     x1, y1, x2, y2 = box
     letters, lines = (x2 - x1) // (4 * size), (y2 - y1) // (8 * size)
     for line in range(lines):
@@ -77,7 +76,7 @@ def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, in
 
 
 def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A printed sheet with a headline, lines and perhaps a figure."""
+    """A printed sheet with a headline, lines and possibly a figure."""
     out = filled(height, width, PAPER if rng.random() < 0.6 else pale(rng))
     edge = max(2, width // 12)
     top = height // 5
@@ -91,7 +90,7 @@ def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def abstract(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Shapes of many sizes on a ground, some upon others."""
+    """Overlapping shapes of many sizes on a background."""
     out = filled(height, width, vivid(rng))
     for scale in (0.5, 0.5, *([0.3] * 4), *([0.15] * 6), *([0.08] * 8)):
         at, radius = rng.uniform((0, 0), (width, height)), scale * min(width, height) * rng.uniform(0.6, 1.2) + 1.0
@@ -180,7 +179,7 @@ def whiteboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A view out of the building behind panes; painted on the wall as it were, so it stays where it is."""
+    """A view through a window, flat on the wall, without parallax."""
     out = filled(height, width, (225, 228, 228))
     frame, panes = 10, max(1, width // 180)
     view = shaded(landscape(rng, height, width), np.full((height, width), 1.15, dtype=np.float32))
@@ -193,7 +192,7 @@ def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Shelves with books, their titles along the spines."""
+    """Shelves of books with titles along the spines."""
     side = wood(rng)
     out = filled(height, width, (int(0.4 * side[0]), int(0.4 * side[1]), int(0.4 * side[2])))
     levels = max(1, round(height / 70.0))
@@ -203,7 +202,7 @@ def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
         x = 6
         while x < width - 10:
             if rng.random() < 0.06:
-                x += int(rng.integers(10, 40))  # a gap
+                x += int(rng.integers(10, 40))  # gap
                 continue
             thick, tall = int(rng.integers(4, 12)), int(room * rng.uniform(0.6, 0.95))
             spine = filled(tall, thick, vivid(rng))
@@ -219,7 +218,7 @@ def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def cupboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Doors or drawers with handles, and what people stick on them."""
+    """Doors or drawers with handles and stickers."""
     grain = 1.0 + 0.06 * cv2.resize(clouds(rng, max(height // 12, 2), width, 2.0), (width, height))
     out = shaded(filled(height, width, wood(rng) if rng.random() < 0.7 else pale(rng)), grain.astype(np.float32))
     columns, rows = max(1, round(width / 90.0)), int(rng.integers(1, 5))

@@ -1,4 +1,4 @@
-"""Floor plans: walls, furniture and shelves as segments, and the surfaces that tags are put on."""
+"""Floor plans: walls, furniture and shelves as segments, and the surfaces that tags are mounted on."""
 
 import math
 from dataclasses import dataclass
@@ -12,20 +12,21 @@ from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array
 
 Segment = tuple[float, float, float, float]
-ROOM_WIDTH = 5.0  # m, about
+ROOM_WIDTH = 5.0  # m, approximate
 CORRIDOR_WIDTH = 2.0
 DOOR_WIDTH = 1.0
 SHELF_DEPTH = 1.0
 AISLE_WIDTH = 3.0
-HALL_WIDTH = 3.0  # of the corridors of an H
+HALL_WIDTH = 3.0  # m, of the corridors of the H-shaped plan
 FROM_END = 2.0  # m, of a tag from the end of a corridor
-LOWEST_BOX = 1.4  # m: no furniture and no shelf is lower
+LOWEST_BOX = 1.4  # m: least height of furniture and shelves
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Outline and inner walls, ``boxes`` (furniture, shelves, closed rooms) by their corners (x1, y1, x2, y2), and the gaps in
-    walls that are ``doors``, all in metres; ``hanging``: places (x, y) of tags that hang, in place of any on surfaces."""
+    """Outline and inner walls, ``boxes`` (furniture, shelves, closed rooms) as (x1, y1, x2, y2), and ``doors``, gaps in walls,
+    all in metres; ``hanging``: positions (x, y) of hanging tags, which replace tags on surfaces.
+    """
 
     width: float
     depth: float
@@ -35,17 +36,17 @@ class Plan:
     hanging: tuple[tuple[float, float], ...] = ()
 
     def segments(self) -> Array:
-        """Everything that nobody drives or sees through: (S, 4)."""
+        """All segments (S, 4) that block motion and sight."""
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
-        """The sides of walls and of boxes as segments (F, 4), the free side on the left of each. Inner walls have two."""
+        """The sides of walls and of boxes as segments (F, 4) with the free side on the left. Inner walls have two."""
         walls = [face for wall in self.walls for face in both_sides(wall) if self._is_inside(face)]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
         return np.array(walls).reshape(-1, 4), np.array(boxes).reshape(-1, 4)
 
     def open(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 2) are in the building and in none of the boxes."""
+        """Whether points (N, 2) are inside the building and outside of all boxes."""
         x, y = points.T
         out = self.indoors(points)
         for x1, y1, x2, y2 in self.boxes:
@@ -53,12 +54,12 @@ class Plan:
         return np.asarray(out)
 
     def indoors(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 2) are in the building, in a box or not."""
+        """Whether points (N, 2) are inside the building."""
         x, y = points.T
         return np.asarray((x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth))
 
     def _is_inside(self, face: Segment) -> bool:
-        """Whether the left side of a face is in the building."""
+        """Whether the left side of a face is inside the building."""
         x1, y1, x2, y2 = face
         length = math.hypot(x2 - x1, y2 - y1)
         x, y = (x1 + x2) / 2.0 - 0.05 * (y2 - y1) / length, (y1 + y2) / 2.0 + 0.05 * (x2 - x1) / length
@@ -72,7 +73,7 @@ def both_sides(segment: Segment) -> tuple[Segment, Segment]:
 
 
 def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
-    """The plan that ``settings`` names; doors and furniture are drawn."""
+    """Make the plan named in ``settings``, with random doors and furniture."""
     width, depth = settings.width, settings.depth
     outline = tuple(_sides((0.0, 0.0, width, depth)))
     if settings.plan == "hall":
@@ -105,7 +106,7 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
 
 
 def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:
-    """A cupboard in each outer corner of a room, where the room is large enough to drive past them."""
+    """A cupboard in each outer corner of a room that is large enough to drive past them."""
     left, right = span
     deep, wide = abs(inner - outer), right - left
     if deep < 3.5 or wide < 4.0:
@@ -120,7 +121,7 @@ def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.ra
 
 
 def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
-    """Rows along x with aisles between them, broken in the middle where they are long."""
+    """Rows along x with aisles between them, long ones interrupted in the middle."""
     rows = max(1, math.floor((depth - AISLE_WIDTH) / (SHELF_DEPTH + AISLE_WIDTH)))
     pitch = (depth - rows * SHELF_DEPTH) / (rows + 1)
     margin = min(AISLE_WIDTH, width / 4.0)
@@ -132,9 +133,11 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
 
 
 def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """An H that looks the same when it is turned by half: a corridor along x, and one across each of its ends. What is between them
-    is closed rooms. A tag hangs in the middle, one in an arm at one end, and one in the opposite arm at the other: who comes from
-    the middle finds both to the left or both to the right, which is drawn."""
+    """An H with a half-turn symmetry: a corridor along x and one across each of its ends; the rest are closed rooms.
+
+    A tag hangs in the middle, and one in an arm at each end, in opposite arms: coming from the middle the robot finds both on
+    its left or both on its right, which is random.
+    """
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
             f"world: {width:g} x {depth:g} m is too small for corridors, expected at least "

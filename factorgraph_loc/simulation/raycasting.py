@@ -1,10 +1,9 @@
-"""Rays through a building of upright faces, and the colours that they meet.
+"""Ray casting in a building of vertical faces, and the colours that rays hit.
 
-From one place, what a ray may meet first is narrowed down by its direction in the plan: each of :data:`BINS` directions has a list
-of the faces there, nearest first. A surface seen at a slant is sampled several times along the slant, each time from the mip
-level whose texels are about as large as the step.
+For a camera position, each of :data:`BINS` directions in the plan has a list of the faces that a ray may hit, nearest first. An
+oblique surface is sampled several times along the slant, each time from the mip level whose texels match the step.
 
-What is called for each ray is inlined, as numba counts the references to arrays at each call, which would double the time.
+Functions called per ray are inlined, as numba's reference counting of arrays at each call would double the run time.
 """
 
 import math
@@ -17,27 +16,28 @@ from numpy.typing import NDArray
 from factorgraph_loc.simulation.scene import LEVELS
 from factors.se2 import Array
 
-BINS = 2048  # of the directions in the plan
-TAPS = 4  # samples of a texture at a slant, at most
-STEEPEST = 1e3  # slant that is told from steeper ones
-SLACK = 1e-9  # m, by which faces that meet overlap
-NEAREST = 1e-3  # m from a face's plane: a camera in it sees nothing of it
+BINS = 2048  # directions in the plan
+TAPS = 4  # maximum number of texture samples on an oblique surface
+STEEPEST = 1e3  # maximum slant
+SLACK = 1e-9  # m, by which adjacent faces overlap
+NEAREST = 1e-3  # m from a face's plane, within which the face is invisible
 
-# columns of a table of faces, relative to a camera: unit normal, distance from the plane (below zero behind it), unit vector along,
-# where the foot of the camera is on it, length, heights, the nearest point's distance in the plan, number in the scene,
-# and one over length and height
+# columns of a table of faces relative to a camera: unit normal, distance from the plane (negative behind it), unit vector
+# along, coordinate of the camera's foot point along it, length, heights, distance of the nearest point in the plan, index in
+# the scene, and the inverses of length and height
 NX, NY, AWAY, AX, AY, FOOT, LENGTH, BOTTOM, TOP, DISTANCE, FACE, PER_LENGTH, PER_HEIGHT = range(13)
 GROUND, CEILING, NOTHING = -1, -2, -3  # in place of a row of the table
 
 Ints = NDArray[np.int64]
 Place = tuple[
     float, float, float, float, float, float
-]  # of a camera, height of the building, one over its width and depth
+]  # of a camera, height of the building, inverses of its width and depth
 
 
 class Surroundings(NamedTuple):
-    """What can be seen from one place ``origin`` (3,): a ``table`` (M, 13) of faces, of which ``items[starts[b] : starts[b + 1]]``
-    may be met in the direction b; ``size`` (5,): width, depth and height of the building, and one over the first two."""
+    """The faces visible from ``origin`` (3,): a ``table`` (M, 13) of which ``items[starts[b] : starts[b + 1]]`` may be hit in
+    the direction b; ``size`` (5,): width, depth and height of the building, and the inverses of the first two.
+    """
 
     origin: Array
     table: Array
@@ -48,7 +48,7 @@ class Surroundings(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy")
 def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
-    """The faces that can be seen from ``origin`` (3,), for :func:`cast`."""
+    """The faces visible from ``origin`` (3,), for :func:`cast`."""
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))
     m = 0
@@ -87,8 +87,9 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
 
 @numba.njit(inline="always", error_model="numpy")
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
-    """What the ray along (dx, dy, dz) meets first: a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and how
-    far away in lengths of the ray."""
+    """The first hit of the ray along (dx, dy, dz): a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and
+    its distance in lengths of the ray.
+    """
     best, found = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
     if dz < -1e-12:
@@ -123,7 +124,7 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
 
 @numba.njit(cache=True, error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
-    """Distances (K,) in lengths of ``rays`` (K, 3), infinite where nothing is met."""
+    """Distances (K,) in lengths of ``rays`` (K, 3), infinite without a hit."""
     distance = np.empty(len(rays))
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -144,9 +145,10 @@ def expose(
     found: NDArray[np.int16],
     out: NDArray[np.float32],
 ) -> None:
-    """Add to ``out`` (H, W, 3) what pixels that look along ``directions`` (H, W, 2), at depth 1 in the camera's frame, see of the
-    building; where two surfaces meet in a pixel, the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels.
-    ``found`` (H, W): room to work in."""
+    """Render the building: add to ``out`` (H, W, 3) the colours of pixels in ``directions`` (H, W, 2), at depth 1 in the camera
+    frame. At edges a pixel is the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels; ``found`` (H, W): work
+    array.
+    """
     height, width = directions.shape[:2]
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -168,7 +170,7 @@ def expose(
                 continue
             across = (directions[i, right, 0] - directions[i, left, 0]) / (right - left)
             along = (directions[down, j, 1] - directions[up, j, 1]) / (down - up)
-            for k in range(5):  # the one ray in the middle is taken away, four around it come in its place
+            for k in range(5):  # remove the central ray and add four around it
                 a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
                 weight = np.float32(0.25) if k < 4 else np.float32(-1.0)
                 x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
@@ -191,7 +193,7 @@ def _look(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """What is seen along (x, y, 1) in the camera's frame, as :func:`cast` has it, and its colour (blue, green, red) there."""
+    """The hit along (x, y, 1) in the camera frame, as in :func:`cast`, and its colour (blue, green, red)."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
@@ -201,7 +203,7 @@ def _look(
     if found == NOTHING:
         return found, blue, green, red
     flat = math.sqrt(dx * dx + dy * dy)
-    along_x, along_y = 1.0, 0.0  # of the slant, on the texture
+    along_x, along_y = 1.0, 0.0  # direction of the slant on the texture
     if found >= 0:
         number = int(table[found, FACE])
         s = table[found, FOOT] + depth * (table[found, AX] * dx + table[found, AY] * dy)
@@ -215,7 +217,7 @@ def _look(
         slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
         along_x, along_y = dx / flat, dy / flat
     slant = min(slant, STEEPEST)
-    pixel = depth * pixel_at_one  # the size of a pixel there, in texels, across the slant
+    pixel = depth * pixel_at_one  # size of a pixel at that depth, in texels, across the slant
     taps = 1
     if slant * pixel > 1.0 and slant >= 1.5:
         taps = min(int(slant + 0.5), TAPS)
@@ -239,7 +241,7 @@ def _look(
 def _sample(
     texels: NDArray[np.uint8], first: int, x: float, y: float, width: int, height: int
 ) -> tuple[np.float32, np.float32, np.float32]:
-    """Blue, green and red of a picture at ``x`` and ``y`` from its upper left corner in texels, between the texels around."""
+    """Bilinear sample (blue, green, red) of a picture at ``x``, ``y`` texels from its upper left corner."""
     x = min(max(x - 0.5, 0.0), width - 1.0)
     y = min(max(y - 0.5, 0.0), height - 1.0)
     i, j = int(y), int(x)
@@ -260,7 +262,7 @@ def _sample(
 
 @numba.njit(cache=True, error_model="numpy")
 def _direction(x: float, y: float) -> float:
-    """A direction in the plan as a number in [0, BINS) that grows counter-clockwise, without the angle's cost."""
+    """A direction in the plan as a number in [0, BINS) that grows counter-clockwise, without trigonometric functions."""
     total = abs(x) + abs(y)
     if total == 0.0:
         return 0.0
@@ -277,9 +279,12 @@ def develop(
     read: float,
     shot: float,
 ) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with a sensor's noise of the variance
-    read^2 + shot * value, drawn by the numbers ``noise`` (H, W, 3) from the ``quantiles`` (Q,), Q a power of two, of a
-    distribution of deviation 1."""
+    """The 8-bit picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with sensor noise of variance read^2 + shot *
+    value.
+
+    ``noise`` (H, W, 3): random integers that select from ``quantiles`` (Q,), Q a power of two, of a distribution with unit
+    variance.
+    """
     height, width = gain.shape
     out = np.empty((height, width, 3), dtype=np.uint8)
     last = np.uint16(len(quantiles) - 1)

@@ -1,4 +1,4 @@
-"""Images of a building as a camera takes them: its lens, its exposure, its noise, and the blur of its motion."""
+"""Camera images of a building, with lens distortion, exposure, noise and motion blur."""
 
 import math
 
@@ -16,18 +16,19 @@ from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 Image = NDArray[np.uint8]
-STEP = 2.0  # px between the sub-images whose mean is a blurred one, so that no edge shows twice
+STEP = 2.0  # px between the sub-images that are averaged to a blurred one
 MOST_STEPS = 16
-CHECKED = 8  # by as many rows and columns of pixels the motion is judged
+CHECKED = 8  # stride in rows and columns of the pixels whose motion is evaluated
 STILL: Array = np.zeros(3)
-# quantiles of the normal distribution: drawing one of them is ten times as fast as drawing from the distribution
+# quantiles of the normal distribution: ten times as fast as drawing from it
 _QUANTILES = ndtri((np.arange(4096) + 0.5) / 4096)
 NORMAL = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 
 
 class Renderer:
-    """A camera of a ``model`` in a ``scene``. Poses are of the camera in the world: ``position`` (3,) and ``rotation`` (3, 3), as
-    of :func:`factors.camera.model.camera_pose` for a robot on the floor."""
+    """A camera ``model`` in a ``scene``. Poses are of the camera in the world: ``position`` (3,) and ``rotation`` (3, 3), as
+    from :func:`factors.camera.model.camera_pose` for a robot on the floor.
+    """
 
     def __init__(self, scene: Scene, model: CameraModel, settings: ImageSettings | None = None) -> None:
         self.scene, self.model, self.settings = scene, model, settings or ImageSettings()
@@ -50,8 +51,9 @@ class Renderer:
         gain: float = 1.0,
         rng: np.random.Generator | None = None,
     ) -> Image:
-        """BGR (H, W, 3). ``velocity`` (3,) [m/s] and ``turn`` (3,) [rad/s] of the camera in the world's frame blur the image; the
-        pose is that in the middle of the exposure. ``gain``: of the brightness. Without ``rng`` there is no noise."""
+        """Render a BGR image (H, W, 3). ``velocity`` (3,) [m/s] and ``turn`` (3,) [rad/s] of the camera in the world frame blur
+        it; the pose is that in the middle of the exposure. ``gain``: of the brightness. Without ``rng`` there is no noise.
+        """
         shape = (self.model.height, self.model.width, 3)
         light = np.zeros(shape, dtype=np.float32)
         shifts = self._moments(position, rotation, velocity, turn)
@@ -65,7 +67,7 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """The points (K, 3) of the world that ``pixels`` (K, 2) show, NaN where they show nothing."""
+        """The world points (K, 3) shown by ``pixels`` (K, 2), NaN where there is none."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance = self._distances(position, rays)
@@ -73,7 +75,7 @@ class Renderer:
         return np.asarray(position + distance[:, None] * rays)
 
     def depths(self, position: Array, rotation: Array) -> Array:
-        """How far along the optical axis each pixel's point is (H, W) [m], infinite where there is none."""
+        """Depth of each pixel (H, W) [m] along the optical axis, infinite where there is none."""
         directions = self._directions.reshape(-1, 2)
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         return np.asarray(self._distances(position, rays).reshape(self._directions.shape[:2]))
@@ -104,7 +106,7 @@ class Renderer:
             self._lay_lids(position, rotation, pixel_at_one, light)
 
     def _distances(self, position: Array, rays: Array) -> Array:
-        """How far each of ``rays`` (K, 3) goes (K,), in its lengths."""
+        """Distances (K,) to the first hit of ``rays`` (K, 3), in lengths of the rays."""
         distance: Array = raycasting.cast_all(self._surroundings(position), rays)
         for lid in self._below(position):
             t, _, on = _on_lid(lid, position, rays)
@@ -112,8 +114,9 @@ class Renderer:
         return distance
 
     def _lay_lids(self, position: Array, rotation: Array, pixel_at_one: float, light: NDArray[np.float32]) -> None:
-        """Put into ``light`` the upper sides of furniture, in place of what was added to it from below them. No robot whose
-        camera is lower than all furniture needs it; within :func:`raycasting.cast` it would take a third of the time."""
+        """Draw the top sides of furniture into ``light``, replacing what is behind them. Only needed for a camera above some
+        furniture; inside of :func:`raycasting.cast` it would take a third of the time.
+        """
         scene, shape = self.scene, self._directions.shape[:2]
         below = np.zeros_like(light)
         view = self._directions, rotation, pixel_at_one
@@ -133,7 +136,7 @@ class Renderer:
             light[pixels] += scene.texels[first + row * width + column] - below[pixels]
 
     def _below(self, position: Array) -> Array:
-        """The lids (B, 6) that are seen from above."""
+        """The lids (B, 6) below the camera."""
         return np.asarray(self.scene.lids[self.scene.lids[:, 4] < position[2]])
 
     def _surroundings(self, position: Array) -> Surroundings:
@@ -146,8 +149,9 @@ class Renderer:
 
 
 def _on_lid(lid: Array, position: Array, rays: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where ``rays`` (K, 3) meet the plane of a lid: distances (K,) in their lengths, shares (K, 2) of the lid's sides, and whether
-    that is on the lid and ahead (K,)."""
+    """Intersections of ``rays`` (K, 3) with the plane of a lid: distances (K,) in ray lengths, coordinates (K, 2) relative to
+    the lid's sides, and whether the hit is on the lid and ahead (K,).
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (lid[4] - position[2]) / rays[:, 2]
         shares = (position[:2] + t[:, None] * rays[:, :2] - lid[:2]) / (lid[2:4] - lid[:2])
@@ -156,5 +160,5 @@ def _on_lid(lid: Array, position: Array, rays: Array) -> tuple[Array, Array, NDA
 
 
 def _turned(rotation: Array, turn: Array) -> Array:
-    """``rotation`` (3, 3) after a turn (3,) [rad] about the world's axes."""
+    """``rotation`` (3, 3) after a rotation vector (3,) [rad] in the world frame."""
     return np.ascontiguousarray(np.asarray(gtsam.Rot3.Expmap(turn).matrix()) @ rotation)

@@ -1,7 +1,7 @@
-"""A building that can be looked at: upright faces with textures, floor and ceiling.
+"""A textured building for rendering: vertical faces, floor and ceiling.
 
-A face is a rectangle above a segment in the plan, seen from the segment's left side alone. Furniture is lower than the room.
-Textures are kept with their halvings (mip levels; Williams, "Pyramidal parametrics", SIGGRAPH 1983).
+A face is a rectangle above a segment in the plan, visible from the segment's left side. Furniture is lower than the room.
+Textures have mip levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
 """
 
 import math
@@ -21,19 +21,19 @@ from factors.se2 import Array
 ROOM_HEIGHT = 2.7  # m
 DOOR_HEIGHT = 2.05
 HIGHEST_BOX = 2.0
-TEXEL = 0.005  # m; larger in a building whose textures would need more than MOST_TEXELS
-MOST_TEXELS = 50e6  # a byte each of three colours, and a third more for the mip levels
-LEVELS = 7  # of each texture, the first included
+TEXEL = 0.005  # m; larger in a building that would need more than MOST_TEXELS
+MOST_TEXELS = 50e6  # three bytes each, plus a third for the mip levels
+LEVELS = 7  # mip levels of a texture, including the first
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """``faces`` (F, 4) [m]: segments whose left side is seen; ``bottoms`` and ``tops`` (F,) [m] of them. ``lids``
-    (B, 6): upper sides of boxes, x1, y1, x2, y2, height [m], and the number of the face whose texture they have too.
+    """``faces`` (F, 4) [m]: segments visible from the left; ``bottoms`` and ``tops`` (F,) [m] of them. ``lids`` (B, 6): top
+    sides of boxes: x1, y1, x2, y2, height [m], and the index of the face whose texture they share.
 
-    ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout``
-    (F + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face to its
-    right as one looks at it, rows downwards; on floor and ceiling along x and y. ``texel`` [m].
+    ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout`` (F
+    + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face, left to
+    right for the viewer, rows downwards; on floor and ceiling along x and y. ``texel`` [m].
     """
 
     faces: Array
@@ -49,7 +49,7 @@ class Scene:
 
 
 def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Scene:
-    """The building of a plan; textures and heights of furniture are drawn, and tags with a facing are seen as small labels."""
+    """The building of a plan, with random textures and heights of furniture; tags with a facing appear as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
     faces = np.concatenate((walls, boxes, doors))
@@ -92,7 +92,7 @@ def _outer(plan: Plan, face: Array) -> bool:
 
 
 def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
-    """How far from the left end of a face, and how high, are the tags [m] that hang just before it."""
+    """Positions [m] of the tags just before a face: distance from the viewer's left end, and height."""
     along = face[2:] - face[:2]
     length = math.hypot(*along)
     along = along / length
@@ -103,14 +103,14 @@ def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
         if tag.facing is None or not 0.0 <= s <= length or not 0.0 <= away < 0.05:
             continue
         if normal @ (math.cos(tag.facing), math.sin(tag.facing)) > 0.9:
-            # the left end of what one sees is the segment's end, on whose left side one stands
+            # the viewer stands on the segment's left side, so its end is on the viewer's left
             yield length - s, tag.z
 
 
 def _stored(
     sizes: Sequence[tuple[int, int]], canvases: Iterable[Canvas]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Canvases of these sizes and their mip levels in one array."""
+    """Pack canvases of the given sizes and their mip levels in one array."""
     layout = np.empty((len(sizes), LEVELS, 3), dtype=np.int64)
     total = 0
     for i, (height, width) in enumerate(sizes):

@@ -1,4 +1,4 @@
-"""What is simulated: the world, the drive, the sensors and their faults; presets of them, and files that change a preset."""
+"""Settings of a simulation (world, drive, sensors, faults), presets, and files that change a preset."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted
 
 MOST_TAGS = 10_000
-MOST_LOOKS = 50_000_000  # of a kind of sensor at tags, landmarks or points: all are in memory at once
+MOST_LOOKS = 50_000_000  # maximum number of simulated observations of one kind, as all are in memory at once
 Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of ``width`` times ``depth`` metres, from (0, 0) to there; ``hall``: one room with nothing in it; ``corridors``: an H
-    that looks the same when it is turned by half, with three tags that hang, which alone tell its ends apart.
+    """A plan of ``width`` x ``depth`` metres from the origin; ``hall``: one empty room; ``corridors``: an H with a half-turn
+    symmetry and three hanging tags, which alone distinguish its ends.
 
-    ``tags``: how many, or ``density`` of them per m^2, spread over ``surfaces`` (``shelf``: furniture too) at ``tag_height``;
-    ``even``: at equal distances along the walls, alike on both sides, in place of at random. ``landmarks``: on the walls.
-    ``points``: named points on walls and furniture that a camera may see.
+    ``tags``: their number, or ``density`` per m^2, on ``surfaces`` (``shelf`` includes furniture) at ``tag_height``; ``even``:
+    at equal distances along the walls, symmetric on both sides, rather than at random. ``landmarks``: number on the walls.
+    ``points``: number of named points on walls and furniture for a camera.
     """
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
@@ -57,7 +57,7 @@ class WorldSettings(FileModel):
 
 
 class DriveSettings(FileModel):
-    """A drive between random places. ``rate``: of the reference. ``clearance``: from walls, for the path's points."""
+    """A drive between random places. ``rate``: of the reference. ``clearance``: of the path from walls."""
 
     duration: Annotated[float, Field(ge=1.0, le=14_400.0, description="s")] = 600.0
     speed: Annotated[float, Field(ge=0.01, le=3.0, description="m/s")] = 0.5
@@ -67,9 +67,10 @@ class DriveSettings(FileModel):
 
 
 class ImageSettings(FileModel):
-    """Images of the rendered building: ``rate`` of them, ``exposure`` time, noise of the variance ``read_noise``^2 + ``shot_noise``
-    times the value of a pixel (0 to 255), brightness that wanders by the share ``gain_drift`` over some ten seconds, and the
-    share ``vignetting`` of it that is lost at the corners."""
+    """Images of the rendered building: frame ``rate``, ``exposure`` time, noise variance ``read_noise``^2 + ``shot_noise``
+    times the pixel value (0 to 255), relative brightness variation ``gain_drift`` over some ten seconds, and relative loss
+    ``vignetting`` of brightness at the corners.
+    """
 
     rate: Hertz = 5.0
     exposure: Annotated[float, Field(ge=0.0, le=0.2, description="s")] = 0.005
@@ -80,10 +81,11 @@ class ImageSettings(FileModel):
 
 
 class SimulationSettings(FileModel):
-    """Everything but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: what estimators are told, and what
-    reads and sightings are drawn from. ``world_seed``: of the world, its look and its survey, if several drives are to go through
-    one world; else the seed of the log is theirs too. Other sections are those that sensors register: ``sightings``, ``rssi`` and
-    ``phase``, which reads have if they are given, ``faults`` of them, ``pixels``."""
+    """All settings but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: given to estimators, and
+    used to simulate reads and sightings. ``world_seed``: seed of the world, its appearance and its survey, to simulate several
+    drives in one world; by default the seed of the log. Sensors register further sections: ``sightings``, ``rssi`` and
+    ``phase`` of reads, ``faults`` of them, ``pixels``.
+    """
 
     name: str = "office"
     world: WorldSettings
@@ -102,12 +104,13 @@ class SimulationSettings(FileModel):
     def _fits(self) -> SimulationSettings:
         for what, looks in self.looks().items():
             if looks > MOST_LOOKS:
-                raise ValueError(f"{what} are looked for {looks:,.0f} times in all, expected at most {MOST_LOOKS:,}")
+                raise ValueError(f"{what} are observed {looks:,.0f} times in all, expected at most {MOST_LOOKS:,}")
         return self
 
     def looks(self) -> dict[str, float]:
-        """How often a drive looks for each of its tags, landmarks and points, added up over all that there are of a kind.
-        ValueError where the settings do not fit together."""
+        """The number of simulated observations of tags, landmarks and points, summed over all objects of a kind. Raises
+        ValueError if the settings are inconsistent.
+        """
         per_second = {what: often for _, looks in functions("looks") for what, often in looks(self).items()}
         return {what: self.drive.duration * often for what, often in per_second.items()}
 
@@ -144,7 +147,7 @@ RACKHAM_RIG: Mapping[str, Any] = {
         "tempering": 1.0,
     },
     "bearing_range": {"range_sigma": 0.05, "range_sigma_relative": 0.02, "bearing_sigma": 0.02},
-    # a little upwards: there is more to see on walls than on floors
+    # slightly upwards: walls have more texture than floors
     "camera": {
         "fx": 410.0,
         "fy": 411.0,
@@ -157,21 +160,21 @@ RACKHAM_RIG: Mapping[str, Any] = {
     },
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
-# Fades of a share f that last d in the mean make the count of reads in many rounds, dt apart, vary more than independent rounds
-# would: 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) times as much, with rho = exp(-dt / (d (1 - f))), where a share p of the rounds
-# outside fades read the tag: 1.9 times at p = 0.5. One over that is too cautious, since the robot moves on.
-# The tempering is that at which the smoother's causal ANEES is 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
+# Fades that affect a fraction f of the time, with mean duration d, increase the variance of the number of reads in many rounds
+# at intervals dt by 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p), relative to independent rounds, with rho = exp(-dt / (d (1 -
+# f))) and the probability p of a read outside of fades: 1.9 at p = 0.5. The inverse is too conservative as a tempering, since
+# the robot moves. This tempering makes the smoother's causal ANEES 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.7}},
 }
 
 
-EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # a change to one takes the other away
+EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # setting one removes the other
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``changes``, tables within tables merged alike; a table of another ``kind`` takes the place of the old one."""
+    """``base`` with ``changes``, merged recursively; a table of another ``kind`` replaces the old one."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)
@@ -205,14 +208,15 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """The settings of a preset, with ``changes`` as nested tables. InputError names a wrong preset, key or value."""
+    """The settings of a preset, with ``changes`` as nested tables. Raises InputError for a wrong preset, key or value."""
     content = merged(_preset(name, "the settings"), changes or {})
     return parse_model(SimulationSettings, content, "the settings")
 
 
 def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """The settings of a TOML file: ``preset`` (default office), and what differs from it. ``rig`` may be the name of a file below
-    the folder. InputError names file, key and what is expected."""
+    """Read settings from a TOML file: ``preset`` (default office), and changes to it. ``rig`` may name a file below the folder.
+    Raises InputError with file, key and what is expected.
+    """
     content = read_toml(path)
     base = _preset(content.pop("preset", "office"), path)
     base["name"] = path.stem
@@ -226,7 +230,7 @@ def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> Simul
 
 
 def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """The settings of a preset, or of a file where ``what`` looks like one."""
+    """The settings of a preset, or of a file if ``what`` looks like a path."""
     return read_settings(Path(what), changes) if what.endswith(".toml") else preset(what, changes)
 
 

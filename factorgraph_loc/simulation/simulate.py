@@ -1,4 +1,4 @@
-"""A simulated log: world, drive, and what the sensors report, all of one seed."""
+"""Simulation of a log: world, drive and measurements from one seed."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -21,14 +21,13 @@ START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad
 
 
 def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | None = None) -> Log:
-    """The log of ``settings`` and ``seed``; the same both, the same log, to the last bit.
+    """Simulate a log; the same ``settings`` and ``seed`` give the same log to the last bit.
 
-    Streams: odometry, rfid, bearing_range where the world has landmarks, sightings where it has points, and those of other
-    packages' sensors. The reference is the true trajectory. The stated start is the true pose with an error drawn from the
-    deviations that it states (:data:`START_SIGMAS`), as consistency needs it. World, drive and each sensor draw from generators
-    of their own, so that to change one leaves the others as they are.
-    With ``recorded`` the robot carries the antennas of those recordings, and reads what they read (:mod:`.recorded`).
-    InputError if the settings leave no room for tags or for the robot.
+    Streams: odometry, rfid, bearing_range if the world has landmarks, sightings if it has points, and those of sensors from
+    other packages. The reference is the true trajectory. The stated start is the true pose plus an error drawn from its
+    covariance (:data:`START_SIGMAS`). World, drive and sensors use independent random generators. With ``recorded``, the robot
+    carries the antennas of these recordings and reads what they read (:mod:`.recorded`). Raises InputError if there is no space
+    for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed
     rig = settings.rig if recorded is None else recorded.carried_by(settings.rig)
@@ -55,6 +54,6 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
 
 
 def with_sensors(rig: Rig, streams: Iterable[str]) -> Rig:
-    """The rig, whose estimators use by default what the log has."""
+    """The rig with the channels of the log as the sensors that estimators use by default."""
     sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
     return rig.model_copy(update={"sensors": sensors})

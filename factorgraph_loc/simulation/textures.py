@@ -1,4 +1,4 @@
-"""The surfaces of a simulated building: what a wall, a piece of furniture, the floor and the ceiling look like."""
+"""Textures of a simulated building: walls, furniture, floor and ceiling."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.simulation import pictures
 from factorgraph_loc.simulation.pictures import Canvas, Draw
 
-# what hangs on walls: how likely, width and height [m] from and to, and how high its middle is
+# objects on walls: probability, ranges of width and height [m], and range of the height of the centre
 HANGING: tuple[tuple[Draw, float, tuple[float, float], tuple[float, float], tuple[float, float]], ...] = (
     (pictures.poster, 0.28, (0.4, 0.9), (0.5, 1.1), (1.2, 1.7)),
     (pictures.painting, 0.2, (0.4, 1.2), (0.35, 0.9), (1.2, 1.8)),
@@ -18,14 +18,14 @@ HANGING: tuple[tuple[Draw, float, tuple[float, float], tuple[float, float], tupl
     (pictures.sign, 0.06, (0.2, 0.4), (0.1, 0.25), (1.4, 2.3)),
     (pictures.extinguisher, 0.04, (0.22, 0.25), (0.5, 0.6), (0.7, 0.9)),
 )
-GAP = (0.05, 0.35)  # m between what hangs side by side
+GAP = (0.05, 0.35)  # m between adjacent objects
 SKIRTING = 0.1  # m
-SMALL = (0.03, 0.12)  # m: sockets, switches, stickers, stains
+SMALL = (0.03, 0.12)  # m: size of sockets, switches, stickers, stains
 TILE = 0.6  # m, of floor and ceiling
 
 
 def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, windows: bool) -> Canvas:
-    """A painted wall with things on it, most about as high as eyes; with ``windows``, some are those."""
+    """A painted wall with objects, most of them at eye level; with ``windows``, some are windows."""
     out = _painted(rng, height, width, texel)
     tall = height * texel
     x = rng.uniform(*GAP)
@@ -46,7 +46,7 @@ def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, win
 
 
 def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """What is above a door: a plate, and the frame's upper edge."""
+    """The wall above a door: a plate and the upper edge of the frame."""
     out = _painted(rng, height, width, texel)
     plate = pictures.sign(rng, max(height // 3, 8), max(width // 2, 16))
     _hang(out, plate, width // 4, height // 3)
@@ -55,7 +55,7 @@ def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> C
 
 
 def furniture(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """One side of a cupboard or of a book shelf."""
+    """One side of a cupboard or book shelf."""
     draw = pictures.books if rng.random() < 0.5 else pictures.cupboard
     return draw(rng, height, width)
 
@@ -116,7 +116,7 @@ def label(rng: np.random.Generator, texel: float) -> Canvas:
 
 
 def _painted(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """A colour, or two with a border at about the height of a table."""
+    """One colour, or two with a border at about table height."""
     out = pictures.filled(height, width, pictures.pale(rng))
     if rng.random() < 0.4:
         below = height - round(rng.uniform(0.7, 1.1) / texel)
@@ -135,7 +135,7 @@ def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Sideboards, low shelves and stacks of paper at the foot of the wall, as flat as what hangs above them."""
+    """Sideboards, low shelves and stacks of paper at the foot of the wall, drawn flat."""
     height, width = canvas.shape[:2]
     x = rng.uniform(0.0, 1.0)
     while x < width * texel - 0.4:
@@ -146,7 +146,7 @@ def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
 
 
 def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Sockets, switches, vents and stickers, anywhere: five on a metre."""
+    """Sockets, switches, vents and stickers at random positions, five per metre."""
     height, width = canvas.shape[:2]
     for _ in range(int(5.0 * width * texel)):
         h, w = (max(3, round(rng.uniform(*SMALL) / texel)) for _ in range(2))
@@ -157,7 +157,7 @@ def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> Non
 
 
 def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
-    """Light from the ceiling: pools of it along the wall, darker in the corners and near the floor."""
+    """Ceiling light: bright spots along the wall, darker in the corners and near the floor."""
     height, width = canvas.shape[:2]
     factor = 1.0 + 0.05 * pictures.clouds(rng, height, width, 1.5 / texel)
     factor *= np.linspace(1.05, 0.85, height, dtype=np.float32)[:, None]
@@ -167,7 +167,7 @@ def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
 
 
 def _grain(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-    """Fine noise of deviation 1, repeated every 512 texels: too weak to be recognized."""
+    """Fine noise of unit variance with a period of 512 texels, too weak to be recognized."""
     tile = rng.standard_normal((512, 512)).astype(np.float32)
     return np.asarray(np.tile(tile, (height // 512 + 1, width // 512 + 1))[:height, :width])
 

@@ -1,4 +1,4 @@
-"""Drives through free space: a robot that follows shortest paths between random places."""
+"""Simulated drives: a robot that follows shortest paths between random places."""
 
 import math
 
@@ -12,13 +12,13 @@ from factorgraph_loc.simulation.settings import DriveSettings
 from factors import se2
 from factors.se2 import Array
 
-LOOKAHEAD = 0.3  # m: the robot aims at the point of the path that is so far away
-STEP = 0.02  # s, of the robot's control
-GAIN = 4.0  # rad/s of turn per rad of error
+LOOKAHEAD = 0.3  # m: distance of the point of the path that the robot steers towards
+STEP = 0.02  # s, control period
+GAIN = 4.0  # rad/s per rad of heading error
 
 
 def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Trajectory:
-    """Poses at ``settings.rate`` from t = 0 to the duration, of a robot that drives from one random place to the next."""
+    """Poses at ``settings.rate`` from t = 0 to the duration, of a robot that drives between random places."""
     space = free_space(world, settings.clearance)
     here = int(rng.integers(len(space.centres)))
     length, parts = 0.0, [space.centres[here][None]]
@@ -38,7 +38,7 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
 
 
 def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
-    """A robot that turns towards a point of the path ahead, and slows down while it looks elsewhere (pure pursuit)."""
+    """Pure pursuit: turn towards a point ahead on the path, and slow down for large heading errors."""
     every = max(1, round(1.0 / (settings.rate * STEP)))
     step = 1.0 / (settings.rate * every)
     count = int(settings.duration * settings.rate + 1e-9)

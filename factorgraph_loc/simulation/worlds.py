@@ -1,4 +1,4 @@
-"""Worlds with tags, landmarks and points: what is put where on a floor plan."""
+"""Worlds with tags, landmarks and points placed on a floor plan."""
 
 import numpy as np
 
@@ -11,18 +11,17 @@ from factorgraph_loc.simulation.plans import LOWEST_BOX, Plan, make_plan
 from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array
 
-STANDOFF = 0.02  # m, of a tag or point from the surface that it is on
-POINT_HEIGHTS = (0.3, 2.2)  # m, from and to, on walls
-IN_FRONT = 0.3  # m of a tag there is nothing
-CANDIDATES = 10  # places that each tag is chosen from, for the farthest from the others
+STANDOFF = 0.02  # m, of a tag or point from its surface
+POINT_HEIGHTS = (0.3, 2.2)  # m, range on walls
+IN_FRONT = 0.3  # m of free space needed before a tag
+CANDIDATES = 10  # candidate places for each tag, of which the farthest from the others is chosen
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """A world with walls (those of furniture and shelves too), tags ``T000``..., landmarks ``L000``... and points
-    ``P0000``....
+    """A world with walls (including furniture and shelves), tags ``T000``..., landmarks ``L000``... and points ``P0000``....
 
-    Tags on surfaces face away from them; those that hang face nowhere, nor do those on the floor, at height 0. InputError if the
-    plan lacks the surfaces.
+    Tags on surfaces face away from them; hanging tags and those on the floor (at height 0) have no facing. Raises InputError if
+    the plan lacks the surfaces.
     """
     plan = make_plan(settings, rng)
     tags: dict[str, Tag] = {}
@@ -56,8 +55,10 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 
 
 def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
-    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), each the farthest from those before among
-    :data:`CANDIDATES` drawn with equal probability per metre (Mitchell, SIGGRAPH 1991); none behind a piece of furniture."""
+    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), by best-candidate sampling (Mitchell,
+    SIGGRAPH 1991): each is the farthest from the previous ones among :data:`CANDIDATES`, uniform per metre. None is behind
+    furniture.
+    """
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
     for i in range(count):
@@ -71,7 +72,7 @@ def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> A
 
 
 def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.Generator) -> PointMap:
-    """Points spread along walls and furniture, at heights drawn from :data:`POINT_HEIGHTS`, on furniture up to its top."""
+    """Points spread over walls and furniture, at heights from :data:`POINT_HEIGHTS`, on furniture up to its top."""
     places = _spread(plan, np.concatenate((walls, boxes)), count, rng)
     x, y, facing = places.T
     behind = np.column_stack((x - 2.0 * STANDOFF * np.cos(facing), y - 2.0 * STANDOFF * np.sin(facing)))
@@ -82,7 +83,7 @@ def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.G
 
 
 def _even(settings: WorldSettings, count: int) -> Array:
-    """``count`` places along the two long walls of the outline, mirrored and turned into each other."""
+    """``count`` places along the two long walls of the outline, invariant to mirroring and half-turns."""
     below, above = (count + 1) // 2, count // 2
     width, depth = settings.width, settings.depth
     rows = (((0.0, 0.0, width, 0.0), below), ((width, depth, 0.0, depth), above))
@@ -92,7 +93,7 @@ def _even(settings: WorldSettings, count: int) -> Array:
 
 
 def _places(faces: Array, along: Array) -> Array:
-    """Places (N, 3) at shares ``along`` (N,) of faces (N, 4): x, y, and the direction to their left."""
+    """Places (N, 3) at fractions ``along`` (N,) of faces (N, 4): x, y, and the direction to their left."""
     dx, dy = faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1]
     facing = np.arctan2(dx, -dy)
     x = faces[:, 0] + along * dx + STANDOFF * np.cos(facing)

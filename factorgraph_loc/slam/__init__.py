@@ -1,3 +1,3 @@
-"""What maps while it localizes: unknown landmarks and points, loop closure, robots in space."""
+"""Localization and mapping at once: unknown landmarks and points, loop closure, and robots in space."""
 
 __all__ = ["monoslam", "point_mapper", "space_batch"]

@@ -1,6 +1,7 @@
-"""Visual odometry in a graph: what tracks of no other use tell of the motion from one image's keyframe to the next one's.
+"""Visual odometry in a graph: relative-motion factors between the keyframes of consecutive images.
 
-No pixel counts twice: tracks of points of the map, of the graph, and of those that wait for it are left out.
+They use only tracks that have no other use, so that no pixel counts twice: not those of map points, of points in the graph, or of
+points waiting to be triangulated.
 """
 
 import math
@@ -17,8 +18,8 @@ from factors.camera.visual_odometry import SHARED, VisualOdometryFactor
 from factors.motion import Increment
 from factors.se2 import Array
 
-# m, rad, s: between images that are compared. Where the way is short against the noise of pixels its direction is biased
-# (towards where the camera looks), which adds up over many short ones
+# m, rad, s: between images that are paired. For a motion that is short relative to the pixel noise, the estimated direction is
+# biased towards the viewing direction, which accumulates over many short motions
 LEAST_WAY, LEAST_TURN, LEAST_TIME = 0.25, 0.3, 1.5
 MAX_TIME = 2.0
 
@@ -30,14 +31,14 @@ class _Image:
 
 
 class FramePairs:
-    """Keeps the last image, and turns it with the next one into a factor."""
+    """Keeps the last image and makes a factor of it and the next one."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
         self._last: _Image | None = None
 
     def previous(self, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> Keyframe | None:
-        """The keyframe of the last image, where it still is one of ``keyframes`` and not long before ``keyframe``."""
+        """The keyframe of the last image, if it is still one of ``keyframes`` and not much older than ``keyframe``."""
         if self._last is None:
             return None
         before = self._last.keyframe
@@ -48,8 +49,12 @@ class FramePairs:
     def take(
         self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None
     ) -> Node | None:
-        """What is seen at ``pixels`` (K, 2) from a keyframe, by ``names`` of tracks; returned is the factor with the image before
-        it, from whose keyframe the robot is ``predicted`` to have moved, None where there is none or they tell nothing."""
+        """Store what is seen at ``pixels`` (K, 2) from a keyframe, by ``names`` of tracks, and return the factor with the
+        previous image.
+
+        ``predicted``: the motion from that image's keyframe. None if there is no previous image, or the tracks do not determine
+        the motion.
+        """
         last, here = self._last, _Image(keyframe, dict(zip(names, pixels, strict=True)))
         if last is None or predicted is None:
             self._last = here

@@ -1,8 +1,9 @@
-"""The last keyframes and the points that wait there, adjusted together, where no points of the graph tell how the robot turned.
+"""Local bundle adjustment of the last keyframes and the points waiting there, where no points of the graph determine the
+rotation.
 
-Odometry alone may be off by many pixels from one image to the next, by more than the parallax that it is to triangulate. Points
-seen from several keyframes tell their turns much better (bundle adjustment: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle
-Adjustment, a Modern Synthesis", 2000). What comes out is a guess alone: the sightings enter the graph as they are.
+Odometry alone may be wrong by more pixels than the parallax to be triangulated. Points seen from several keyframes determine the
+rotation better (Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle Adjustment, a Modern Synthesis", 2000). The result serves as a
+linearization point only: the sightings enter the graph unchanged.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -21,10 +22,10 @@ from factors.graph import PriorFactor
 from factors.odometry.model import OdometryFactor
 from factors.se2 import Array
 
-ROUGH = 0.5  # share of its depth, to which a place is told that is good enough to begin with
+ROUGH = 0.5  # standard deviation of an initial point, relative to its depth
 ENOUGH = 8  # points
 ITERATIONS = 12
-ANCHOR = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: nothing moves the first keyframe
+ANCHOR = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: holds the first keyframe
 
 
 def bundled(
@@ -34,8 +35,9 @@ def bundled(
     slacks: Sequence[float],
     waiting: Mapping[Hashable, Sequence[Sighting]],
 ) -> list[Array] | None:
-    """Poses (3,) of successive ``keyframes`` from those of the guess ``poses``, which put points off by ``slacks`` [px], the first
-    one held; None where fewer than :data:`ENOUGH` points tell them."""
+    """Adjusted poses (3,) of consecutive ``keyframes``, the first one held, from the initial ``poses``, which displace points by
+    ``slacks`` [px]; None with fewer than :data:`ENOUGH` points.
+    """
     first = keyframes[0].index
     places = [Place.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
     values: Values = {k.key: pose for k, pose in zip(keyframes, poses, strict=True)}

@@ -1,11 +1,11 @@
-"""Places that a robot comes back to, without a map: points of the graph that were last seen long ago are found again.
+"""Loop closure without a map: recognition of points of the graph that were last seen long ago.
 
-About once a second an image is compared with those of them that may be in view, without a prediction (Associator.relocalized of
-:mod:`factorgraph_loc.vision.association`); the pose that comes out must be one on the floor. From there they are looked for once
-more, and enough of those that should be seen must be, all over the image. As things look alike in a building, none of that is
-believed at once: successive images must find the robot where it was found before and the odometry says it went, and not farther
-from the track than that may have drifted. (Geometric verification and consistency over successive images: Cadena, Galvez-Lopez,
-Tardos, Neira, IEEE Transactions on Robotics 28(4), 2012.)
+About once a second an image is compared with those of these points that may be visible, without using a predicted pose
+(Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The pose found must be on the floor. From there the points
+are matched again, and enough of the visible ones must be found, spread over the image. Since places in a building look alike,
+consecutive images must give poses that agree with each other by odometry, within the possible drift of the track. (Geometric
+verification and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4),
+2012.)
 """
 
 import math
@@ -28,22 +28,23 @@ from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 INTERVAL = 0.9  # s between images that are compared
-SUCCESSIVE, BREAK = 3, 3.0  # images that must agree, and s within which the next one must come
-APART = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of what two of them say of the motion between them
-FEWEST = 15  # points that must be seen
-LEAST_SHARE = 0.1  # of those that should be
-GRID, CELLS = (6, 4), 7  # cells of the image, and in how many of them there must be one
-# m, rad; and shares of the way since: standard deviations of a track's drift beside those that it tells itself
+SUCCESSIVE, BREAK = 3, 3.0  # images that must agree, and the maximum time [s] between them
+APART = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of the motion between two of their poses
+FEWEST = 15  # points that must be found
+LEAST_SHARE = 0.1  # of the visible ones
+GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a point
+# m, rad; and relative to the distance travelled: standard deviations of a track's drift in addition to its covariance
 DRIFT, DRIFT_OF_WAY = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
-GATE = 16.3  # squared, of three degrees of freedom: 99.9 %
-SHIFTED, TURNED = 1.0, 0.3  # m, rad: by how much a track may be off for its points to be found
+GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
+SHIFTED, TURNED = 1.0, 0.3  # m, rad: errors of a track for which its points are found
 FARTHEST = 15.0  # m
 
 
 @dataclass(frozen=True)
 class OldPoints:
-    """``points`` (N) of the graph with a view each, and their ``keys``: where they are, and were seen from, need not be the newest;
-    ``ways`` (N,): how far the robot had gone by then [m]."""
+    """``points`` (N) of the graph with a view each, and their ``keys``; positions may be outdated. ``ways`` (N,): distance
+    travelled by the robot [m] when they were last seen.
+    """
 
     points: PointMap
     keys: Sequence[int]
@@ -52,7 +53,7 @@ class OldPoints:
 
 @dataclass(frozen=True)
 class Image:
-    """What was seen from a new ``keyframe`` at about ``guess``; ``way``: how far the robot has gone [m]."""
+    """What was seen from a new ``keyframe`` at about ``guess``; ``way``: distance travelled [m]."""
 
     frame: CameraFrame
     keyframe: Keyframe
@@ -62,7 +63,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Revisit:
-    """Where a keyframe was found, the ``pose`` (3,), by which of the old points (M,), and which features (M,) show them."""
+    """The ``pose`` (3,) where a keyframe was recognized, and the indices of the old points (M,) and of their features (M,)."""
 
     keyframe: Keyframe
     pose: Array
@@ -71,19 +72,18 @@ class Revisit:
 
 
 class LoopClosure:
-    """What the last images said; see the module."""
+    """Recognizes revisited places from consecutive images; see the module."""
 
     def __init__(self) -> None:
-        self._found: list[Revisit] = []  # successive ones that agree
+        self._found: list[Revisit] = []  # consecutive ones that agree
         self._looked = -math.inf
 
     def due(self, t: float) -> bool:
-        """Whether the image of that time is to be compared."""
+        """Whether the image at time ``t`` is to be compared."""
         return t >= self._looked + INTERVAL
 
     def look(self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-        """Which points that were last seen long ago an image shows; None where that is not certain. ``current``: the newest
-        estimate of a variable by key."""
+        """The old points that an image shows, None if not certain. ``current``: the newest estimate of a variable by key."""
         self._looked = image.keyframe.t
         found = _found(model, image, old, current)
         if found is None:
@@ -99,7 +99,7 @@ class LoopClosure:
 
 
 def _found(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """What one image tells by itself."""
+    """The result of one image by itself."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -113,8 +113,9 @@ def _found(model: CameraModel, image: Image, old: OldPoints, current: Callable[[
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """The pose (3,) of the robot that enough of what should be seen from there agrees with, and which of ``points`` (M,) are shown
-    by which features (M,)."""
+    """A pose (3,) of the robot that is consistent with enough of the visible points, and matching ``points`` (M,) and features
+    (M,).
+    """
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)
     if somewhere is None:
@@ -140,15 +141,16 @@ def _on_floor(
 
 
 def _believed(guess: Guess, pose: Array, way: float) -> bool:
-    """Whether the track may have drifted to ``guess`` from a ``pose`` in a ``way`` [m]."""
+    """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``way`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_OF_WAY * way
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
 
 
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:
-    """Which points (N,) the camera may see, if it is where it is believed to be within :data:`SHIFTED` and :data:`TURNED`, and see
-    as they were seen before."""
+    """Which points (N,) the camera may see from the same side as before, if its pose is correct within :data:`SHIFTED` and
+    :data:`TURNED`.
+    """
     here, there = points.positions - camera.position, points.positions - points.seen_from
     away, before = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
     turn = np.arcsin(np.minimum(1.0, SHIFTED / away))
@@ -165,7 +167,7 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Some of the points where they are believed to be by now; where they were seen from goes with them."""
+    """Some of the points at their newest estimates, with the viewpoints moved along."""
     points = old.points
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return PointMap(
@@ -181,6 +183,6 @@ def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> 
 
 
 def _spread(model: CameraModel, pixels: Array) -> bool:
-    """Whether ``pixels`` (K, 2) are all over the image."""
+    """Whether ``pixels`` (K, 2) are spread over the image."""
     cells = np.floor(pixels / (model.width, model.height) * GRID)
     return len(np.unique(cells, axis=0)) >= CELLS

@@ -1,13 +1,14 @@
-"""The paper's EKF (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3), which is that of monoSLAM: Davison et al., 2007.
+"""The EKF of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3), which is that of monoSLAM: Davison et
+al., 2007.
 
-The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world's frame and its
-turn rate w^R in its own; points that are not in the map follow. The error state has 12, as an orientation has three degrees of
-freedom. The camera sits on R by the rig's extrinsic, so R stands in for the paper's camera frame.
+The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world frame and its
+turn rate w^R in its own frame; points that are not in the map follow. The error state has 12 values, as an orientation has three
+degrees of freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
-Odometry is read before the prediction that uses it and replaces the constant-velocity noise of x, y and heading; height, roll and
-pitch stay near those of a robot on the floor. A motion measured in space (``twist``) replaces all six. Without either, velocity
-is constant up to impulses. Points of the map are looked for where they are expected (:mod:`.monoslam_search`); others come into
-the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+Odometry replaces the constant-velocity prediction of x, y and heading; height, roll and pitch stay near those of a robot on the
+floor. A motion measured in space (``twist``) replaces all six. Without either, velocity is constant up to random impulses. Map
+points are searched where they are predicted (:mod:`.monoslam_search`); others enter the state by inverse depth
+(:mod:`.monoslam_map`). RFID is ignored.
 """
 
 import math
@@ -53,24 +54,23 @@ from factors.camera.model import carrier, huber_weight
 from factors.motion import Increment
 from factors.se2 import Array
 
-SETTLED = 1e-3  # m, rad: a step of the iterated update that needs no further one
+SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
 HORIZON = 5.0  # s of measured motion that are kept
-VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s of the start
-LATELY = 5.0  # s: a point in the state that was not seen since may be hidden now
-LOST_AFTER = 5  # images in a row in which nothing is where it is expected
-VAGUE = 0.5  # m, rad: standard deviations beyond which a place is not known
+VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
+LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
+LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
+VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
 class MonoslamSettings(FilterSettings):
     """``acceleration``, ``angular_acceleration``: standard deviations of the constant-velocity model, as published.
 
-    ``planar``: the robot is on a floor, off by ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
-    space. ``landmarks``: use of the map's points, as of
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``max_points``: in the state; ``per_image``: new ones are
-    taken
-    in where fewer than these should be in view. ``iterations``: in a known map; 1 is the published update, more linearise again.
-    With points in the state it is always 1: what is linearised at other places again and again seems to tell more than it does.
-    ``smooth``: the final trajectory of a run in a known map is smoothed; with points in the state it is the causal one.
+    ``planar``: the robot is on a floor, up to ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
+    space. ``landmarks``: use of the map's points, as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
+    ``max_points``: in the state; ``per_image``: new ones are added if fewer than these should be visible. ``iterations`` of the
+    update in a known map; 1 is the published update. With points in the state it is always 1, as repeated linearization makes the
+    filter inconsistent. ``smooth``: smooth the final trajectory of a run in a known map; with points in the state it is the
+    causal one.
     """
 
     planar: bool | None = None
@@ -86,8 +86,9 @@ class MonoslamSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _Record:
-    """``step`` led here from the record before; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the
-    place was found in the map, whatever was before."""
+    """``step``: from the previous record; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the pose
+    was found by relocalization, independent of the past.
+    """
 
     t: float
     step: Step
@@ -98,7 +99,7 @@ class _Record:
 
 
 class Monoslam(Filter):
-    """The filter; see the module."""
+    """The monoSLAM filter; see the module."""
 
     modalities = frozenset({"camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
@@ -114,12 +115,12 @@ class Monoslam(Filter):
         self._wheels = bool(moving(setup.sensors, "floor"))
         self._step: Step | None = None
         self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
-        # without a map nothing tells of the start: its uncertainty is kept out of the state, where it would shrink as the
-        # linearization moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
+        # linearization point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in time or late by at most ``max_delay``."""
+        """Process one measurement, in order or late by at most ``max_delay``."""
         twist = in_space(measurement)
         if twist is not None and self._twists is not None:
             self._ahead = None
@@ -129,7 +130,7 @@ class Monoslam(Filter):
             super().process(measurement)
 
     def learnt(self) -> Learnt:
-        """Points in the state, as seen from above; those whose depth is unknown are left out."""
+        """Points in the state, seen from above, without those of unknown depth."""
         points = {}
         if self._state is not None:
             for point, start in zip(self._state.points, self._state.starts().tolist(), strict=True):
@@ -146,8 +147,9 @@ class Monoslam(Filter):
         return planar_trajectory(self.space_trajectory())
 
     def space_trajectory(self) -> Trajectory3:
-        """The poses in space at the stamps of the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or with
-        ``smooth`` off, the causal ones."""
+        """The poses in space at the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without ``smooth``,
+        the causal ones.
+        """
         found = self._past()
         ticks = np.unique(np.array(self._ticks))
         chosen = [found[i] for i in np.searchsorted([t for t, *_ in found], ticks, side="right") - 1]
@@ -159,7 +161,7 @@ class Monoslam(Filter):
         )
 
     def _past(self) -> list[tuple[float, RobotState, Array]]:
-        """Time, robot and covariance (12, 12) of each record."""
+        """Time, robot state and covariance (12, 12) of each record."""
         records: list[_Record] = self._records
         smooth = self._smooth and self._settings.landmarks == "known"
         size = ROBOT if self._by_velocity else POSE
@@ -196,7 +198,7 @@ class Monoslam(Filter):
 
     @property
     def _by_velocity(self) -> bool:
-        """Whether no motion is measured, so that the velocity tells where the robot goes."""
+        """Whether no motion is measured, so that the motion is predicted from the velocity."""
         return self._twists is None and not (self._planar and self._wheels)
 
     def _predict(self, increment: Increment) -> None:
@@ -235,10 +237,10 @@ class Monoslam(Filter):
         self._state = state
 
     def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
-        """Told of every image and what was found in it."""
+        """Called after each image with its matches."""
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """The Kalman update, iterated; pixels far off have their noise widened, then are weighted by Huber's loss."""
+        """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
         points, spreads = match.points, match.spreads
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, match.mapped, points, spreads)
@@ -272,8 +274,9 @@ class Monoslam(Filter):
             self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
-        """Where nothing is found where it is expected, image after image, or where the pose is hardly known, the place is looked
-        for in the whole map; whether it was found. Points in the state are given up with the old place."""
+        """Relocalize in the whole map if several images had no matches, or if the pose is hardly known; whether that succeeded.
+        Points in the state are dropped with the old pose.
+        """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
         found = None if camera is None else self._standing(camera, eye)
@@ -283,11 +286,11 @@ class Monoslam(Filter):
         return found, True
 
     def _vague(self, state: SlamState) -> bool:
-        """Whether the place in a known map is so little known that nothing can be linearised there."""
+        """Whether the pose in a known map is too uncertain for linearization."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
 
     def _standing(self, camera: CameraPose, eye: Eye) -> SlamState | None:
-        """The state of a robot whose ``camera`` was found; None if it would float or tilt on a floor."""
+        """The state of a robot with the relocalized ``camera``; None if it would float or tilt on a floor."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -301,7 +304,7 @@ class Monoslam(Filter):
         return SlamState(robot, covariance)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Points counted, deleted, made x, y, z, and taken in where there are too few."""
+        """The state after counting, deleting, converting (to x, y, z) and adding points."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
@@ -324,14 +327,14 @@ class Monoslam(Filter):
         return planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
 
     def _spread(self, robot: RobotState, covariance: Array) -> Array:
-        """The covariance (6, 6) of a pose, that of the start included."""
+        """The covariance (6, 6) of a pose, including that of the start."""
         own = covariance[:6, :6]
         return own if self._origin is None else own + self._origin.of_pose(robot)
 
     def _record(self) -> _Record:
         s = self._state
         step, predicted = self._step or standstill(s.robot), self._predicted
-        if self._step is None:  # a second measurement of the same time
+        if self._step is None:  # a second measurement at the same time
             predicted = self._records[-1].covariance if self._records else s.covariance[:ROBOT, :ROBOT]
             step = standstill(self._records[-1].robot if self._records else s.robot)
         self._step, anew, self._anew = None, self._anew, False
@@ -339,15 +342,16 @@ class Monoslam(Filter):
 
 
 def _starting() -> Array:
-    """The covariance (12, 12) of a start, without that of the pose."""
+    """The covariance (12, 12) of a start, except for the pose."""
     return np.diag(np.square([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3))
 
 
 def _smoothed(
     here: _Record, after: _Record, robot: RobotState, covariance: Array, size: int
 ) -> tuple[RobotState, Array]:
-    """The robot of a record given what came later: ``robot`` and ``covariance`` (12, 12) are the smoothed ones of ``after``. The
-    first ``size`` values of the error are smoothed, on which the others have no influence later."""
+    """The smoothed robot state of a record, given the smoothed ``robot`` and ``covariance`` (12, 12) of ``after``. Only the first
+    ``size`` values of the error are smoothed; the others have no influence later.
+    """
     transition, predicted = after.step.transition[:size, :size], after.predicted[:size, :size]
     own = here.covariance[:size, :size]
     gain = positive.solve(predicted, transition @ own).T

@@ -1,7 +1,7 @@
-"""Points come into the state of the monoSLAM filter, become x, y, z, and leave it again.
+"""Management of the points in the state of the monoSLAM filter: initialization, conversion to x, y, z, and deletion.
 
-Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.G: a point that is often not found where it
-should be is deleted. Civera, Davison, Montiel, 2008: new points by inverse depth (:mod:`factors.camera.inverse_depth`).
+Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.G: a point that is often not found is deleted.
+Civera, Davison, Montiel, 2008: new points are initialized by inverse depth (:mod:`factors.camera.inverse_depth`).
 """
 
 from collections.abc import Collection, Sequence
@@ -14,13 +14,13 @@ from factorgraph_loc.slam.space_motion import ROBOT
 from factors.camera import inverse_depth
 from factors.se2 import Array
 
-NEAREST_POINT = 0.5  # m: new points are expected beyond, with 95 %
-TRIED, FOUND = 8, 0.5  # a point that should have been seen so often stays if it was found in this share
+NEAREST_POINT = 0.5  # m: new points are farther than this with 95 % probability
+TRIED, FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
-    """The state with a new point, of unknown depth, seen at ``pixel`` (2,)."""
-    inverse = 0.5 / NEAREST_POINT  # two deviations below it is 0, two above the nearest point
+    """The state with a new point of unknown depth, seen at ``pixel`` (2,)."""
+    inverse = 0.5 / NEAREST_POINT  # zero at two standard deviations below, the nearest point at two above
     position, rotation = eye.pose(state.robot)
     ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, inverse)
     by_pose = by_camera @ eye.lift
@@ -37,7 +37,7 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """The state with x, y, z of the points whose depth is known well enough for that (the linearity index)."""
+    """The state with points converted to x, y, z where the depth is known well enough (linearity index)."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -64,7 +64,7 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
 
 
 def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
-    """The state whose points remember that ``expected`` of them should have been found, and ``matched`` were, at ``t``."""
+    """The state with updated counts of the points ``expected`` to be found and ``matched`` at ``t``."""
     points = list(state.points)
     for i in expected:
         hit = i in matched
@@ -74,8 +74,9 @@ def counted(state: SlamState, expected: Sequence[int], matched: Collection[int],
 
 
 def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
-    """The state without points that failed to be found or that are beyond infinity, and how many these were; of more than
-    ``most`` points those go that were not seen for longest."""
+    """The state without points that are often not found or beyond infinity, and the number of these. If more than ``most``
+    remain, those not seen for longest are removed too.
+    """
     failed = {
         i
         for i, (p, start) in enumerate(zip(state.points, state.starts().tolist(), strict=True))
@@ -88,12 +89,12 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
 
 
 def _beyond(state: SlamState, place: int) -> bool:
-    """Whether an inverse depth is below zero for certain."""
+    """Whether an inverse depth is significantly negative."""
     return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[ROBOT + place, ROBOT + place]))
 
 
 def without(state: SlamState, which: Collection[int]) -> SlamState:
-    """The state without some of its points."""
+    """The state without the points ``which``."""
     if not which:
         return state
     kept = np.repeat([i not in which for i in range(len(state.points))], [p.size for p in state.points])

@@ -1,4 +1,4 @@
-"""What the monoSLAM filter makes of an image: which pixels are which points, of the map or of its own state."""
+"""Data association of the monoSLAM filter: which pixels of an image belong to which points of the map or of the state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,15 +21,17 @@ from factorgraph_loc.vision.spread import spread_out
 from factors.se2 import Array
 
 APART = 15.0  # px between a new point and all others
-FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree on a place without a prediction, and their share
+FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocalization, and their fraction
 
 
 @dataclass(frozen=True)
 class Match:
-    """Pixels (K, 2) that are taken, of the points ``mapped`` of the state, then of ``points`` (P, 3) of the map with covariances
-    ``spreads`` (P, 3, 3) and a likelihood of the exponent ``tempering``. ``taken``: rows of the image that they stand in, rejected
-    ones too. ``expected``: points of the state that should have been found. ``wanted``: 0 where so little was expected that nothing
-    follows if nothing is found."""
+    """The inlier pixels (K, 2), of points ``mapped`` in the state, then of ``points`` (P, 3) of the map with covariances
+    ``spreads`` (P, 3, 3).
+
+    ``tempering``: exponent of the likelihood. ``taken``: their rows of the image, including rejected ones. ``expected``: points
+    of the state that should have been found. ``wanted``: 0 if too few were predicted to conclude anything from missing matches.
+    """
 
     pixels: Array
     mapped: tuple[int, ...]
@@ -42,7 +44,7 @@ class Match:
 
 
 class FeatureMatcher:
-    """Associates; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
+    """Matches features; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
         self._diagnostics = diagnostics
@@ -63,16 +65,17 @@ class FeatureMatcher:
             self._spreads_matter = worst > (EXACT * self._left_eye.model.sigma / self._left_eye.model.fx) ** 2
 
     def eye(self, m: Pixels) -> Eye | None:
-        """The camera that took an image."""
+        """The camera of an image."""
         return self._right_eye if m.right else self._left_eye
 
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
-        """The pixels that belong to points, those that cannot be right left out and counted as rejected."""
+        """The pixels that belong to points; outliers are removed and counted as rejected."""
         return self._named(m, m.names, state, eye) if m.frame is None else self._searched(m.frame, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
-        """Rows of an image that may become points: what has no name yet in map and state, or was followed from the image before
-        (``tracks``) and lies far from what is matched and expected."""
+        """Rows of an image that may become points: unmatched features that were tracked from the previous image (``tracks``), or
+        names unknown to map and state, at a distance from matched and predicted pixels.
+        """
         if m.frame is None:
             there = {p.name for p in state.points}
             return [i for i, name in enumerate(m.names) if i not in match.taken and name not in there]
@@ -87,7 +90,7 @@ class FeatureMatcher:
         return chosen
 
     def in_view(self, state: SlamState, eye: Eye, since: float) -> int:
-        """How many points of the state should be in the image, of those that were seen ``since`` then."""
+        """The number of points of the state that should be visible, of those seen after ``since``."""
         lately = [i for i, p in enumerate(state.points) if p.t >= since]
         return len(_visible(eye, eye.mapped(state, lately))[1])
 
@@ -122,7 +125,7 @@ class FeatureMatcher:
         return replace(match, tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
-        """Where the camera is by this image and the map alone; None where that does not tell."""
+        """The camera pose from this image and the map alone; None if they do not determine it."""
         if m.frame is not None:
             found = None if self._associator is None else self._associator.relocalized(m.frame)
             return None if found is None else CameraPose(*found[:3])
@@ -136,7 +139,7 @@ class FeatureMatcher:
         return place.camera
 
     def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
-        """Features of an image that are points of the map, and how many were expected."""
+        """Matches of features and map points, and how many were predicted."""
         if self._associator is None:
             if not self._grows:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -154,7 +157,7 @@ class FeatureMatcher:
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Those of the pairs (row of the image, point of the state) that agree with the others."""
+        """The inliers of pairs (row of the image, point of the state)."""
         if not ours:
             return ours
         sights = eye.mapped(state, [p for _, p in ours])
@@ -164,7 +167,7 @@ class FeatureMatcher:
     def _agreeing_known(
         self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Those of the pairs (row of the image, point of the map) that agree with the others."""
+        """The inliers of pairs (row of the image, point of the map)."""
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]
@@ -172,7 +175,7 @@ class FeatureMatcher:
         camera = CameraPose(*eye.pose(state.robot), eye.spread(state.covariance))
         try:
             right = consensus.agreeing(eye.model, camera, points, pixels[[i for i, _ in known]], noise)
-        except np.linalg.LinAlgError:  # of a prediction that says nothing any more
+        except np.linalg.LinAlgError:  # of a meaningless prediction
             right = np.zeros(len(known), dtype=bool)
         return self._kept(known, right)
 
@@ -205,6 +208,6 @@ class FeatureMatcher:
 
 
 def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
-    """Those that are in front of the camera and in its image."""
+    """Those in front of the camera and inside its image."""
     inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
     return sights[inside], inside

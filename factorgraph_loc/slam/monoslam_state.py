@@ -1,7 +1,7 @@
-"""The state of the monoSLAM filter: the robot and points, what a camera would see of them, and how pixels correct them.
+"""The state of the monoSLAM filter (robot and points), predicted pixels, and the Kalman update.
 
-Kalman update in covariance form: of a state of 12 + D error values only the columns of the robot's pose and of the points that are
-seen enter the innovation. A sighting far off has its noise widened, as in :mod:`~factors.update`.
+The update is in covariance form: of the 12 + D error values, only the columns of the robot's pose and of observed points enter
+the innovation. The noise of outliers is widened, as in :mod:`~factors.update`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from factors.update import GATE
 
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
-POSE = 6  # values of the pose's error, the first of the state's
+POSE = 6  # first values of the error state: those of the pose
 
 
 @dataclass(frozen=True)
 class MapPoint:
-    """A point in the state, by six values (``ray``) or three. ``descriptor`` (D,): of what was found in an image, else None.
-    ``expected``, ``matched``: how often it should have been found, and was; ``t`` [s]: when it last was."""
+    """A point in the state, with six values (``ray``) or three. ``descriptor`` (D,): of a feature, else None. ``expected``,
+    ``matched``: number of times it should have been found, and was; ``t`` [s]: the last time it was found.
+    """
 
     name: str
     ray: bool
@@ -47,7 +48,7 @@ class MapPoint:
 class SlamState:
     """``robot``, and ``values`` (D,) of ``points`` one after the other; ``covariance`` (12 + D, 12 + D) of the error state.
 
-    ``tracks``: in the newest image; ``met``: points so far; ``lost``: images in a row in which nothing was where it was expected.
+    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match.
     """
 
     robot: RobotState
@@ -59,7 +60,7 @@ class SlamState:
     lost: int = 0
 
     def starts(self) -> Integers:
-        """Where each point begins in ``values``."""
+        """The index of each point's first value in ``values``."""
         sizes = [inverse_depth.SIZE if p.ray else 3 for p in self.points]
         return np.cumsum([0, *sizes], dtype=np.int64)[:-1]
 
@@ -72,7 +73,7 @@ class SlamState:
         )
 
     def moved(self, step: Step) -> SlamState:
-        """After a prediction, which changes the robot alone."""
+        """The state after a prediction, which changes the robot only."""
         carried = step.transition @ self.covariance[:ROBOT]
         covariance = self.covariance.copy()
         covariance[:ROBOT] = carried
@@ -84,9 +85,10 @@ class SlamState:
 
 @dataclass(frozen=True)
 class Sights:
-    """K pixels as they are predicted: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians by the robot's pose (K, 2, 6) and by the
-    point's own values (K, 2, 6), of which the first ``sizes`` (K,) count; 0 for a point of the map, which is not in the state.
-    ``starts`` (K,): where the point's values begin in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map."""
+    """K predicted pixels: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians with respect to the robot's pose (K, 2, 6) and the
+    point's own values (K, 2, 6), of which the first ``sizes`` (K,) are used; 0 for a map point, which is not in the state.
+    ``starts`` (K,): index of the point's values in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map.
+    """
 
     pixels: Array
     depths: Array
@@ -111,7 +113,7 @@ class Sights:
         )
 
     def columns(self) -> tuple[Integers, Array]:
-        """The Jacobian (2K, C) by those C values of the error state that matter, and which these are."""
+        """The Jacobian (2K, C) with respect to the C values of the error state it depends on, and their indices."""
         own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
         where, first, which = own
         sizes = self.sizes[self.sizes > 0][first]
@@ -126,7 +128,7 @@ class Sights:
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera: its ``model``, and how its perturbation depends on that of the robot (6, 6)."""
+    """A camera: its ``model``, and the Jacobian (6, 6) of its perturbation with respect to that of the robot."""
 
     model: CameraModel
     lift: Array
@@ -147,7 +149,7 @@ class Eye:
         return self.lift @ covariance[:POSE, :POSE] @ self.lift.T
 
     def known(self, robot: RobotState, points: Array, spreads: Array | None) -> Sights:
-        """What is seen of ``points`` (K, 3) of a map with covariances ``spreads`` (K, 3, 3); None: exact."""
+        """Predicted pixels of map ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); None: exact."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
@@ -159,7 +161,7 @@ class Eye:
         return Sights(pixels, depths, by_pose, np.zeros((len(points), 2, 6)), nothing, nothing, noise)
 
     def mapped(self, state: SlamState, which: Sequence[int]) -> Sights:
-        """What is seen of the points ``which`` of the state."""
+        """Predicted pixels of the points ``which`` of the state."""
         position, rotation = self.pose(state.robot)
         count, starts = len(which), state.starts()[list(which)]
         rays = np.array([state.points[i].ray for i in which], dtype=bool)
@@ -181,12 +183,11 @@ class Eye:
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + ROBOT, sizes, noise)
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, spreads: Array | None) -> Sights:
-        """Points of the state, then those of the map."""
+        """Predicted pixels of points of the state, then of the map."""
         return joined(self.mapped(state, which), self.known(state.robot, points, spreads))
 
 
 def joined(first: Sights, second: Sights) -> Sights:
-    """The rows of both, ``first`` before ``second``."""
     if not len(first) or not len(second):
         return first if len(first) else second
     names = Sights.__dataclass_fields__
@@ -195,8 +196,9 @@ def joined(first: Sights, second: Sights) -> Sights:
 
 @dataclass(frozen=True)
 class Innovation:
-    """``carried`` (12 + D, 2K): covariance of state and predicted pixels; ``jacobian`` (2K, C) by the ``columns`` (C,) of the error
-    state; ``covariance`` (2K, 2K) of the innovation, without noise."""
+    """``carried`` (12 + D, 2K): covariance of state and predicted pixels; ``jacobian`` (2K, C) with respect to the ``columns``
+    (C,) of the error state; ``covariance`` (2K, 2K) of the innovation, without noise.
+    """
 
     carried: Array
     jacobian: Array
@@ -210,13 +212,13 @@ class Innovation:
         return Innovation(carried, jacobian, columns, jacobian @ carried[columns])
 
     def each(self, noise: Array) -> Array:
-        """The covariance (K, 2, 2) of each pixel's innovation, with ``noise`` (K, 2, 2)."""
+        """The innovation covariance (K, 2, 2) of each pixel, with ``noise`` (K, 2, 2)."""
         k = np.arange(len(noise))
         blocks = self.covariance.reshape(len(noise), 2, len(noise), 2)
         return np.asarray(blocks[k, :, k, :] + noise)
 
     def root(self, noise: Array) -> Array:
-        """The Cholesky factor (2K, 2K) of the innovation's covariance, with ``noise`` (K, 2, 2)."""
+        """The Cholesky factor (2K, 2K) of the innovation covariance, with ``noise`` (K, 2, 2)."""
         total = self.covariance.copy()
         blocks = total.reshape(len(noise), 2, len(noise), 2)
         k = np.arange(len(noise))
@@ -230,12 +232,12 @@ class Innovation:
 
 
 def squared(residual: Array, covariance: Array) -> Array:
-    """Squares (K,) of ``residual`` (K, 2) in units of ``covariance`` (K, 2, 2)."""
+    """Squared Mahalanobis distances (K,) of ``residual`` (K, 2) with ``covariance`` (K, 2, 2)."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = residual[:, 0], residual[:, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
 
 
 def widening(residual: Array, innovation: Innovation, noise: Array) -> Array:
-    """By how much (K,) the noise of each pixel is widened: the square of the excess beyond the gate."""
+    """The factor (K,) on the noise of each pixel beyond the gate: the squared excess."""
     return np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE) ** 2

@@ -1,8 +1,7 @@
-"""Points that no map has: their sightings wait until they tell where the point is.
+"""Delayed initialization of points that the map lacks: sightings are collected until they determine the point.
 
-That needs sightings from :data:`FEWEST` keyframes whose rays enclose an angle wide enough (a parallax test) for the errors of
-pixels and poses, that meet in front of the camera, and that are seen where the place that they give says. A sighting that
-contradicts the others is dropped.
+This needs sightings from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses, rays that intersect in
+front of the camera, and small residuals. A sighting that contradicts the others is dropped.
 """
 
 from __future__ import annotations
@@ -20,17 +19,17 @@ from factors.se2 import Array
 
 FEWEST, MAX_WAITING = 3, 10  # sightings of one point
 MIN_PARALLAX = 0.03  # rad, between the outermost rays
-MAX_SPREAD = 0.15  # standard deviation of a place that is good enough to begin with, as a share of the least depth
+MAX_SPREAD = 0.15  # standard deviation of an initial point, relative to its least depth
 NEAREST = 0.3  # m of depth
-ITERATIONS, SETTLED = 4, 1e-3  # m: a step that needs no further one
-GATE = 0.999  # probability of the residuals to be that small, if all sightings are right
-PATIENCE = 20  # keyframes that a point waits without being seen again
+ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
+GATE = 0.999  # probability of the chi-square test of the residuals
+PATIENCE = 20  # keyframes after which a point not seen again is dropped
 ORIGIN, UNTURNED = np.zeros(3), np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A point seen from a keyframe, by its number, at ``pixel`` (2,): in the direction ``ray`` (3,) of the camera's frame."""
+    """A point seen from keyframe ``keyframe`` at ``pixel`` (2,), in the direction ``ray`` (3,) of the camera frame."""
 
     keyframe: int
     pixel: Array
@@ -38,7 +37,7 @@ class Sighting:
 
 
 def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sighting]:
-    """Of ``pixels`` (K, 2) seen from a keyframe."""
+    """The sightings at ``pixels`` (K, 2) from a keyframe."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     return [Sighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
@@ -46,8 +45,9 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sight
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the camera of a keyframe is: ``centre`` (3,) and ``rotation`` (3, 3) in the world; and how far off in the image its
-    error may put points, ``slack`` [px]."""
+    """Camera pose of a keyframe: ``centre`` (3,) and ``rotation`` (3, 3) in the world, and the pixel error ``slack`` [px] that
+    its uncertainty causes.
+    """
 
     centre: Array
     rotation: Array
@@ -55,14 +55,15 @@ class Place:
 
     @classmethod
     def of(cls, model: CameraModel, pose: Array, slack: float) -> Place:
-        """Of the robot at ``pose`` (3,)."""
+        """The camera of a robot at ``pose`` (3,)."""
         return cls(*reprojection.camera_pose(model, pose), slack)
 
 
 @dataclass(frozen=True, slots=True)
 class Triangulated:
-    """A point's ``position`` (3,), its ``covariance`` (3, 3) with exact poses, and the squared whitened residuals (M,) of its
-    sightings."""
+    """A point's ``position`` (3,), its ``covariance`` (3, 3) for exact poses, and squared whitened residuals (M,) of its
+    sightings.
+    """
 
     position: Array
     covariance: Array
@@ -70,7 +71,7 @@ class Triangulated:
 
 
 class NewPoints:
-    """The sightings that wait, by the name or number of their point."""
+    """The collected sightings of points that are not initialized yet, by name or number of the point."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
@@ -80,28 +81,30 @@ class NewPoints:
         return len(self._waiting)
 
     def count(self, name: Hashable) -> int:
-        """How many sightings of a point wait."""
+        """The number of collected sightings of a point."""
         return len(self._waiting.get(name, ()))
 
     def waiting(self) -> Mapping[Hashable, Sequence[Sighting]]:
-        """All that wait."""
+        """All collected sightings."""
         return self._waiting
 
     def add(self, name: Hashable, sighting: Sighting) -> None:
-        """One more sighting; the oldest ones do not wait for ever."""
+        """Add a sighting; the oldest ones are dropped."""
         waiting = self._waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
     def forget(self, keyframe: int) -> None:
-        """Give up the points that were last seen long before a keyframe."""
+        """Drop the points that were last seen long before a keyframe."""
         self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
 
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], Place | None], most: int = 1000
     ) -> list[tuple[Hashable, Triangulated, list[Sighting]]]:
-        """Those of ``names``, at ``most`` so many, whose place is told by now, with the sightings that tell it; they wait no
-        longer. ``places``: of keyframes, None for one that nothing can be added to."""
+        """Remove and return at ``most`` this many of the points ``names`` that are determined now, with the sightings used.
+
+        ``places``: camera poses of keyframes, None for a keyframe that nothing can be added to.
+        """
         found: list[tuple[Hashable, Triangulated, list[Sighting]]] = []
         known: dict[int, Place | None] = {}
         for name in names:
@@ -124,7 +127,7 @@ class NewPoints:
 def apart(
     model: CameraModel, first: Sighting, here: Place, last: Sighting, there: Place, spread: float = MAX_SPREAD
 ) -> bool:
-    """Whether it is worth a try: two rays alone would nearly tell the point's place to the share ``spread`` of its depth."""
+    """Cheap test whether two rays alone nearly determine the point to ``spread`` times its depth."""
     sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / spread, 0.5))
     return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
@@ -133,8 +136,9 @@ def apart(
 def agreed(
     model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
 ) -> tuple[Triangulated, list[Sighting]] | None:
-    """The point of ``seen`` from ``places``, and those sightings that agree on it; None where they do not tell it to the share
-    ``spread`` of its depth. Where they contradict each other, the one goes without which the others do so least."""
+    """The point ``seen`` from ``places``, and its consistent sightings; None if they do not determine it to ``spread`` times its
+    depth. Of contradicting sightings the one without which the others agree best is removed.
+    """
     seen, places = list(seen), list(places)
     found = _triangulate(model, seen, places, spread)
     while found is not None and not found.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
@@ -155,10 +159,11 @@ def agreed(
 def triangulate(
     model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float = MAX_SPREAD
 ) -> Triangulated | None:
-    """The point ``seen`` M times from ``places``; None where the rays are too nearly parallel, do not meet in front of the camera,
-    or tell the place worse than to the share ``spread`` of its least depth.
+    """Triangulate a point ``seen`` M times from ``places``, minimising the squared residuals in the images, from the point
+    nearest to the rays.
 
-    It begins where the rays come nearest to each other, and minimises the squared residuals in the images.
+    None if the rays are nearly parallel, do not intersect in front of the camera, or do not determine the point to ``spread``
+    times its least depth.
     """
     found = _triangulate(model, seen, places, spread)
     return None if found is None or not math.isfinite(found.squared.sum()) else found
@@ -167,7 +172,7 @@ def triangulate(
 def _triangulate(
     model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
 ) -> Triangulated | None:
-    """The same, with residuals that are infinite where the rays do not meet in front of the camera."""
+    """As :func:`triangulate`, with infinite residuals where the rays do not intersect in front of the camera."""
     centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
     rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
     if (rays @ rays.T).min() > math.cos(MIN_PARALLAX):
@@ -179,12 +184,12 @@ def _triangulate(
         local = ((point - centres)[:, None, :] @ turns)[:, 0]
         if not local[:, 2].min() > NEAREST:
             return Triangulated(point, UNTURNED, np.full(len(seen), np.inf))
-        # a point in the frame of a camera is as one of the world seen by a camera that is not moved
+        # a point in the camera frame is like a world point seen by a camera at the origin
         at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
         residual = (at - pixels) / sigmas[:, None]
         jacobian = (by_local @ turns.transpose(0, 2, 1) / sigmas[:, None, None]).reshape(-1, 3)
         covariance = np.linalg.inv(jacobian.T @ jacobian)
-        # at first it need not be that good
+        # the initial point may be less accurate
         if np.linalg.eigvalsh(covariance)[-1] > ((2.0 if i == 0 else 1.0) * spread * local[:, 2].min()) ** 2:
             return None
         if i < ITERATIONS:

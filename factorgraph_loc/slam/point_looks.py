@@ -1,4 +1,4 @@
-"""What the points of a graph looked like when they were seen last."""
+"""The last view of each point of a graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +14,9 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The feature's ``descriptor`` (D,) and ``size`` [px], where the camera was, ``seen_from`` (3,), and how far the robot had gone
-    by then, ``way`` [m]."""
+    """The feature's ``descriptor`` (D,) and ``size`` [px], the camera position ``seen_from`` (3,), and the distance travelled by
+    the robot until then, ``way`` [m].
+    """
 
     descriptor: NDArray[Any]
     size: float
@@ -24,7 +25,7 @@ class Look:
 
 
 class PointLooks:
-    """The last look of each point, by its key."""
+    """The last view of each point, by key."""
 
     def __init__(self) -> None:
         self._looks: dict[int, Look] = {}
@@ -37,12 +38,12 @@ class PointLooks:
         return self._looks[key]
 
     def keep(self, key: int, frame: CameraFrame, row: int, seen_from: Array, way: float) -> None:
-        """A point was seen as one of the features of a frame."""
+        """Store the view of a point from the feature ``row`` of a frame."""
         self._feature = frame.feature
         self._looks[key] = Look(frame.descriptors[row], float(frame.sizes[row]), seen_from, way)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
-        """Points with a view each where there is one, in their order."""
+        """A map of the points, with their last views, in the given order."""
         shown = [i for i, key in enumerate(keys) if key in self._looks]
         if not shown:
             return PointMap.of(tuple(names), positions, covariances)

@@ -1,4 +1,4 @@
-"""What a graph makes of an image beside the points of its map: points that it estimates, and the motion since the image before."""
+"""Mapping from images in a graph: points that are estimated, and relative motion between images."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class PointMapper:
         return self._unknown is not None
 
     def is_due(self, m: Pixels) -> bool:
-        # unknown points need keyframes of their own, whatever others stand there for other sensors
+        # estimated points need keyframes of their own
         return self._unknown is not None and m.modality == self._camera.modality and m.t - self._taken >= self._interval
 
     def take(
@@ -99,7 +99,7 @@ class PointMapper:
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> PointMapper | None:
-    """The mapper of a run; None where nothing is to be mapped."""
+    """The mapper of a run; None if nothing is to be mapped."""
     camera = sensors.get(CameraSensor.modality)
     if not isinstance(camera, CameraSensor) or camera.points.model is None:
         return None

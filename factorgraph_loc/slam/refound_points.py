@@ -1,7 +1,7 @@
-"""Points of a graph that are found again by what they look like, after what followed them from image to image lost them.
+"""Matching of graph points by descriptor after their track was lost.
 
-Of what is in view where they are predicted, inside the ellipse that pose and point leave, the nearest descriptor that is clearly
-nearer than the second (:func:`factorgraph_loc.vision.matching.match_guided`). Whether it is right the other points tell.
+Within the ellipse predicted from pose and point, the nearest descriptor is accepted if it is clearly nearer than the second
+(:func:`factorgraph_loc.vision.matching.match_guided`). Wrong matches are rejected later, by consensus with other points.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-NOISE = 3.0  # px: of a point's place in the image beside what the pose does to it
+NOISE = 3.0  # px: of the predicted pixel, in addition to the error of the pose
 FARTHEST = 15.0  # m of depth
 
 
@@ -28,8 +28,9 @@ def refound(
     frame: CameraFrame,
     rows: Sequence[int],
 ) -> list[tuple[int, int]]:
-    """Pairs of a point, of those at ``positions`` (N, 3) with N ``descriptors``, and of one of the features ``rows`` of a frame
-    that shows it from about ``camera``."""
+    """Pairs of a point, of those at ``positions`` (N, 3) with N ``descriptors``, and of its match among the features ``rows`` of
+    a frame taken from about ``camera``.
+    """
     if not len(positions) or not rows:
         return []
     seen, by_camera, _ = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)

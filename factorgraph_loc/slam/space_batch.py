@@ -1,10 +1,10 @@
-"""The offline optimum of a run in space: all poses at once, from measured motion and from points of a known map.
+"""Batch estimation in space: all poses at once, from measured motion and points of a known map.
 
-One ``gtsam.Pose3`` a stamp; between factors of the measured motion (``twist``), or where there is none of a random walk; and of
-each image the points that the monoSLAM filter found in it, under the loss of Huber. That filter, which runs along, gives the
-guess; its causal estimates are not the batch's and are never ``localized``. Points that the map lacks are not used.
+One ``gtsam.Pose3`` per stamp; between-factors of the measured motion (``twist``), or of a random walk without it; and for each
+image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values; its causal
+estimates are not the batch's and are never ``localized``. Points that the map lacks are not used.
 
-Levenberg-Marquardt in Python: the points' factors are linearised here, as :mod:`.problem` does, and GTSAM solves.
+Levenberg-Marquardt in Python: point factors are linearised here, as in :mod:`.problem`, and GTSAM solves.
 """
 
 import math
@@ -32,19 +32,20 @@ from factors.camera.model import huber_loss, huber_weight
 from factors.se2 import Array
 
 MAX_ITERATIONS = 50
-CONVERGED_GAIN = 1e-6  # of the cost
+CONVERGED_GAIN = 1e-6  # relative decrease of the cost at convergence
 INITIAL_DAMPING, MAX_DAMPING = 1e-6, 1e6
-RANDOM_WALK = (1.0, 1.0, 1.0)  # m and rad per sqrt(s), where no motion is measured
+RANDOM_WALK = (1.0, 1.0, 1.0)  # m and rad per sqrt(s), without measured motion
 
 
 class SpaceBatchSettings(MonoslamSettings):
-    """Those of the filter that gives the guess; ``landmarks`` must be ``known``, and ``planar`` off."""
+    """Settings of the filter that provides initial values; ``landmarks`` must be ``known``, and ``planar`` off."""
 
 
 @dataclass(frozen=True)
 class _Image:
-    """What one camera saw at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); ``tempering``:
-    exponent of their likelihood."""
+    """The image of a camera at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3);
+    ``tempering``: exponent of the likelihood.
+    """
 
     t: float
     eye: Eye
@@ -54,7 +55,7 @@ class _Image:
     tempering: float
 
     def linearize(self, pose: gtsam.Pose3) -> tuple[Array, Array]:
-        """Whitened, robustly weighted residual (2K,) and Jacobian (2K, 6) by the pose."""
+        """Whitened, robustly weighted residual (2K,) and Jacobian (2K, 6) with respect to the pose."""
         error, whitener, jacobian = self._whitened(pose)
         weight = np.sqrt(self.tempering * huber_weight(np.sum(error**2, axis=1), self.eye.model.robust))
         return (weight[:, None] * error).ravel(), (weight[:, None, None] * (whitener @ jacobian)).reshape(-1, 6)
@@ -72,23 +73,25 @@ class _Image:
 
 
 class SpaceBatch(Monoslam):
-    """The batch in space; see the module."""
+    """The batch estimator in space; see the module."""
 
     estimates_points = False
     starts_in_space = True
 
     def __init__(self, setup: Setup, settings: SpaceBatchSettings) -> None:
         if settings.landmarks != "known" or settings.planar:
-            raise InputError("space_batch: takes points of a known map and a robot in space, expected planar = false")
+            raise InputError(
+                "space_batch: works with points of a known map and a robot in space, expected planar = false"
+            )
         super().__init__(setup, settings.model_copy(update={"planar": False}))
         twist = twist_settings(setup)
         self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
         self._images: dict[tuple[float, bool], _Image] = {}
         self._prior: PosePrior | None = None
-        self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the end, until something is taken
+        self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a pose in space; InputError for one on a floor alone."""
+        """Start from a pose in space. Raises InputError for a planar pose."""
         if prior.space is None:
             raise InputError(
                 "space_batch: the start is a pose on a floor, expected one in space: a log with such a reference"
@@ -97,7 +100,7 @@ class SpaceBatch(Monoslam):
         super().initialize(prior)
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in time or late by at most ``max_delay``."""
+        """Process one measurement, in order or late by at most ``max_delay``."""
         self._conclusion = None
         twist = in_space(measurement)
         if twist is not None:
@@ -105,19 +108,19 @@ class SpaceBatch(Monoslam):
         super().process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The filter's guess: not an estimate to be scored, as the problem is only solved at the end."""
+        """The filter's estimate, which is not to be scored: the problem is solved at the end only."""
         return replace(super().estimate(t), status="unlocalized")
 
     def space_trajectory(self) -> Trajectory3:
-        """The optimum over the whole log, at the stamps of the ticks."""
+        """The optimum over the whole log, at the ticks."""
         return self._concluded()[0]
 
     def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics, and what the final trajectory adds to them."""
+        """The diagnostics, including those of the final trajectory."""
         return self._concluded()[1]
 
     def _concluded(self) -> tuple[Trajectory3, Diagnostics]:
-        """The final trajectory, and the diagnostics with what it adds to them."""
+        """The final trajectory, and the diagnostics including it."""
         if self._conclusion is None:
             diagnostics = self.diagnostics.copy()
             self._conclusion = self._solution(diagnostics), diagnostics
@@ -172,7 +175,7 @@ class SpaceBatch(Monoslam):
 def _covariances(
     linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
 ) -> dict[int, Array]:
-    """The covariances (6, 6) of the poses ``rows``, of those at ``t``; RunFailedError where they are not determined."""
+    """Covariances (6, 6) of the poses ``rows``. Raises RunFailedError if they are not determined."""
     try:
         found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
     except IndeterminateError as error:
@@ -210,7 +213,7 @@ def _solved(
         try:
             moved = values.retract(damped.optimize())
             found = cost(moved)
-        except RuntimeError:  # of a system that is too badly conditioned to be solved
+        except RuntimeError:  # the system is too ill-conditioned to be solved
             found = math.inf
         if not (math.isfinite(found) and found <= best):
             damping *= 10.0

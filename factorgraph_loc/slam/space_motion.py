@@ -1,11 +1,11 @@
-"""How a robot moves in space between two times: one step of a filter whose error state has 12 values.
+"""Motion of a robot in space between two times, for a filter with an error state of 12 values.
 
-The error state is (turn, shift, velocity, turn rate): turn and shift (3,) of the pose in the robot's own frame, as ``gtsam.Pose3``
-has them, the velocity (3,) in the world's frame and the turn rate (3,) in the robot's.
+The error state is (rotation, translation, velocity, turn rate): rotation and translation (3,) of the pose in the robot's frame,
+as of ``gtsam.Pose3``, the velocity (3,) in the world frame and the turn rate (3,) in the robot's.
 
 Constant velocity: Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis
-and Machine Intelligence 29(6), 2007, section III.D: unknown accelerations a and alpha act as impulses a dt and alpha dt,
-so the noise depends on how long the steps are.
+and Machine Intelligence 29(6), 2007, section III.D: unknown accelerations a and alpha act as impulses a dt and alpha dt, so the
+noise depends on the length of the steps.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from factors.se2 import Array
 
 ROBOT = 12  # values of the error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-PLANAR = [3, 4, 2]  # of the pose's error state: x, y and heading of a robot that stands level
-UPRIGHT = [0, 1, 5]  # and what the floor holds: roll, pitch, height
-NO_VELOCITY = [8, 9, 10]  # velocities of these
-SETTLING = 1.0  # s, in which a robot that was lifted or tilted comes back to the floor
-HOLD = 1.0  # s, for which a measured motion holds on
-SHORTEST = 1e-3  # s, for which a velocity means something
-UNKNOWN = 0.5  # m and rad per sqrt(s) without any
+PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level robot
+UPRIGHT = [0, 1, 5]  # the components held by the floor: roll, pitch, height
+NO_VELOCITY = [8, 9, 10]  # their velocities
+SETTLING = 1.0  # s, time constant of the return to the floor
+HOLD = 1.0  # s, for which a measured velocity is held
+SHORTEST = 1e-3  # s, shortest interval from which a velocity is computed
+UNKNOWN = 0.5  # m and rad per sqrt(s) without measured motion
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The 13 values: ``position`` (3,) [m] in the world, ``rotation`` (3, 3) of the robot in the world, which stands for the
-    quaternion, ``velocity`` (3,) [m/s] in the world's frame and ``rate`` (3,) [rad/s] in the robot's."""
+    """The 13 values: ``position`` (3,) [m] in the world, ``rotation`` (3, 3) of the robot in the world, in place of the
+    quaternion, ``velocity`` (3,) [m/s] in the world frame and ``rate`` (3,) [rad/s] in the robot's.
+    """
 
     position: Array
     rotation: Array
@@ -44,7 +45,7 @@ class RobotState:
     rate: Array
 
     def plus(self, error: Array) -> RobotState:
-        """The state moved by an error (12,)."""
+        """The state perturbed by an error (12,)."""
         return RobotState(
             self.position + self.rotation @ error[SHIFT],
             orthonormal(self.rotation @ exp(error[TURN])),
@@ -53,7 +54,7 @@ class RobotState:
         )
 
     def minus(self, other: RobotState) -> Array:
-        """The error (12,) that leads from ``other`` to this state."""
+        """The error (12,) of this state relative to ``other``."""
         turn = log(other.rotation.T @ self.rotation)
         shift = other.rotation.T @ (self.position - other.position)
         return np.concatenate((turn, shift, self.velocity - other.velocity, self.rate - other.rate))
@@ -61,21 +62,22 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Step:
-    """A prediction: the ``robot`` that it led to, the ``transition`` (12, 12) of its error and the ``noise`` (12, 12) added."""
+    """A prediction: the resulting ``robot``, the ``transition`` (12, 12) of the error and the added ``noise`` (12, 12)."""
 
     robot: RobotState
     transition: Array
     noise: Array
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """This step with another after it."""
+        """This step followed by another."""
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Motion in space: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start, with the ``covariance`` (6, 6)
-    of its perturbation at the end, turn first, then shift."""
+    """Motion in space: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start, with ``covariance`` (6, 6) of
+    a perturbation at the end, rotation first.
+    """
 
     rotation: Array
     shift: Array
@@ -84,13 +86,13 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Origin:
-    """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, which all that follows shares."""
+    """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, common to all later poses."""
 
     robot: RobotState
     covariance: Array
 
     def of_pose(self, robot: RobotState) -> Array:
-        """What it makes of the covariance (6, 6) of a later pose."""
+        """Its contribution to the covariance (6, 6) of a later pose."""
         turn = robot.rotation.T @ self.robot.rotation
         back = robot.rotation.T @ (self.robot.position - robot.position)
         adjoint = np.zeros((6, 6))
@@ -99,20 +101,21 @@ class Origin:
         return adjoint @ self.covariance @ adjoint.T
 
     def of_point(self, point: Array) -> Array:
-        """What it makes of the covariance (3, 3) of a ``point`` (3,)."""
+        """Its contribution to the covariance (3, 3) of a ``point`` (3,)."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         return np.asarray(jacobian @ self.covariance @ jacobian.T)
 
 
 def standstill(robot: RobotState) -> Step:
-    """No motion: the step to a second measurement of the same time."""
+    """The step of no motion, to a second measurement at the same time."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
 def constant_velocity(robot: RobotState, dt: float, impulse: Array, angular_impulse: Array) -> Step:
-    """Motion at constant velocity over ``dt``; ``impulse``, ``angular_impulse`` (3,): standard deviations of what is added to
-    velocity and turn rate at its beginning."""
+    """Motion at constant velocity over ``dt``; ``impulse``, ``angular_impulse`` (3,): standard deviations of the change of
+    velocity and turn rate at its beginning.
+    """
     turned = exp(robot.rate * dt)
     rotation = orthonormal(robot.rotation @ turned)
     by_rate = dt * np.asarray(gtsam.Rot3.ExpmapDerivative(robot.rate * dt))
@@ -127,7 +130,7 @@ def constant_velocity(robot: RobotState, dt: float, impulse: Array, angular_impu
 
 
 def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
-    """Motion that was measured over ``dt``: it replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
+    """Motion that was measured over ``dt``; it replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
     dt = max(dt, SHORTEST)
     rotation = orthonormal(robot.rotation @ motion.rotation)
     transition, by_noise = np.zeros((ROBOT, ROBOT)), np.zeros((ROBOT, 6))
@@ -151,8 +154,9 @@ def planar(increment: Increment) -> Displacement:
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) -> Step:
-    """A step of a robot that the floor holds: height, roll and pitch are those of a stationary process around zero with these
-    standard deviations, whatever the step says of them, and have no velocity. Small tilts."""
+    """A step of a robot on the floor: height, roll and pitch follow a stationary process about zero with these standard
+    deviations, and have no velocity. For small tilts.
+    """
     keep = math.exp(-dt / SETTLING)
     robot = step.robot
     heading = about_z(math.atan2(robot.rotation[1, 0], robot.rotation[0, 0]))
@@ -170,7 +174,7 @@ def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) 
 
 
 class TwistChain:
-    """Measured velocities in, motion between any two times out. ``horizon``: seconds of rows that are kept."""
+    """Integrates measured velocities to the motion between two times. ``horizon``: seconds of rows that are kept."""
 
     def __init__(self, settings: TwistSettings, horizon: float = math.inf) -> None:
         self._spread = np.square((*settings.turn, *settings.shift))
@@ -179,7 +183,7 @@ class TwistChain:
         self._rows: list[tuple[Array, Array]] = []
 
     def add(self, t: float, v: Array, w: Array) -> bool:
-        """Take a row; False if it is older than the newest, whose motion is used already."""
+        """Add a row; False if it is older than the newest, whose motion was used already."""
         if self._t and t < self._t[-1]:
             return False
         self._t.append(t)
@@ -190,7 +194,7 @@ class TwistChain:
         return True
 
     def between(self, start: float, end: float) -> Displacement:
-        """The motion from ``start`` to ``end``, later; a velocity holds until the next row, for at most :data:`HOLD`."""
+        """The motion from ``start`` to ``end``; a velocity is held until the next row, for at most :data:`HOLD`."""
         rotation, shift, covariance = np.eye(3), np.zeros(3), np.zeros((6, 6))
         first, last = bisect.bisect_right(self._t, start), bisect.bisect_left(self._t, end)
         cuts = [start, *(t for t in self._t[first:last]), end]
@@ -211,17 +215,17 @@ class TwistChain:
 
 
 def exp(turn: Array) -> Array:
-    """The rotation (3, 3) of a turn (3,)."""
+    """The rotation (3, 3) of a rotation vector (3,)."""
     return np.asarray(gtsam.Rot3.Expmap(turn).matrix())
 
 
 def log(rotation: Array) -> Array:
-    """The turn (3,) of a rotation (3, 3)."""
+    """The rotation vector (3,) of a rotation (3, 3)."""
     return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(rotation)))
 
 
 def about_z(angle: float) -> Array:
-    """The rotation (3, 3) by ``angle`` [rad] about z, counter-clockwise as seen from above."""
+    """The rotation (3, 3) by ``angle`` [rad] about z."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 
@@ -233,5 +237,5 @@ def cross(v: Array) -> Array:
 
 
 def orthonormal(rotation: Array) -> Array:
-    """A rotation (3, 3) without the rounding errors that its products gather."""
+    """A rotation (3, 3) with the accumulated rounding errors removed."""
     return np.asarray(rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation))

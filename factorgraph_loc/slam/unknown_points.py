@@ -1,9 +1,8 @@
 """Points that the map lacks, as variables of a graph.
 
-Pixels of one enter the graph at keyframes alone. First its sightings wait (:mod:`.new_points`); with its place it becomes a
-variable, with all of them as factors. Then its pixels place the newest keyframe, those that agree with the others, and become
-factors too. A point whose pixels disagree :data:`STRIKES` times in a row is another one from then on: whoever followed it went
-astray.
+Their pixels enter the graph at keyframes only. Sightings are collected first (:mod:`.new_points`); once the point is determined
+it becomes a variable, with all of them as factors. From then on its inlier pixels correct the newest keyframe and become factors
+too. A track whose pixels are outliers :data:`STRIKES` times in a row is separated from the point.
 """
 
 import math
@@ -39,22 +38,23 @@ from factors.graph import VectorPriorFactor
 from factors.se2 import Array
 from factors.update import robust_update
 
-PER_KEYFRAME, WAITING = 40, 60  # points that are seen from one, and that wait
+PER_KEYFRAME, WAITING = 40, 60  # maximum number of estimated points per keyframe, and of points waiting
 STRIKES = 2
-ANCHORED = 4  # points of the graph that place a keyframe well: to SLACK pixels
+ANCHORED = 4  # points of the graph that determine a keyframe to SLACK pixels
 SLACK = 2.0  # px
-OPEN = np.full(3, 30.0)  # m: sightings may leave a point open, but not farther than a building is wide
-LOST = 10.0  # s for which a point is looked for: later on, in a building, too many others look like it
-AGREED = 0.5  # share of points that must agree, of those not seen for longer: looks that are alike agree by chance
-RECENT = 5.0  # s: a point that was seen since has the error of the track now
-REVISITED = 6  # points not seen for longer that together are right, whatever the others say
-HORIZON, BUNDLE = 60, 8  # keyframes back that sightings may wait, and that are adjusted together
+OPEN = np.full(3, 30.0)  # m: weak prior of a point, about the size of a building
+LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
+AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
+RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
+REVISITED = 6  # points not seen for longer that are accepted together, whatever the others say
+HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
 
 
 @dataclass
 class _Point:
-    """A point of the graph: when it was last seen, what its sightings tell of it with exact poses (3, 3), and how many of
-    the last ones disagreed."""
+    """A point of the graph: when it was last seen, the information (3, 3) of its sightings for exact poses, and the number of
+    consecutive outliers.
+    """
 
     key: int
     last: float
@@ -64,18 +64,20 @@ class _Point:
 
 @dataclass
 class UnknownPoints:
-    """The points of a graph by name, and those that wait. ``estimated``: constants of the camera that are variables."""
+    """The points of a graph by name, and those waiting. ``estimated``: camera constants that are variables."""
 
     model: CameraModel
     diagnostics: Diagnostics
     estimated: Estimated = NOTHING
     _points: dict[Hashable, _Point] = field(default_factory=dict)
-    _astray: list[_Point] = field(default_factory=list)  # in the graph, but seen no more under their name
-    _names: dict[int, str] = field(default_factory=dict)  # by key, of all that ever were in the graph
+    _astray: list[_Point] = field(default_factory=list)  # in the graph, but no longer seen under their name
+    _names: dict[int, str] = field(default_factory=dict)  # by key, of all points that ever were in the graph
     _looks: PointLooks = field(default_factory=PointLooks)
     _loops: LoopClosure = field(default_factory=LoopClosure)
-    _distance_travelled: float = 0.0  # m that the robot has gone
-    _again_as: dict[Hashable, Hashable] = field(default_factory=dict)  # names of points that are followed by new tracks
+    _distance_travelled: float = 0.0  # m
+    _again_as: dict[Hashable, Hashable] = field(
+        default_factory=dict
+    )  # names of points that are continued by new tracks
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
@@ -91,8 +93,11 @@ class UnknownPoints:
         graph: GraphView,
         addition: Addition,
     ) -> Guess:
-        """Turn ``rows`` of what is seen from a new keyframe into factors and variables; returned is the guess of its pose, placed
-        by the points. Its covariance stays: the points are known no better than the poses that saw them."""
+        """Turn ``rows`` of what is seen from a new keyframe into factors and variables, and return its pose, corrected by the
+        points.
+
+        The covariance is not reduced: the points are as uncertain as the poses that observed them.
+        """
         model = self.model
         if graph.constants is not None:
             model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
@@ -148,11 +153,11 @@ class UnknownPoints:
         return pose, guess[1]
 
     def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: GraphView) -> list[Hashable]:
-        """What is seen, by name: of features the number of the track, or of that under which the point came into the graph."""
+        """The name of each row: of a feature, the number of its track, or of the track that its point was added with."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
-        # the track that a point came with may come back itself
+        # the track that a point was added with may itself return
         gone = self._points.keys() - set(tracks)
         self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
         names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
@@ -177,14 +182,14 @@ class UnknownPoints:
         return names
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
-        """From now on a track, and no other, shows the point of that name."""
+        """Assign the point ``name`` to ``track`` and to no other."""
         self._again_as = {other: of for other, of in self._again_as.items() if of != name}
         self._again_as[track] = name
 
     def _revisited(
         self, model: CameraModel, image: Image, rows: Sequence[int], names: list[Hashable], graph: GraphView
     ) -> set[int]:
-        """Those ``rows`` of an image that certainly show points last seen long ago; their ``names`` become those of the points."""
+        """The ``rows`` of an image that certainly show points last seen long ago; ``names`` are updated to those of the points."""
         t = image.keyframe.t
         old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._looks]
         if not old:
@@ -208,33 +213,32 @@ class UnknownPoints:
         return certain
 
     def _remember(self, m: CameraFrame, seen: Sequence[tuple[int, Hashable, bool]], seen_from: Array) -> None:
-        """What points of the graph look like now; a track that is none of them after all goes its own way."""
+        """Store the current views of points; a track that was wrongly assigned to one is separated."""
         for row, name, agrees in seen:
             track = int(m.tracks[row])
             if agrees:
                 self._looks.keep(self._points[name].key, m, row, seen_from, self._distance_travelled)
             elif self._again_as.pop(track, None) is not None:
-                self._points[name].strikes -= 1  # the point itself did nothing wrong
+                self._points[name].strikes -= 1  # not the fault of the point
 
     def uses(self, name: Hashable) -> bool:
-        """Whether what is seen under a name is a point of the graph, or waits to be one."""
+        """Whether ``name`` is a point of the graph, or waiting to become one."""
         return name in self._points or name in self._again_as or self._new.count(name) > 0
 
     def leave(self, t: float) -> list[int]:
-        """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+        """Remove the points last seen before ``t``, and return their keys."""
         gone = [point.key for point in (*self._points.values(), *self._astray) if point.last < t]
         self._points = {name: point for name, point in self._points.items() if point.last >= t}
         self._astray = [point for point in self._astray if point.last >= t]
         return gone
 
     def keep_only(self, keys: set[int]) -> None:
-        """Give up the points of the graph but those with these ``keys``, and all that wait."""
+        """Remove the points of the graph without these ``keys``, and all waiting ones."""
         self._points = {name: point for name, point in self._points.items() if point.key in keys}
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that were ever in the graph, those that were met under several keys under the first of them; of
-        features with the last view of each."""
+        """All points that were ever in the graph, under the first of their keys; features with their last view."""
         keys: dict[str, int] = {}
         for key, name in self._names.items():
             if key in values:
@@ -254,9 +258,9 @@ class UnknownPoints:
         graph: GraphView,
         known: Truths,
     ) -> tuple[Guess, Truths]:
-        """The guess placed by points of the graph, and which of these agree.
+        """The pose corrected by points of the graph, and which of these are inliers.
 
-        Those that were not seen for long need not agree with the others, as the track has drifted since, but with each other.
+        Points not seen for long need to agree with each other but not with the rest, as the track has drifted since.
         """
         if not points:
             return guess, np.zeros(0, dtype=bool)
@@ -296,7 +300,7 @@ class UnknownPoints:
         graph: GraphView,
         addition: Addition,
     ) -> None:
-        """A point of the graph is seen again."""
+        """Add an observation of a point that is in the graph already."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: does not agree with the others")
@@ -326,11 +330,11 @@ class UnknownPoints:
     def _places(
         self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView
     ) -> tuple[dict[int, Place], Array]:
-        """Where the keyframes are that see points that wait, by number, and how well their pixels fit to those of the newest; and
-        the pose (3,) of that.
+        """The camera poses of the keyframes that see waiting points, by number, with the pixel errors they cause in the newest
+        one; and the pose (3,) of the newest keyframe.
 
-        Between keyframes that points of the graph have placed they do; else that goes with the turn that odometry alone tells
-        between them, or with the adjustment of both where that is possible.
+        Relative poses come from points of the graph where these determine both keyframes, otherwise from odometry, or from local
+        bundle adjustment where possible.
         """
         slacks = self._slacks(newest, graph)
         if not self._anchored[newest.index]:
@@ -347,10 +351,10 @@ class UnknownPoints:
         return places, pose
 
     def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:
-        """By how many pixels the last keyframes may be off against the newest."""
+        """The pixel error of the last keyframes relative to the newest."""
         slacks: dict[int, float] = {}
         to_anchor = since = (
-            0.0  # variance of the turn from the newest to the first one that is anchored, and from that on
+            0.0  # variance of the rotation from the newest to the first anchored keyframe, and from that one on
         )
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):

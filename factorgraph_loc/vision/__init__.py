@@ -1,5 +1,4 @@
-"""Point features of images: the paper's colour features, OpenCV's beside them, their matching and how well they
-repeat."""
+"""Point features of images (the paper's colour features, SIFT, ORB), their matching, tracking and localization in a map."""
 
 __all__ = [
     "association",

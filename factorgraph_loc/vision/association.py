@@ -1,10 +1,10 @@
-"""Which features of an image show which points of a map: with a prediction of the camera's pose, or without any.
+"""Matching of an image's features to the points of a map, with or without a predicted camera pose.
 
-With one, a point is looked for where it should be seen, if it has been seen from about there before, which also leaves out what a
-wall hides; of what looks alike in its gate the clearly nearest is taken, and all that are taken must agree on one pose
-(:mod:`~factorgraph_loc.vision.consensus`). Without one, the whole map is compared with the image
-(:mod:`~factorgraph_loc.vision.relocalization`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, here among different points, as views
-of one look alike.
+With a prediction, a point is searched where it should be visible, if it was observed from a similar viewpoint before, which also
+excludes occluded points. The most similar feature in its gate is accepted if it passes the ratio test, and all matches must agree
+on one pose (:mod:`~factorgraph_loc.vision.consensus`). Without a prediction, the image is compared with the whole map
+(:mod:`~factorgraph_loc.vision.relocalization`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, here among different points, as
+views of one point are similar.
 """
 
 import math
@@ -25,27 +25,27 @@ from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8
-NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are looked for
-TURNED, ZOOMED = math.radians(50.0), 2.0  # between the views of a point: of their directions, and of their distances
+NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are searched
+TURNED, ZOOMED = math.radians(50.0), 2.0  # bounds between views: angle, ratio of distances
 GATE = float(chi2.ppf(0.99, 2))
-CELL = 20.0  # px, of the cells that features are sorted into
-# px, half the diameter: for what the prediction lacks, and for what may be searched
+CELL = 20.0  # px, cells for sorting features
+# px, radius: added for errors of the prediction, and the largest gate
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
-MARGIN = 20.0  # px around the image in which a point may be predicted
-SAME = 4.0  # px: points and features that are nearer may be one
-SAME_POINT = 0.15  # m: points that are nearer may be one
-CHANCE = 0.02  # share of the map's different points that look more alike than a match may
-# matches, and their share of what could be seen: fewer may agree with the prediction by chance. Of an office that the map does not
-# know up to 2 % of the features agree
+MARGIN = 20.0  # px around the image in which a predicted point is still searched
+SAME = 4.0  # px: closer points and features may be the same
+SAME_POINT = 0.15  # m: closer points may be the same
+CHANCE = 0.02  # fraction of pairs of different map points that are more similar than a match may be
+# matches, and fraction of the visible points: fewer may be consistent with the prediction by chance. In an office unknown to the
+# map up to 2 % of the features are
 FEWEST, LEAST_SHARE = 3, 0.05
-SAMPLED = 300  # views, to tell that
-FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # matches that must agree on a place without a prediction, and their share
+SAMPLED = 300  # views, to estimate that similarity
+FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # matches that must agree in relocalization, and their fraction
 
 
 @dataclass(frozen=True)
 class Associations:
-    """Which points of the map (M,) are shown by which features of an image (M,); ``expected``: how many points were looked for;
-    ``rejected``: how many that looked right did not agree with the others."""
+    """Matched ``points`` of the map (M,) and features of an image (M,); ``expected``: number of points searched; ``rejected``:
+    number of similar features that were outliers."""
 
     points: Integers
     features: Integers
@@ -60,7 +60,7 @@ NONE = Associations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 class Associator:
-    """Features against a map; see the module."""
+    """Matches features to a map; see the module."""
 
     def __init__(self, points: PointMap, model: CameraModel) -> None:
         self.feature = points.feature
@@ -75,7 +75,7 @@ class Associator:
         self._descriptors: Descriptors = np.ascontiguousarray(points.descriptors[order])
         self._farthest_look = self._look_alike()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
-        # wide enough for a focal length that is not known well
+        # wide enough for an uncertain focal length
         self._slopes = 1.3 * np.abs(reprojection.undistorted(model, corners)).max(axis=0)
 
     def guided(
@@ -87,9 +87,10 @@ class Associator:
         model: CameraModel | None = None,
         focal: float = 0.0,
     ) -> Associations:
-        """What is seen from about ``position`` (3,), with ``rotation`` (3, 3) of the camera in the world; ``covariance`` (6, 6): of
-        the camera's perturbation in its own frame, turn first, then shift. ``model``: of the camera as it is believed by now,
-        ``focal``: standard deviation of the logarithm of its focal length."""
+        """Match with a predicted camera pose ``position`` (3,), ``rotation`` (3, 3) in the world.
+
+        ``covariance`` (6, 6): of a perturbation in the camera's frame, rotation first. ``model``: the current estimate of the
+        camera, ``focal``: standard deviation of the logarithm of its focal length."""
         model = self._model if model is None else model
         if len(frame.pixels) == 0 or frame.feature != self.feature:
             return NONE
@@ -127,8 +128,8 @@ class Associator:
         return Associations(ahead[rows[right]], seen[right], expected, int(np.count_nonzero(~right)))
 
     def relocalized(self, frame: CameraFrame) -> tuple[Array, Array, Array, Associations] | None:
-        """Position (3,), rotation (3, 3) and covariance (6, 6), as in :meth:`guided`, of the camera, with what it sees; None where
-        the map does not tell."""
+        """Relocalize: camera position (3,), rotation (3, 3), covariance (6, 6) as in :meth:`guided`, and the matches; None if the
+        map does not determine the pose."""
         if len(frame.pixels) == 0 or frame.feature != self.feature or len(self._owners) == 0:
             return None
         points, features = self._alike(frame)
@@ -143,7 +144,7 @@ class Associator:
         return found.camera.position, found.camera.rotation, found.camera.covariance, seen
 
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
-        """Points and features that look alike, and clearly more than any other point does."""
+        """Points and features that are similar, and pass the ratio test against all other points."""
         owners, first = np.unique(self._owners, return_index=True)
         distances = distance_matrix(frame.descriptors, self._descriptors, binary=self._binary)
         nearest = np.minimum.reduceat(distances, first, axis=1)
@@ -166,7 +167,7 @@ class Associator:
         return np.asarray(found)
 
     def _look_alike(self) -> float:
-        """The cost that few pairs of views of different points stay below: a match must."""
+        """Upper limit of the cost of a match: few pairs of views of different points are below it."""
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)
@@ -179,8 +180,7 @@ class Associator:
 
 
 def _gates(spreads: Array) -> tuple[Array, Array]:
-    """Of innovations with covariances (C, 2, 2) [px^2] the gates' matrices, inverted (C, 2, 2), and half their largest diameters
-    (C,): none is smaller or larger than is sensible."""
+    """Gates of innovations with covariances (C, 2, 2) [px^2]: inverse matrices (C, 2, 2) and largest radii (C,)."""
     gates = GATE * spreads
     mean = 0.5 * (gates[:, 0, 0] + gates[:, 1, 1])
     half = np.hypot(0.5 * (gates[:, 0, 0] - gates[:, 1, 1]), gates[:, 0, 1])

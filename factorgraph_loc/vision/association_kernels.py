@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`~factorgraph_loc.vision.association`: thousands of points of a map against hundreds of features."""
+"""Compiled loops of :mod:`~factorgraph_loc.vision.association`, for thousands of points and hundreds of features."""
 
 from typing import Any
 
@@ -18,8 +18,8 @@ BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 def agreeing_views(
     rows: Integers, place: Array, positions: Array, starts: Integers, seen_from: Array, cosine: float, ratio: float
 ) -> tuple[Integers, Integers]:
-    """Of the points ``rows`` (C,) the views from where they look as from ``place`` (3,): indices of these, and where those of each
-    point begin (C+1,). Views stand in the order of the points they show, from ``starts`` (P+1,) on."""
+    """Views of the points ``rows`` (C,) from viewpoints similar to ``place`` (3,): their indices, and the start of each point's
+    views in these (C+1,). Views are stored by point, beginning at ``starts`` (P+1,)."""
     total = 0
     for row in rows:
         total += starts[row + 1] - starts[row]
@@ -49,7 +49,7 @@ def agreeing_views(
 def in_view(
     positions: Array, place: Array, rotation: Array, nearest: float, farthest: float, slopes: Array
 ) -> Integers:
-    """Which points lie ahead of the camera, between two depths and below the ``slopes`` (2,) of its widest directions."""
+    """Which points lie in front of the camera, between two depths and within the ``slopes`` (2,) of its field of view."""
     out = np.empty(len(positions), np.int64)
     n = 0
     for i in range(len(positions)):
@@ -67,10 +67,10 @@ def in_view(
 
 @numba.njit(cache=True)
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
-    """Pairs (N, 2) of a point and a feature that lies in the gate of the point's prediction.
+    """Pairs (N, 2) of a point and a feature inside the gate of the point's prediction.
 
-    ``predicted`` (C, 2); ``inverses`` (C, 2, 2): of the gates' matrices, so that a point on the border has 1; ``reaches`` (C,):
-    half their largest diameters; ``features`` (K, 2). ``cell``: size of the cells that features are sorted into.
+    ``predicted`` (C, 2); ``inverses`` (C, 2, 2): inverse gate matrices (1 on the border); ``reaches`` (C,): largest radii;
+    ``features`` (K, 2). ``cell``: size of the cells for sorting features.
     """
     low_x, low_y = features[:, 0].min(), features[:, 1].min()
     columns = int((features[:, 0].max() - low_x) / cell) + 1
@@ -110,8 +110,8 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @numba.njit(cache=True, fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any) -> Array:
-    """Squared distance (N,) of each pair's feature, of descriptors ``seen`` (K, D), from the nearest of the point's views, of
-    descriptors ``known`` (V, D)."""
+    """Squared distance (N,) of each pair's feature (descriptors ``seen`` (K, D)) from the nearest of the point's views (``known``
+    (V, D))."""
     out = np.empty(len(pairs))
     size = known.shape[1]
     for i in range(len(pairs)):
@@ -129,7 +129,7 @@ def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, se
 
 @numba.njit(cache=True)
 def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any, bits: Integers) -> Array:
-    """The same, as the number of bits that differ."""
+    """As :func:`distances`, with the Hamming distance."""
     out = np.empty(len(pairs))
     for i in range(len(pairs)):
         best = 1 << 30
@@ -146,8 +146,8 @@ def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any
 def clear_pairs(
     pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
 ) -> Integers:
-    """Indices of the pairs whose point and feature are nearest to each other, and clearly nearer than to any other: a cost below
-    ``ratio`` times that of the best other that lies ``apart`` pixels away."""
+    """Indices of the pairs that are mutually nearest and pass the ratio test: a cost below ``ratio`` times that of the best other
+    match at least ``apart`` pixels away."""
     count, amount = len(predicted), len(features)
     of_point, of_feature = np.full(count, NOWHERE), np.full(amount, NOWHERE)
     for i in range(len(pairs)):

@@ -1,7 +1,7 @@
-"""The Gaussian colour model: intensity and two opponent colours, as linear combinations of red, green and blue.
+"""The Gaussian colour model: intensity and two opponent colours as linear combinations of red, green and blue.
 
-Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5: what a Gaussian
-receptive field measures of a spectrum and of its first two derivatives, for a camera's colours."""
+Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5: the response of a Gaussian
+receptive field to a spectrum and its first two derivatives, for RGB cameras."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ _FROM_BGR = GAUSSIAN_COLOUR[:, ::-1].astype(np.float32).copy()
 
 
 def colour_channels(image: Image) -> list[Float]:
-    """E, E_lambda, E_lambda_lambda (H, W) each of a BGR image; of a grey one, (H, W), only itself, as E."""
+    """E, E_lambda, E_lambda_lambda, each (H, W), of a BGR image; a grey image (H, W) gives E only."""
     if image.ndim == 2:
         return [image.astype(np.float32)]
     channels = cv2.split(cv2.transform(image.astype(np.float32), _FROM_BGR))

@@ -1,4 +1,4 @@
-"""The paper's colour features behind the interface that all features share."""
+"""The paper's colour features behind the common interface of features."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,18 +16,18 @@ from factorgraph_loc.vision.scale_space import ScaleSpace
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """How much each of the 35 values of a colour feature counts: a linear map, learnt where the same points are seen twice.
+    """A linear map that weights the 35 values of a colour feature, learnt from points seen in two images.
 
-    ``map`` (35, 35) takes the values, less their ``mean`` (35,), to a space where those of one point, seen in two images, differ
-    by as much in all directions: Euclidean distance there is Mahalanobis distance of the values (within-class whitening,
-    Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
+    ``map`` (35, 35) takes the values minus their ``mean`` (35,) to a space where the differences between two views of a point
+    have unit covariance: Euclidean distance there is the Mahalanobis distance of the values (within-class whitening, Fukunaga,
+    "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
     """
 
     mean: Float
     map: Float
 
     def __call__(self, values: Float) -> Float:
-        """Descriptors (N, 35), of length one, of ``values`` (N, 35)."""
+        """Unit descriptors (N, 35) of ``values`` (N, 35)."""
         mapped = (values - self.mean) @ self.map
         length = np.linalg.norm(mapped, axis=1, keepdims=True)
         return np.asarray(mapped / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)
@@ -35,7 +35,7 @@ class Weights:
 
 @cache
 def shipped_weights() -> Weights:
-    """The weights that come with the package, learnt by ``scripts/learn_feature_weights`` on the sequences bark and graf of
+    """The weights included in the package, learnt by ``scripts/learn_feature_weights`` on the sequences bark and graf of
     Mikolajczyk et al., IJCV 65, 2005."""
     with (
         resources.files("factorgraph_loc.vision").joinpath("weights.npz").open("rb") as file,
@@ -45,11 +45,11 @@ def shipped_weights() -> Weights:
 
 
 class ColourExtractor:
-    """Colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`), of any image at most ``count``; descriptors
-    are (N, 35) ``float32`` of length one.
+    """Extractor of colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`), at most ``count`` per image, with
+    ``float32`` unit descriptors (N, 35).
 
-    ``paper_literal``: for comparison, neighbours as the paper has them (:func:`~factorgraph_loc.vision.descriptor.records`).
-    The memory for an image is kept and used for the next one of its size: an extractor serves one thread.
+    ``paper_literal``: the neighbours of the paper (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison. The
+    memory of an image is reused for the next one of its size, so an extractor must be used by one thread only.
     """
 
     name = "colour"
@@ -64,7 +64,7 @@ class ColourExtractor:
         return self._found(image, mask)[1]
 
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
-        """Those of ``keypoints`` that are in the image, and their descriptors; a point without direction gets one."""
+        """The ``keypoints`` inside the image, and their descriptors; missing orientations are computed."""
         kept, found = self.record(image, keypoints)
         return kept, shipped_weights()(descriptor.values(found))
 
@@ -73,8 +73,7 @@ class ColourExtractor:
         return keypoints, shipped_weights()(descriptor.values(self._records(space, keypoints)))
 
     def record(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.void]]:
-        """What :meth:`compute` describes, with the raw values, :data:`~factorgraph_loc.vision.descriptor.RECORD`
-        (N,)."""
+        """As :meth:`compute`, with the raw values :data:`~factorgraph_loc.vision.descriptor.RECORD` (N,)."""
         pixels = as_image(image)
         if len(keypoints) == 0 or is_blank(pixels):
             return Keypoints.empty(), np.empty(0, dtype=descriptor.RECORD)

@@ -1,10 +1,9 @@
-"""Which of several points seen in one image belong together: they must agree on one pose of the camera near a predicted one.
+"""Outlier rejection among the points seen in an image: they must agree on one camera pose near the predicted one.
 
-If all together are as near to the prediction as noise lets them be (joint compatibility: Neira, Tardos, IEEE Transactions on
-Robotics and Automation 17(6), 2001), all are taken. Else three of them at a time correct the prediction, as a Kalman filter
-would, and the correction that most others agree with tells the right ones from the wrong ones (after Civera, Grasa, Davison,
-Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). A prediction of a planar robot has a
-covariance of rank 3, and so has what is corrected.
+If all together are compatible with the prediction (joint compatibility: Neira, Tardos, IEEE Transactions on Robotics and
+Automation 17(6), 2001), all are accepted. Otherwise samples of three points correct the prediction by a Kalman update, and the
+correction with most inliers is used (after Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field
+Robotics 27(5), 2010). The prediction of a planar robot has a covariance of rank 3, and so has the correction.
 """
 
 from dataclasses import dataclass
@@ -25,22 +24,22 @@ from factors.se2 import Array
 
 Truths = NDArray[np.bool_]
 
-FEWEST = 4  # points that must agree: any three do, on some pose
+FEWEST = 4  # points that must agree: three always determine a pose
 SAMPLE = 3
-HYPOTHESES, ROUND = 96, 16  # at most, and between looks whether that is enough
-MISSED = 1e-3  # probability that no sample of right points was drawn
-REACH = 10.0  # standard deviations of the prediction, within which a correction may lie
-FARTHEST = 3.0  # reaches, of a single step
-ROUNDING = 1e-12  # of a covariance's largest eigenvalue: smaller ones are none
-RIDGE = 1e-9  # of the information: keeps it invertible where the points are as good as at the camera
-LOOSE, GATE = 25.0, 13.8  # squared residuals of those that agree with three, and with all (99.9 %)
-JOINT = 0.99  # probability of all together to be compatible, if all are right
+HYPOTHESES, ROUND = 96, 16  # maximum number, and number between checks for termination
+MISSED = 1e-3  # probability that no outlier-free sample was drawn
+REACH = 10.0  # standard deviations of the prediction that bound a correction
+FARTHEST = 3.0  # bound of a single step, relative to REACH
+ROUNDING = 1e-12  # relative to the largest eigenvalue of a covariance: smaller ones count as zero
+RIDGE = 1e-9  # regularisation of the information, for points very close to the camera
+LOOSE, GATE = 25.0, 13.8  # squared residuals of inliers of a sample, and of the final pose (99.9 %)
+JOINT = 0.99  # probability of the joint compatibility test
 
 
 @dataclass(frozen=True)
 class CameraPose:
-    """``position`` (3,) and ``rotation`` (3, 3) of a camera in the world, and the ``covariance`` (6, 6) of its perturbation in its
-    own frame, turn first, then shift."""
+    """``position`` (3,) and ``rotation`` (3, 3) of a camera in the world, and ``covariance`` (6, 6) of a perturbation in its own
+    frame, rotation first."""
 
     position: Array
     rotation: Array
@@ -48,19 +47,19 @@ class CameraPose:
 
 
 def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> bool:
-    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], lie
-    together as near to what is predicted as they should."""
+    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``spreads`` (K, 2, 2) [px^2], are jointly
+    compatible with the prediction."""
     seen = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, spreads))
     try:
         joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *seen)
-    except np.linalg.LinAlgError:  # a covariance that is beyond numbers: each point is looked at by itself
+    except np.linalg.LinAlgError:  # an extreme covariance: each point is tested by itself
         return False
     return bool(joint < _largest(2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
-    """Which of ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise of covariances ``spreads`` (K, 2, 2) [px^2], agree on a pose
-    near the predicted ``camera``: all that are :func:`compatible`, none where fewer than :data:`FEWEST` agree."""
+    """The inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``spreads`` (K, 2, 2) [px^2], for a
+    pose near the predicted ``camera``: all if :func:`compatible`, none with fewer than :data:`FEWEST`."""
     count = len(points)
     if compatible(model, camera, points, pixels, spreads):
         return np.ones(count, dtype=bool)
@@ -84,7 +83,7 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """The pose that most points agree with, of those that samples of them lead to, and the squared residuals (K,) there."""
+    """The pose with most inliers among the corrections by random samples, and the squared residuals (K,) there."""
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
     tried = 0
@@ -101,7 +100,7 @@ def _best_of_samples(
             normal[:, range(6), range(6)] = 1.0 + (1.0 + RIDGE) * normal[:, range(6), range(6)]
             gradient = np.einsum("hij,hi->hj", flat, residual) + moved
             step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
-            # three wrong points may lead anywhere
+            # three outliers may give any correction
             step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
             moved = moved + step
             position, rotation = _moved(position, rotation, step @ root.T)
@@ -127,8 +126,8 @@ def _largest(dof: int) -> float:
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, spreads: Array
 ) -> float:
-    """The normalised square of what is seen of points (K, 3) at pixels (K, 2) with noise (K, 2, 2), by a camera whose
-    perturbation has a covariance (6, 6)."""
+    """Normalised squared innovation of points (K, 3) seen at pixels (K, 2) with noise (K, 2, 2), by a camera with perturbation
+    covariance (6, 6)."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros(6), 0.0
     for i in range(len(points)):
@@ -143,19 +142,19 @@ def _joint(
             xu, xv = (c * ju - b * jv) / determinant, (a * jv - b * ju) / determinant
             for m in range(6):
                 information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
-    # by the matrix inversion lemma, in a form that takes a singular covariance
+    # by the matrix inversion lemma, in a form that allows a singular covariance
     return float(total - pull @ (covariance @ np.linalg.solve(np.eye(6) + information @ covariance, pull)))
 
 
 def _root(camera: CameraPose) -> Array:
-    """A root (6, 6) of the covariance, which may be singular."""
+    """A square root (6, 6) of the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
-    # what is a matter of rounding must not decide in which directions a sample may move
+    # rounding errors must not decide in which directions a sample may move
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
 def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
-    """Cameras (H) moved by perturbations (H, 6)."""
+    """H camera poses after perturbations (H, 6)."""
     moved = position + (rotation @ step[:, 3:, None])[..., 0]
     return moved, rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
 
@@ -163,7 +162,7 @@ def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Whitened residuals (K, 2), predicted less measured, and their Jacobians (K, 2, 6) by the camera's perturbation."""
+    """Whitened residuals (K, 2), predicted minus measured, and Jacobians (K, 2, 6) with respect to the camera's perturbation."""
     predicted, jacobian, _ = reprojection.linearize_in_space(model, position, rotation, points)
     return np.einsum("kij,kj->ki", whiteners, predicted - pixels), whiteners @ jacobian
 
@@ -171,10 +170,10 @@ def _whitened(
 def _whitened_each(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """The same of H cameras with ``points`` (H, S, 3) each, stacked: (H, 2S) and (H, 2S, 6)."""
+    """The same for H cameras with ``points`` (H, S, 3) each, stacked: (H, 2S) and (H, 2S, 6)."""
     count = len(position)
     local = (points - position[:, None]) @ rotation
-    # a point in the frame of a camera is as one of the world seen by a camera that is not moved
+    # a point in the camera frame is like a world point seen by a camera at the origin
     predicted, jacobian, _ = reprojection.linearize_in_space(model, np.zeros(3), np.eye(3), local.reshape(-1, 3))
     jacobian = whiteners @ jacobian.reshape(count, -1, 2, 6)
     residual = np.einsum("hkij,hkj->hki", whiteners, predicted.reshape(pixels.shape) - pixels)
@@ -184,7 +183,7 @@ def _whitened_each(
 def _squared(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> Array:
-    """Squared whitened residuals (H, K) of all points seen by H cameras."""
+    """Squared whitened residuals (H, K) of all points for H cameras."""
     local = (points - position[:, None]) @ rotation
     predicted = reprojection.project(model, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
     error = np.einsum("kij,hkj->hki", whiteners, predicted - pixels)

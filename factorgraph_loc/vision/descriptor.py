@@ -1,10 +1,9 @@
-"""What the colour features look like: the paper's 2 space, 21 scale, 5 orientation and 9 texture values.
+"""Descriptors of the colour features: the paper's 2 space, 21 scale, 5 orientation and 9 texture values.
 
-All is measured on E in a point's own frame and in units of its own scale: on a lattice of 24 x 24 samples, by one
-product with a matrix of filters. The paper's neighbours are a cross of four places around the point; each of the four
-scales has a cross of its own size, as coarse structure is seen farther out. Algorithm 1 and figure 2 of Raoui,
-Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor's wavelets: Daugman, J.
-Opt. Soc. Am. A 2(7), 1985."""
+All are measured on E in a point's own frame and in units of its own scale, on a lattice of 24 x 24 samples, as one product with a
+matrix of filters. The paper's neighbours are a cross of four places around the point, whose size depends on the scale. Algorithm
+1 and figure 2 of Raoui, Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor wavelets:
+Daugman, J. Opt. Soc. Am. A 2(7), 1985."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +14,24 @@ from factorgraph_loc.vision.keypoints import Integers, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 from factors.se2 import Array
 
-# the first place is the point, the others are a cross; responses and texture are in grey levels
+# the first place is the point, the others form a cross; responses and texture are in grey levels
 RECORD = np.dtype(
     [
         ("position", np.float32, 2),  # x, y [px]
         ("scale_responses", np.float32, (5, 4)),  # Laplacian of Gaussian at each place and scale
         ("scale", np.float32),  # [px]
-        ("orientation", np.float32, 5),  # of the gradient at each place, from the point's direction [rad], in (-pi, pi]
+        (
+            "orientation",
+            np.float32,
+            5,
+        ),  # of the gradient at each place, relative to the point's direction [rad], in (-pi, pi]
         ("texture", np.float32, (3, 3)),  # magnitude of the Gabor wavelet of each wavelength and direction
     ]
 )
 VALUES = 35  # of the distance: all but the position
-OWN_SCALE = 20  # which of them is the point's own scale: it has no weight, as a zoom changes it
+OWN_SCALE = 20  # index of the point's own scale, which has no weight as a zoom changes it
 
-# in units of a point's scale; the patch cuts the coarsest of the filters short
+# in units of a point's scale; the patch truncates the coarsest filters
 SIDE = 24
 LOG_SCALES = (1.6, 2.4, 3.6, 5.4)
 LOG_ARMS = (2.0, 4.0, 6.0, 8.0)
@@ -37,14 +40,13 @@ GRADIENT_ARM = 6.0
 WAVELENGTHS = (3.5, 7.0, 14.0)
 ENVELOPE = 0.4  # standard deviation over wavelength
 
-_FLAT = 1e-6  # grey levels: norm of a patch's responses below which it has none
+_FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are set to 0
 
 
 def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
-    """The values of :data:`RECORD` (N,) of points with directions in the image that ``space`` is filled with.
+    """The values of :data:`RECORD` (N,) of points with directions in the image of ``space``.
 
-    ``paper_literal``: the neighbours are the four nearest of the other points, which are seldom the same in another
-    image."""
+    ``paper_literal``: use the four nearest other points as neighbours, which seldom are the same in another image."""
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
     result = np.empty(len(keypoints), dtype=RECORD)
@@ -64,9 +66,8 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 
 
 def values(record: NDArray[np.void]) -> Float:
-    """The 35 values (N, 35) of records (N,), each block without units: responses and textures divided by their norm,
-    which takes out contrast; scale in octaves; the sine of the orientations, which has no seam where an angle
-    wraps."""
+    """The 35 values (N, 35) of records (N,), each block dimensionless: responses and textures divided by their norm, for
+    invariance to contrast; scale in octaves; the sine of orientations, which is continuous where an angle wraps."""
     responses = record["scale_responses"].reshape(-1, 20)
     texture = record["texture"].reshape(-1, 9)
     return np.hstack(
@@ -75,8 +76,7 @@ def values(record: NDArray[np.void]) -> Float:
 
 
 def _nearest(points: Array) -> Integers:
-    """The four others (N, 4) that are nearest to each of ``points`` (N, 2), the nearest first; itself where there are
-    too few."""
+    """The four nearest others (N, 4) of each of ``points`` (N, 2), nearest first; the point itself if there are too few."""
     found = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
     return np.where(found < len(points), found, np.arange(len(points))[:, None]).astype(np.int64)
 
@@ -92,8 +92,7 @@ def cross(arm: float) -> Array:
 
 
 def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
-    """The blur (M,) that makes the plane of a point one of ``scale``, around ``centre`` (2,); places from there (M,
-    2); its variance."""
+    """The blur (M,) that takes a point's plane to ``scale``, around ``centre`` (2,); offsets from there (M, 2); its variance."""
     variance = scale**2 - 1.0
     away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance
@@ -102,7 +101,7 @@ def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
 def _laplacian(scale: float, centre: Array) -> Array:
     window, away, variance = _gaussian(scale, centre)
     response = scale**2 * ((away**2).sum(axis=1) / variance - 2.0) / variance * window
-    # on a lattice, and cut at its border, the sum is not zero: brightness would count
+    # truncated on a lattice the sum is not zero: subtract it, or brightness would count
     return np.asarray(response - window * (response.sum() / window.sum()))
 
 
@@ -113,7 +112,7 @@ def _gradient(scale: float, centre: Array) -> list[Array]:
 
 
 def _gabor(wavelength: float, angle: float) -> list[Array]:
-    """Real and imaginary part of a wavelet, the real one without mean."""
+    """Real and imaginary part of a wavelet, the real one without its mean."""
     x, y = LATTICE.T
     window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
     window /= window.sum()

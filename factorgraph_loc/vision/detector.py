@@ -1,12 +1,11 @@
-"""Where the colour features are: corners of colour at their characteristic scales, with a direction.
+"""Detector of colour features: corners of colour at their characteristic scales, with a direction.
 
-Colour Harris: the second moment matrix of Harris and Stephens ("A combined corner and edge detector", 1988) summed
-over the channels of the Gaussian colour model, with a derivative and an integration scale (Mikolajczyk, Schmid,
-"Scale & affine invariant interest point detectors", IJCV 60, 2004, eq. 1); a corner stays at the scale where the
-normalised Laplacian of Gaussian is largest (ibid., section 2.1). Direction: the peak of a histogram of gradients
-(Lowe, "Distinctive image features", IJCV 60, 2004, section 5). Spread: a weaker corner near a stronger one of its
-scale waits (Brown, Szeliski, Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section
-2.1)."""
+Colour Harris: the second moment matrix of Harris and Stephens ("A combined corner and edge detector", 1988) summed over the
+channels of the Gaussian colour model, with a derivative and an integration scale (Mikolajczyk, Schmid, "Scale & affine invariant
+interest point detectors", IJCV 60, 2004, eq. 1); the scale of a corner maximises the normalised Laplacian of Gaussian (ibid.,
+section 2.1). Direction: the peak of a histogram of gradients (Lowe, "Distinctive image features", IJCV 60, 2004, section 5).
+Weaker corners near a stronger one of their scale are suppressed (Brown, Szeliski, Winder, "Multi-image matching using multi-scale
+oriented patches", CVPR 2005, section 2.1)."""
 
 import cv2
 import numpy as np
@@ -25,13 +24,13 @@ from factorgraph_loc.vision.keypoints import Keypoints
 from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
 from factors.se2 import Array
 
-INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken at the scale below
-WEAKEST = 1.0  # squared grey levels: a weaker corner is noise of the camera
-# The response that points are ranked by is a product of powers. Where the Laplacian is strong the scale is well defined, and
-# what is coarse is still there when the camera moves away.
+INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken one scale below
+WEAKEST = 1.0  # squared grey levels: weaker corners are camera noise
+# The response for ranking is a product of powers. A strong Laplacian gives a well-defined scale, and coarse corners remain
+# visible when the camera moves away.
 BY_STRENGTH, BY_LAPLACIAN, BY_SCALE = 0.7, 0.6, 0.3
-BORDER = 4  # pixels of an octave: nearer to the border half of a corner is made up
-CLEARANCE = 1.2  # in units of a point's scale: nearer to a stronger one it waits
+BORDER = 4  # pixels of an octave near the image border without corners
+CLEARANCE = 1.2  # in units of a point's scale: within it, weaker points are suppressed
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
@@ -47,8 +46,8 @@ _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTAT
 
 
 def detect(space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int) -> Keypoints:
-    """At most ``count`` points, by falling strength, of the image that ``space`` is filled with, where ``mask`` (H,
-    W) is not 0; ``colours``: its channels (H, W) beside E."""
+    """At most ``count`` points, by descending strength, of the image in ``space``, where ``mask`` (H, W) is not 0; ``colours``:
+    its channels (H, W) besides E."""
     corners = np.vstack(_corners(space, colours))
     if mask is not None:
         x, y = np.rint(corners[:, :2]).astype(np.int64).T
@@ -81,7 +80,7 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
-    """Of each characteristic scale its corners (N, 4): x and y [px], scale [px], response."""
+    """Corners (N, 4) of each characteristic scale: x and y [px], scale [px], response."""
     found = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
@@ -98,7 +97,7 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
 
 
 def fill_strength(octave: Octave, i: int) -> None:
-    """Harris' measure at scale ``i`` of an octave whose colours are at scale ``i - 1``."""
+    """Compute the Harris measure at scale ``i`` of an octave whose colours are at scale ``i - 1``."""
     structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
     for product in octave.products:
         blur(product, product, INTEGRATION * SIGMAS[i])
@@ -106,7 +105,6 @@ def fill_strength(octave: Octave, i: int) -> None:
 
 
 def _peaks(octave: Octave, i: int) -> Array:
-    """The corners (N, 4) of scale ``i`` of an octave, as of :func:`_corners`."""
     inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
     cv2.dilate(octave.strength, _NEIGHBOURS, dst=octave.largest)
     found = cv2.findNonZero(cv2.compare(octave.strength[inner], octave.largest[inner], cv2.CMP_EQ))

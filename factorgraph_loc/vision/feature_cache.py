@@ -1,6 +1,6 @@
-"""What was found in images, kept in the user's cache folder, so that it is computed once.
+"""Disk cache of image features in the user's cache folder.
 
-A cache may vanish, be full or be damaged at any time: then things are computed again, and nothing else happens.
+A cache that is missing, full or damaged only causes features to be computed again.
 """
 
 import os
@@ -14,20 +14,20 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DATA, read_bytes
 from factorgraph_loc.files.models import replacing
 
-VARIABLE = "FGLOC_CACHE"  # of the environment: another folder than the user's
+VARIABLE = "FGLOC_CACHE"  # environment variable: a folder other than the user's
 LIMIT = 4 * 10**9  # bytes
 _HEAD = struct.Struct("<4sII")  # mark, CRC-32 and length of the content
 _MARK = b"FGLC"
 
 
 def cache_folder() -> Path:
-    """The folder that ``FGLOC_CACHE`` names, else that for caches of the user's system."""
+    """The folder that ``FGLOC_CACHE`` names, else the user's cache folder of the system."""
     told = os.environ.get(VARIABLE)
     return Path(told) if told else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
 
 
 class FeatureCache:
-    """Contents by their keys, a file each, below ``folder``; together at most ``limit`` bytes once :meth:`trim` is called.
+    """Contents by key, one file each, below ``folder``; :meth:`trim` limits their size to ``limit`` bytes.
 
     ``fault``: why nothing can be written, if so."""
 
@@ -37,7 +37,7 @@ class FeatureCache:
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
-        """What was written, and a mark that it was used now; None if it is not there or not as it was written."""
+        """The content of a key, marked as used now; None if it is missing or damaged."""
         path = self._path(key)
         try:
             stored = read_bytes(path, DATA)
@@ -53,7 +53,7 @@ class FeatureCache:
         return content
 
     def write(self, key: str, content: bytes) -> None:
-        """Keep ``content``, at once or not at all; where nothing can be written, nothing is."""
+        """Store ``content`` atomically; nothing happens if that is impossible."""
         if self.fault:
             return
         path = self._path(key)
@@ -65,12 +65,12 @@ class FeatureCache:
             self.fault = f"{self._folder}: cannot be written: {error.strerror}"
 
     def trim(self) -> None:
-        """Remove what was not used for longest, until the rest is within the limit."""
-        files = []  # but for those that are being written
+        """Remove the least recently used contents until the rest is within the limit."""
+        files = []  # except those being written
         for path in self._folder.glob("*/[!.]*"):
             try:
                 status = path.stat()
-            except OSError:  # another process removed it
+            except OSError:  # removed by another process
                 continue
             files.append((status.st_mtime_ns, status.st_size, path))
         excess = sum(size for _, size, _ in files) - self._limit
@@ -84,5 +84,5 @@ class FeatureCache:
             excess -= size
 
     def _path(self, key: str) -> Path:
-        # folders of 256 parts: some file systems are slow with many files in one
+        # two levels of folders: some file systems are slow with many files in one
         return self._folder / key[:2] / key

@@ -1,7 +1,6 @@
-"""Features by name: the paper's colour features and OpenCV's SIFT and ORB behind one interface.
+"""Features by name: the paper's colour features, and OpenCV's SIFT and ORB, behind one interface.
 
-``extractor("colour")``, ``extractor("sift")`` and ``extractor("orb")`` take and give the same, so that what uses
-features need not know which; a caller asks ``binary`` to choose between Hamming and Euclidean distance."""
+A caller uses ``binary`` to choose between Hamming and Euclidean distance."""
 
 from collections.abc import Callable
 
@@ -21,7 +20,7 @@ SIFT_CONTRAST = 0.01  # OpenCV's default of 0.04 finds too few points in indoor 
 
 
 class OpenCvExtractor:
-    """A feature of OpenCV behind :class:`Extractor`."""
+    """An OpenCV feature behind :class:`Extractor`."""
 
     def __init__(self, name: str, feature: cv2.Feature2D, count: int) -> None:
         self.name = name
@@ -67,7 +66,7 @@ class OpenCvExtractor:
 
 
 def _strongest_first(keypoints: Keypoints, count: int) -> Integers:
-    """Indices of at most ``count`` points by falling response: OpenCV keeps more where responses are equal."""
+    """Indices of at most ``count`` points by descending response: OpenCV keeps more at equal responses."""
     return np.argsort(-keypoints.responses, kind="stable")[:count].astype(np.int64)
 
 
@@ -83,8 +82,8 @@ EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"colour": ColourExtractor, 
 
 
 def extractor(name: str, count: int = 1000) -> Extractor:
-    """The feature of that name in :data:`EXTRACTORS`, at most ``count`` of them in an image; InputError if there is
-    none."""
+    """The extractor ``name`` of :data:`EXTRACTORS`, with at most ``count`` features per image. Raises InputError for an unknown
+    name."""
     if name not in EXTRACTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")
     if count < 1:

@@ -1,11 +1,10 @@
-"""Fiducial markers in images, found by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
+"""Fiducial markers in images, detected by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
 fiducial markers under occlusion", Pattern Recognition 2014; for AprilTags their dictionaries, Olson, ICRA 2011).
 
-Each corner of a marker is a point with a name, so that nothing but the reprojection of points is needed to use it. It is where
-lines through the edges meet. Looked for at the corner itself (OpenCV's ``cornerSubPix``), blur draws a corner into the square, and
-the marker seems smaller and farther than it is. Across an edge, blur moves as much of the white inwards as of the black outwards,
-so that an edge is where the white ends if what is grey is counted by its share (Tabatabai, Mitchell, "Edge location to subpixel
-values in digital imagery", PAMI 1984, for moments).
+Each corner of a marker is a named point at the intersection of lines fitted to the edges. Refinement at the corner itself
+(OpenCV's ``cornerSubPix``) is biased: blur moves a corner into the square, so that the marker appears smaller and farther away.
+Across an edge, blur is symmetric, so that the edge position follows from the mean grey level (Tabatabai, Mitchell, "Edge location
+to subpixel values in digital imagery", PAMI 1984, for moments).
 """
 
 from collections import Counter
@@ -17,28 +16,28 @@ from factorgraph_loc.maps.markers import MarkerFamily
 from factorgraph_loc.vision.images import Image
 from factors.se2 import Array
 
-REACH = 3.0  # px to both sides of an edge
-MIN_REACH = 1.5  # px: with less, the greys of an edge are not all seen
+REACH = 3.0  # px on both sides of an edge
+MIN_REACH = 1.5  # px: a shorter range does not cover a blurred edge
 STEP = 0.25  # px between samples across an edge
-INSIDE = (0.12, 0.88)  # of an edge: its ends belong to two
-FARTHEST = 3.0  # px that a corner may move in one pass
-PASSES = 3  # the later ones look along better lines
+INSIDE = (0.12, 0.88)  # used part of an edge, without its ends
+FARTHEST = 3.0  # px that a corner may move per pass
+PASSES = 3  # each uses the lines of the previous one
 MIN_CONTRAST = 20.0  # grey levels
 
 
 def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
-    """The corners (4, 2) [px] of a marker that has ``bits`` along a side, its black border included; as they are given where
-    edges are blurred, covered or short."""
+    """The refined corners (4, 2) [px] of a marker with ``bits`` along a side, including its black border; unchanged where edges
+    are blurred, covered or short."""
     for _ in range(PASSES):
         corners = _met(grey, corners, bits)
     return corners
 
 
 def _met(grey: Image, corners: Array, bits: int) -> Array:
-    """Where the lines meet that are found near the sides of the square of ``corners``."""
+    """Intersections of the lines fitted near the sides of the square ``corners``."""
     middle = corners.mean(axis=0)
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not through the black border
+    reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not across the black border
     if reach < MIN_REACH:
         return corners
     lines = [_line(grey, corners[i], corners[(i + 1) % 4], middle, reach) for i in range(4)]
@@ -58,7 +57,7 @@ def _met(grey: Image, corners: Array, bits: int) -> Array:
 
 
 def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) -> tuple[Array, float] | None:
-    """The line n.p = c along an edge, by its normal (2,) and c [px]; None if the edge cannot be seen."""
+    """The line n.p = c along an edge, with normal n (2,) and c [px]; None if the edge is not visible."""
     along = end - start
     length = float(np.linalg.norm(along))
     normal = np.array((-along[1], along[0])) / length
@@ -67,7 +66,7 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
     across = np.arange(-reach, reach + STEP / 2, STEP)
     places = start + shares[:, None] * along
     samples = (places[:, None] + across[:, None] * normal).astype(np.float32)
-    # what lies beyond the image is no edge: its border goes on
+    # beyond the image border there is no edge
     values = cv2.remap(
         grey, samples[:, :, 0], samples[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).astype(float)
@@ -81,7 +80,7 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
     weights[[0, -1]] = STEP / 2.0
     shift = across[0] + share @ weights
     points = places[use] + shift[:, None] * normal
-    for _ in range(2):  # without what does not lie on the line, a shadow or something before the marker
+    for _ in range(2):  # the second time without outliers, such as a shadow or an occlusion
         centre = points.mean(axis=0)
         direction = np.linalg.svd(points - centre, full_matrices=False)[2][0]
         found = np.array((-direction[1], direction[0]))
@@ -95,7 +94,7 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
     """The numbers of the markers in an image, and their corners (4, 2) [px]: upper left, upper right, lower right, lower left of
-    the marker as it is printed. Of a number that is there twice neither is given."""
+    the printed marker. A number that occurs twice is omitted."""
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     detector = _detector(family)
     corners, numbers, _ = detector.detectMarkers(grey)

@@ -1,4 +1,4 @@
-"""The features of one image as few bytes, to be sent between processes and kept in a file."""
+"""Compact encoding of the features of one image, for transfer between processes and storage."""
 
 import struct
 from dataclasses import dataclass
@@ -25,17 +25,17 @@ class Found:
 
 
 def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
-    """Places and sizes with 24 bits, which is a thousandth of a pixel or better; descriptors without loss."""
+    """Encode pixels and sizes with 24 bits (0.001 px or better), descriptors without loss."""
     points = np.column_stack((keypoints.points, keypoints.sizes)).astype("<f4")
     binary = descriptors.dtype == np.uint8
     narrow = descriptors.astype(np.uint8)
-    fits = binary or bool(np.array_equal(narrow, descriptors))  # those of SIFT are whole numbers below 256
+    fits = binary or bool(np.array_equal(narrow, descriptors))  # those of SIFT are integers below 256
     kept: NDArray[Any] = narrow if fits else descriptors.astype("<f4")
     return _HEAD.pack(*descriptors.shape, binary, fits) + points.tobytes() + kept.tobytes()
 
 
 def decode(content: bytes) -> Found:
-    """What :func:`encode` was given; ValueError for other bytes."""
+    """Decode the result of :func:`encode`; ValueError for other bytes."""
     if len(content) < _HEAD.size:
         raise ValueError("these bytes are no features")
     count, columns, binary, fits = _HEAD.unpack_from(content)

@@ -11,10 +11,10 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """The features of one image, none where it could not be read.
+    """The features of one image, empty if it could not be read.
 
-    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left one; ``sizes`` (K,) [px] and ``descriptors``
-    (K, D), of the kind ``feature``. ``tracks`` (K,): numbers that stay with what is followed from image to image.
+    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left pixel; ``sizes`` (K,) [px] and ``descriptors``
+    (K, D) of the kind ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to.
     """
 
     sensor: ClassVar[str] = "camera"
@@ -31,10 +31,10 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """The features that were found."""
+        """The features, with empty arrays where there are none."""
         return self
 
     @property
     def count(self) -> int:
-        """How many points were seen."""
+        """Number of features."""
         return len(self.pixels)

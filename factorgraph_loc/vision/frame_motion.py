@@ -1,16 +1,16 @@
-"""A planar robot's motion between two images, from what was followed from one to the other.
+"""Motion of a planar robot between two images, from tracked features.
 
-Least squares of Sampson's error over the turn and the direction of the way (:mod:`factors.camera.visual_odometry`), with Huber's
-loss, from a robust start: of the motions that two matches each allow, the one that most of the matches agree with (Fischler and
-Bolles, CACM 24(6), 1981; two matches are enough in a plane: Ortin and Montiel, Robotica 19, 2001). How far the robot went is not
-seen: that stays as it was predicted, and the information along it is zero.
+Least squares of Sampson's error over the rotation and the direction of translation (:mod:`factors.camera.visual_odometry`), with
+Huber loss. Initial value: of the motions defined by pairs of matches, the one with most inliers (Fischler and Bolles, CACM 24(6),
+1981; two matches suffice in a plane: Ortin and Montiel, Robotica 19, 2001). The distance is unobservable: it stays as predicted,
+with zero information along it.
 
-Where a turn alone explains most matches, as for a robot at rest, the direction of the way is noise, or that of a thing that moves.
-Then only the turn is told: by least squares of the pixels themselves, with what the points may be displaced by the little way that
-the odometry allows as further unknowns.
+Where a rotation alone explains most matches, as for a robot at rest, the direction of translation is noise or that of a moving
+object. Then only the rotation is estimated, by least squares of the pixels, with the small displacement allowed by odometry as
+further unknowns.
 
-The information is that of Gaussian noise, to first order. Where the way is short against the noise of the pixels its direction is
-biased besides, as it is where all points lie in one plane: such motions are not told.
+The information is for Gaussian noise, to first order. For a translation that is short relative to the pixel noise, or if all
+points lie in one plane, its direction is biased; such motions are rejected.
 """
 
 from dataclasses import dataclass
@@ -25,25 +25,25 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 MIN_MATCHES = 8
-MIN_SHARE = 0.3  # of the matches that agree, else none is trusted
+MIN_SHARE = 0.3  # least fraction of inliers
 HYPOTHESES = 50
 NEWTON_STEPS, ITERATIONS, HALVINGS = 4, 15, 6
-AGREES, CLEAR = 3.0, 20.0  # standard deviations: from its epipolar line, and from the epipole
-TURN_AGREES = 3.4  # standard deviations of two numbers: 99.7 %
-TURN_EXPLAINS = 0.5  # share of the matches, where the robot may be at rest
-DEPTHS = 0.3  # 1/m: how much the inverse depth differs between one side of the image and the other
-BLURRED = 0.05  # rad: the standard deviation of a direction that is not worth telling
-NEAR, NEAREST = 1.0, 0.5  # m: nearer than that few points are, and none
-SHORTEST = 1e-4  # m, of a way that has a direction
-SMALLEST = 1e-7  # of a step, m and rad
+AGREES, CLEAR = 3.0, 20.0  # standard deviations: inliers to their epipolar line, and least distance from the epipole
+TURN_AGREES = 3.4  # standard deviations of two values: 99.7 %
+TURN_EXPLAINS = 0.5  # fraction of matches explained by a rotation if the robot may be at rest
+DEPTHS = 0.3  # 1/m: variation of the inverse depth across the image
+BLURRED = 0.05  # rad: largest standard deviation of a useful direction
+NEAR, NEAREST = 1.0, 0.5  # m: few points are nearer, and none
+SHORTEST = 1e-4  # m, least translation with a direction
+SMALLEST = 1e-7  # m and rad: converged step
 
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """A robot's motion between two images.
+    """The motion of a robot between two images.
 
-    ``delta`` (3,): pose at the second image in the frame of the first, as long as it was predicted. ``information`` (3, 3): of its
-    body-frame perturbation, of rank 2, or 1 where only the turn is told. ``agrees`` (K,): which matches it explains.
+    ``delta`` (3,): pose at the second image in the frame of the first, with the predicted distance. ``information`` (3, 3): of
+    its body-frame perturbation, of rank 2, or 1 for a rotation only. ``agrees`` (K,): the inliers.
     """
 
     delta: Array
@@ -54,8 +54,9 @@ class FrameMotion:
 def frame_motion(
     model: CameraModel, first: Array, second: Array, predicted: Increment, rng: np.random.Generator
 ) -> FrameMotion | None:
-    """The motion between two images, in which the same K things are seen at the pixels ``first`` and ``second`` (K, 2), and that is
-    ``predicted`` by odometry. None with too few matches, or where too few agree."""
+    """The motion between two images with K features at the pixels ``first`` and ``second`` (K, 2), ``predicted`` by odometry.
+
+    None with too few matches or too few inliers."""
     if len(first) < MIN_MATCHES:
         return None
     pairs = RayPairs.of(model, first, second)
@@ -71,7 +72,7 @@ def frame_motion(
 
 
 def _start(pairs: RayPairs, predicted: Array, rng: np.random.Generator) -> Array:
-    """The motion that the most matches agree with, of those that two of them allow and the predicted one."""
+    """The motion with most inliers, of those defined by pairs of matches and the predicted one."""
     best, least = predicted, _misfit(pairs, predicted)
     for _ in range(HYPOTHESES):
         two = pairs.chosen(rng.choice(len(pairs), 2, replace=False))
@@ -92,14 +93,14 @@ def _misfit(pairs: RayPairs, motion: Array) -> float:
 
 
 def _agrees(pairs: RayPairs, motion: Array, residual: Array) -> NDArray[np.bool_]:
-    """Which matches are seen along their epipolar line, at a place where points may be: one that only happens to lie on its line
-    would have to be behind the camera or very near, and would pull the more, the nearer it is."""
+    """Inliers: near their epipolar line and at a plausible depth. A feature that lies on its line by chance would be behind the
+    camera or very near, with a large weight."""
     rho, sigma = nearness(pairs, motion)
     return np.asarray((np.abs(residual) < AGREES) & (rho > -AGREES * sigma) & (rho < 1.0 / NEAREST + AGREES * sigma))
 
 
 def _refined(pairs: RayPairs, motion: Array, robust: float) -> FrameMotion:
-    """Least squares with Huber's loss over the matches that agree, chosen anew at each step, which is halved where it leads up."""
+    """Least squares with Huber loss over the inliers, selected again at each step, with step halving."""
     start, misfit = motion, _misfit(pairs, motion)
     for _ in range(ITERATIONS):
         residual, jacobian, signal = sampson(pairs, motion)
@@ -119,7 +120,7 @@ def _refined(pairs: RayPairs, motion: Array, robust: float) -> FrameMotion:
             break
     residual, _, signal = sampson(pairs, motion)
     weight = _weight(pairs, motion, residual, robust)
-    # to first order the rays meet wherever along its way the camera is: of the rest there is none
+    # to first order the rays intersect for any translation along its direction: there is no information about the distance
     signal -= np.outer(signal @ (along := _along(motion, pairs.position)), along)
     return FrameMotion(motion, (weight[:, None] * signal).T @ signal, _agrees(pairs, motion, residual))
 
@@ -130,14 +131,14 @@ def _weight(pairs: RayPairs, motion: Array, residual: Array, robust: float) -> A
 
 
 def _along(motion: Array, position: Array) -> Array:
-    """The direction (3,) of the camera's way as a perturbation of the robot's motion."""
+    """The direction (3,) of the camera's translation as a perturbation of the robot's motion."""
     way = translation(position, motion)
     x, y = se2.transform_to(np.array((0.0, 0.0, motion[2])), way) / max(float(np.linalg.norm(way)), 1e-12)
     return np.array((x, y, 0.0))
 
 
 def _stepped(motion: Array, step: Array, like: Array, position: Array) -> Array:
-    """``motion`` after a step (3,), the camera's way as long as that of the motion ``like``."""
+    """``motion`` after a step (3,), with the camera's translation as long as that of the motion ``like``."""
     moved = se2.compose(motion, se2.exp(np.clip(step, -0.5, 0.5)))
     way, length = translation(position, moved), float(np.linalg.norm(translation(position, like)))
     there = float(np.linalg.norm(way))
@@ -147,7 +148,7 @@ def _stepped(motion: Array, step: Array, like: Array, position: Array) -> Array:
 
 
 def _blur(moved: FrameMotion, position: Array) -> float:
-    """Standard deviation of the direction of the camera's way [rad]."""
+    """Standard deviation of the direction of the camera's translation [rad]."""
     x, y, _ = _along(moved.delta, position)
     basis = np.array(((-y, 0.0), (x, 0.0), (0.0, 1.0)))
     a, b, c = (basis.T @ moved.information @ basis)[[0, 0, 1], [0, 1, 1]]
@@ -156,9 +157,9 @@ def _blur(moved: FrameMotion, position: Array) -> float:
 
 
 def _turn(pairs: RayPairs, predicted: Increment, robust: float) -> FrameMotion:
-    """The turn alone, and which matches a turn and the little way explain."""
+    """The rotation alone, and the inliers of a rotation with a small translation."""
     delta = predicted.delta.copy()
-    # of the way over the depth of what is seen, in x and in y
+    # translation over depth, in x and in y
     allowed = (
         np.linalg.norm(translation(pairs.position, delta)) + np.sqrt(np.trace(predicted.covariance[:2, :2]))
     ) / NEAR
@@ -178,7 +179,7 @@ def _turn(pairs: RayPairs, predicted: Increment, robust: float) -> FrameMotion:
     residual, jacobian = _displaced(pairs, delta[2], shift)
     weight = _turn_weight(residual, robust) * agrees
     normal = np.einsum("k,kri,krj->ij", weight, jacobian, jacobian) + np.diag(prior**2)
-    # what the different depths do besides shows in the residual
+    # the effect of varying depth is part of the residual
     excess = max(1.0, float(np.sum(weight[:, None] * residual**2)) / max(2.0 * weight.sum() - 1.0, 1.0))
     told = normal[0, 0] - normal[0, 1:] @ np.linalg.solve(normal[1:, 1:], normal[1:, 0])
     variance = excess / max(told, 1e-9) + (DEPTHS * NEAR * allowed) ** 2
@@ -186,7 +187,7 @@ def _turn(pairs: RayPairs, predicted: Increment, robust: float) -> FrameMotion:
 
 
 def _likely_turn(pairs: RayPairs, guess: float) -> float:
-    """Of the turns that each match suggests by itself the one that the most agree with."""
+    """Of the rotations suggested by single matches the one with most inliers."""
     residual, jacobian = _displaced(pairs, guess, np.zeros(2))
     own = jacobian[:, :, 0]
     suggested = guess - np.einsum("kr,kr->k", own, residual) / np.maximum(np.einsum("kr,kr->k", own, own), 1e-9)
@@ -196,15 +197,15 @@ def _likely_turn(pairs: RayPairs, guess: float) -> float:
 
 
 def _displaced(pairs: RayPairs, turn: float, shift: Array) -> tuple[Array, Array]:
-    """Whitened distance (K, 2) between where things are seen at first and where a turn, and the camera's way over the depth
-    ``shift`` (2,), put them after what is seen later; its Jacobian (K, 2, 3) by the turn and the shift."""
+    """Whitened residuals (K, 2) and their Jacobian (K, 2, 3) with respect to the rotation and ``shift`` (2,), the camera's
+    translation over depth."""
     c, s = np.cos(turn), np.sin(turn)
     b = pairs.second
     ahead = np.column_stack((c * b[:, 0] - s * b[:, 1] + shift[0], s * b[:, 0] + c * b[:, 1] + shift[1], b[:, 2]))
     turned = ahead[:, :2] - shift
     by = np.zeros((len(b), 3, 3))
     by[:, 0, 0], by[:, 1, 0], by[:, 0, 1], by[:, 1, 2] = -turned[:, 1], turned[:, 0], 1.0, 1.0
-    # the noise of both pixels, as if it were all in the first: the camera's two axes in the image, and its own one
+    # the noise of both pixels in the first image: along the camera's two axes, and along its own
     inverse = np.linalg.inv(
         np.concatenate((pairs.first_noise, np.broadcast_to(pairs.axis[:, None], (len(b), 3, 1))), axis=2)
     )

@@ -1,4 +1,4 @@
-"""Images as :mod:`factorgraph_loc.vision` takes them: checked once, then ``uint8``, grey or BGR as OpenCV has them."""
+"""Input images of :mod:`factorgraph_loc.vision`: checked once, then ``uint8``, grey or BGR as in OpenCV."""
 
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,14 @@ from factorgraph_loc.files.quiet import quiet
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]
 
-MIN_SIDE = 16  # px: below it no patch around a point fits, and an image has no features
+MIN_SIDE = 16  # px: smaller images have no features
 
 
 def as_image(array: object, source: object = "image") -> Image:
-    """``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA as ``uint8``, (H, W) or (H, W, 3), rows contiguous.
+    """Convert ``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA to ``uint8``, (H, W) or (H, W, 3), C-contiguous.
 
-    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. ``source``
-    is named in the InputError if it is no image: empty, of another shape or type, with values that are not finite or
-    out of range."""
+    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. Raises InputError,
+    naming ``source``, for an empty array, another shape or type, and values that are not finite or out of range."""
     if not isinstance(array, np.ndarray):
         raise InputError(f"{source}: is {type(array).__name__}, expected an array of pixels")
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (1, 3, 4)):
@@ -35,7 +34,7 @@ def as_image(array: object, source: object = "image") -> Image:
     if array.dtype == np.uint8:
         return np.ascontiguousarray(array)
     if array.dtype == np.uint16:
-        scaled = array.astype(np.uint32)  # in place, for a large image takes gigabytes otherwise
+        scaled = array.astype(np.uint32)  # in place, to save memory for large images
         scaled += 128
         scaled //= 257
         return np.ascontiguousarray(scaled, dtype=np.uint8)
@@ -50,8 +49,8 @@ def as_image(array: object, source: object = "image") -> Image:
 
 
 def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
-    """``mask`` (H, W) of truth values or ``uint8`` as ``uint8``, not 0 where features are wanted; None is everywhere.
-    InputError if it is of another type, or of another size than ``image``."""
+    """Convert ``mask`` (H, W) of bool or ``uint8`` to ``uint8``, not 0 where features are wanted; None means everywhere. Raises
+    InputError for another type or a size different from ``image``."""
     if mask is None:
         return None
     if not isinstance(mask, np.ndarray) or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
@@ -63,19 +62,19 @@ def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
 
 
 def is_blank(image: Image) -> bool:
-    """Whether an image can have no feature: a side is below :data:`MIN_SIDE`, or all its pixels are equal."""
-    # row by row: the first one mostly decides
+    """Whether an image cannot have features: a side is below :data:`MIN_SIDE`, or all its pixels are equal."""
+    # row by row, as the first one usually decides
     return min(image.shape[:2]) < MIN_SIDE or all(bool((row == image[0, 0]).all()) for row in image)
 
 
 def read_image(path: Path) -> Image:
-    """The image in a file, (H, W) or (H, W, 3) BGR; InputError if it is missing, does not decode or has too many pixels."""
+    """Read an image, (H, W) or (H, W, 3) BGR. Raises InputError if it is missing, cannot be decoded or has too many pixels."""
     return as_image(decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED), path)
 
 
 def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
-    """The pixels of an image's file as OpenCV gives them with ``flags``; InputError if it is none, or one of more than
-    :data:`~factorgraph_loc.files.bounded.PIXELS` pixels, before memory is taken for them. OpenCV itself would take 2^30."""
+    """Decode an image file with OpenCV's ``flags``. Raises InputError if that fails, or for more than
+    :data:`~factorgraph_loc.files.bounded.PIXELS` pixels, before memory is allocated. OpenCV itself would allow 2^30."""
     image_size(content, source)
     with foreign(source, NO_IMAGE), quiet():
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)

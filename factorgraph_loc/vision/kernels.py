@@ -1,7 +1,6 @@
-"""Compiled loops of the colour features: where numpy would write many images to memory, one pass reads and writes
-each once.
+"""Compiled loops of the colour features, which avoid numpy's temporary images.
 
-Everything is ``float32``, as half the memory is half the time.
+Everything is ``float32``, to halve memory traffic.
 """
 
 import math
@@ -18,14 +17,14 @@ Int64 = NDArray[np.int64]
 
 HALF = np.float32(0.5)
 TINY = np.float32(1e-6)  # keeps a quotient finite where an image is flat
-MAX_SHIFT = 0.7  # px: a peak that is farther from the pixel that is largest is not a paraboloid's
+MAX_SHIFT = 0.7  # px: larger shifts from the largest pixel do not fit the paraboloid model
 FAST = {"contract", "reassoc"}
 
 
 @numba.njit(cache=True, fastmath=FAST)
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
-    """Sums over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to
-    ``products`` (3, H, W): xx, xy, yy.
+    """Sum over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to ``products``
+    (3, H, W): xx, xy, yy.
 
     Derivatives are central differences, halved in the first and last row, 0 in the first and last column.
     """
@@ -64,7 +63,7 @@ def corner_strength(products: Float, scale: np.float32, strength: Float) -> None
 
 @numba.njit(cache=True)
 def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
-    """The largest magnitude of the Laplacian, times ``weight``, at a pixel and its eight neighbours."""
+    """The largest absolute Laplacian, times ``weight``, at a pixel and its eight neighbours."""
     largest = 0.0
     for v in range(y - 1, y + 2):
         for u in range(x - 1, x + 2):
@@ -77,13 +76,12 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
-    """Which of ``pixels`` (N, 2), x and y of local maxima of ``strength`` (H, W), are maxima over scale too, and
-    where exactly.
+    """Select and refine the ``pixels`` (N, 2) at local maxima of ``strength`` (H, W) that are also maxima over scale.
 
-    A pixel stays if its strength is above ``threshold`` and the normalised Laplacian of the middle one of ``planes``
-    (3, H, W), of ``variances`` (3,), is the largest of the three; a neighbouring pixel may stand in for it. Written to
-    ``peaks`` (N, 5): x and y, by a paraboloid through the 3x3 strengths; steps of scale from the middle plane, by a
-    parabola; strength; the Laplacian's magnitude. Returns their number.
+    A pixel is selected if its strength is above ``threshold`` and the normalised Laplacian of the middle one of ``planes`` (3, H,
+    W), of ``variances`` (3,), is the largest of the three, there or at a neighbouring pixel. Written to ``peaks`` (N, 5): x and
+    y, from a paraboloid through the 3x3 strengths; scale offset from the middle plane, from a parabola; strength; absolute
+    Laplacian. Returns their number.
     """
     count = 0
     for n in range(len(pixels)):
@@ -118,10 +116,10 @@ def refined_peaks(
 
 @numba.njit(cache=True)
 def spread(points: Float, scales: Float, reach: float, alike: float, count: int) -> Int64:
-    """Indices of ``count`` of the points (N, 2), which come by falling strength, that have no stronger one near by.
+    """Indices of ``count`` of the points (N, 2), sorted by descending strength, without a stronger one nearby.
 
-    Near by: nearer than ``reach`` times their own of the ``scales`` (N,), and with a scale that differs by a factor
-    of at most ``alike``. If they are too few, the strongest of the others fill up."""
+    Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``. If there are too
+    few, the strongest of the others are added."""
     total = len(points)
     first = np.empty(min(count, total), dtype=np.int64)
     crowded = np.empty(total, dtype=np.int64)
@@ -151,12 +149,11 @@ def spread(points: Float, scales: Float, reach: float, alike: float, count: int)
 
 @numba.njit(cache=True, fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
-    """Bilinear samples of patches around points, each in its own frame, of its own plane.
+    """Bilinear samples of patches around points, each in its own frame and plane.
 
-    ``planes`` (T,): all planes one behind the other, row by row; ``starts`` (N,), ``shapes`` (N, 2): where the plane
-    of a point begins, its height and width. ``frames`` (N, 4): x and y of a point in its plane [px], and the vector
-    (a, b) [px] that its frame's x axis has there. ``offsets`` (M, 2): sampled places in the frame. Beyond the border
-    the nearest pixel counts. Written to ``patches`` (N, M)."""
+    ``planes`` (T,): all planes concatenated, row by row; ``starts`` (N,), ``shapes`` (N, 2): first element, height and width of
+    each point's plane. ``frames`` (N, 4): x and y of a point in its plane [px], and the vector (a, b) [px] of its frame's x axis.
+    ``offsets`` (M, 2): sampled places in the frame. Beyond the border the nearest pixel counts. Written to ``patches`` (N, M)."""
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]
         px, py, a, b = frames[n, 0], frames[n, 1], frames[n, 2], frames[n, 3]
@@ -175,9 +172,8 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
 
 @numba.njit(cache=True)
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
-    """Histograms of the gradient's direction in patches (N, side * side): each gradient counts with its length times
-    ``weights`` (side - 2, side - 2), shared between the two nearest bins. Added to ``histograms`` (N, bins), bin 0 at
-    direction 0."""
+    """Histograms of gradient directions in patches (N, side * side), weighted by gradient magnitude and ``weights`` (side - 2,
+    side - 2), linearly distributed over two bins. Added to ``histograms`` (N, bins), bin 0 at direction 0."""
     bins = histograms.shape[1]
     per_radian = np.float32(bins / (2.0 * math.pi))
     for n in range(len(patches)):

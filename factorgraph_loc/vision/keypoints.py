@@ -1,4 +1,4 @@
-"""What every kind of feature has in common: points as arrays, and the interface that finds and describes them."""
+"""Keypoints as arrays, and the interface of feature extractors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ Descriptors = NDArray[Any]
 class Keypoints:
     """N points of an image, as arrays.
 
-    ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for
-    SIFT and the colour features twice the standard deviation of the Gaussian scale at which a point was found, for
-    ORB its patch; within one feature the region that a point stands for is a fixed multiple of it. ``angles`` (N,)
-    [rad]: direction ``atan2(dy, dx)`` with y down; NaN where a point has none. ``responses`` (N,): strength,
-    comparable within one image and one extractor. ``levels`` (N,): the level of the scale that a point was found at;
-    for OpenCV's features its packed octave."""
+    ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for SIFT and the
+    colour features twice the standard deviation of the Gaussian scale of a point, for ORB its patch; a fixed multiple of the
+    region described. ``angles`` (N,) [rad]: direction ``atan2(dy, dx)`` with y down, NaN if a point has none. ``responses`` (N,):
+    strength, comparable within one image and one extractor. ``levels`` (N,): scale level of a point; for OpenCV's features its
+    packed octave."""
 
     points: Array
     sizes: Array
@@ -37,7 +36,6 @@ class Keypoints:
         return len(self.points)
 
     def __getitem__(self, index: Any) -> Keypoints:
-        """The points of an index array, a truth array or a slice."""
         return Keypoints(
             self.points[index], self.sizes[index], self.angles[index], self.responses[index], self.levels[index]
         )
@@ -48,7 +46,7 @@ class Keypoints:
 
     @classmethod
     def from_cv2(cls, keypoints: Sequence[cv2.KeyPoint]) -> Keypoints:
-        """OpenCV's points, degrees as radians; its angle of -1 means none."""
+        """Convert OpenCV's keypoints, with degrees to radians; its angle of -1 means none."""
         if not keypoints:
             return cls.empty()
         rows = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], dtype=float)
@@ -57,7 +55,7 @@ class Keypoints:
         return cls(rows[:, :2], rows[:, 2], angles, rows[:, 4], levels)
 
     def to_cv2(self) -> list[cv2.KeyPoint]:
-        """The same points as OpenCV has them; ``class_id`` is the index of a point."""
+        """Convert to OpenCV's keypoints; ``class_id`` is the index of a point."""
         degrees = np.where(np.isnan(self.angles), -1.0, np.degrees(self.angles) % 360.0)
         columns = (*self.points.T, self.sizes, degrees, self.responses, self.levels, np.arange(len(self)))
         return list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
@@ -66,23 +64,22 @@ class Keypoints:
 class Extractor(Protocol):
     """Detector and descriptor of one kind of feature.
 
-    Images and masks are what :func:`~factorgraph_loc.vision.images.as_image` and ``as_mask`` take, which raise
-    InputError on others; an image that is blank or below 16 px has no features. At most ``count`` of them are given,
-    the strongest first."""
+    Images and masks are checked by :func:`~factorgraph_loc.vision.images.as_image` and ``as_mask``, which raise InputError; an
+    image that is blank or below 16 px has no features. Returns at most ``count`` points, the strongest first."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def binary(self) -> bool:
-        """Whether descriptors are bits, (N, bytes) ``uint8``, compared by Hamming distance, and not (N, D)
-        ``float32`` by the Euclidean one."""
+        """Whether descriptors are bits, (N, bytes) ``uint8`` with Hamming distance, rather than (N, D) ``float32`` with Euclidean
+        distance."""
 
     def detect(self, image: object, mask: object = None) -> Keypoints:
         """The points of ``image`` where ``mask`` (H, W) is not 0."""
 
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
-        """Those of ``keypoints`` that can be described, and the descriptors of each."""
+        """The ``keypoints`` that can be described, and their descriptors."""
 
     def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
         """:meth:`detect` and :meth:`compute` in one."""

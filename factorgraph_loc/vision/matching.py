@@ -1,13 +1,11 @@
-"""Which descriptors of two images belong together: nearest neighbours that are clearly nearer than the second nearest.
+"""Matching of descriptors: nearest neighbours that pass the ratio test.
 
-Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section
-7.1. The paper accepts a match "if distance is less than 5 times the distance to the second closest", which always
-holds: ``paper_literal`` does so, and ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict sense in which it may have
-been meant.
+Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1. The
+paper accepts a match "if distance is less than 5 times the distance to the second closest", which always holds: ``paper_literal``
+does so; ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict reading.
 
-Distances are computed from products, whose rounding depends on the kernel of the BLAS library. What is below their
-resolution is 0, and of two whose distances differ by less neither is the nearest: matches do not depend on the
-processor."""
+Distances are computed from matrix products, whose rounding depends on the BLAS kernel. Distances below the resolution are 0, and
+a neighbour is accepted only if it is nearer than the second by more than that, so that matches do not depend on the processor."""
 
 import math
 from dataclasses import dataclass
@@ -29,8 +27,7 @@ Truths = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """``indices`` (M, 2): of the descriptor in the first and in the second image, ascending in the first;
-    ``distances`` (M,)."""
+    """``indices`` (M, 2): of the descriptor in the first and in the second image, ascending in the first; ``distances`` (M,)."""
 
     indices: Integers
     distances: Array
@@ -49,12 +46,12 @@ def match(
     paper_literal: bool = False,
     allowed: Truths | None = None,
 ) -> Matches:
-    """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if its distance is below ``ratio`` times that to
-    the second nearest; one without a second nearest passes. Of two that are equally near none is a match.
+    """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if its distance is below ``ratio`` times that to the second
+    nearest, or there is no second. Ties are no matches.
 
-    ``binary``: Hamming distance, not Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``:
-    the paper's ratio of 5, without the mutual check. ``allowed`` (N, M): only such pairs are looked at. InputError
-    for descriptors that are not alike, or not finite, and for a ratio that is not above 0."""
+    ``binary``: Hamming distance, not Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``: the paper's
+    ratio of 5, without the mutual check. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or
+    non-finite descriptors, and for a ratio that is not positive."""
     if paper_literal:
         ratio, mutual = PAPER_RATIO, False
     if not ratio > 0.0:
@@ -87,17 +84,18 @@ def match_guided(
     mutual: bool = True,
     probability: float = GATE,
 ) -> Matches:
-    """:func:`match` of ``first`` (N, D), predicted to be seen at ``predicted`` (N, 2) [px] with ``covariances`` (N,
-    2, 2) [px^2] of prediction and measurement together, with ``second`` (M, D) at ``points`` (M, 2): only inside the
-    :func:`gates`."""
+    """:func:`match` of ``first`` (N, D) with ``second`` (M, D) at ``points`` (M, 2), inside the :func:`gates` of the predictions
+    only.
+
+    ``predicted`` (N, 2) [px] with ``covariances`` (N, 2, 2) [px^2] of prediction and measurement together."""
     allowed = gates(predicted, covariances, points, probability)
     return match(first, second, binary=binary, ratio=ratio, mutual=mutual, allowed=allowed)
 
 
 def gates(predicted: Array, covariances: Array, points: Array, probability: float = GATE) -> Truths:
-    """Which of ``points`` (M, 2) lie in the ellipses (N, M) that hold a Gaussian's ``probability``, of means
-    ``predicted`` (N, 2) and ``covariances`` (N, 2, 2). What is predicted as NaN has an empty gate; InputError if a
-    covariance is not positive definite."""
+    """Which of ``points`` (M, 2) lie in the ellipses (N, M) of the given ``probability`` of Gaussians with means ``predicted``
+    (N, 2) and ``covariances`` (N, 2, 2). NaN predictions have empty gates. Raises InputError if a covariance is not positive
+    definite."""
     if not 0.0 < probability < 1.0:
         raise InputError(f"matching: probability of a gate is {probability}, expected between 0 and 1")
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
@@ -107,14 +105,14 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
         raise InputError(f"matching: covariance {bad[0]} is {covariances[bad[0]].tolist()}, expected positive definite")
     dx, dy = (points[None, :, axis] - predicted[:, axis, None] for axis in (0, 1))
     scaled = c[:, None] * dx * dx - 2.0 * b[:, None] * dx * dy + a[:, None] * dy * dy
-    # of two degrees of freedom the chi-squared distribution has this quantile
+    # quantile of the chi-squared distribution with two degrees of freedom
     return np.asarray(scaled <= -2.0 * math.log1p(-probability) * determinant[:, None])
 
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite where there
-    is none, and whether the nearest is ``alone`` (N,): nearer than the second by more than the distances' resolution."""
+    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite where there is
+    none, and whether the nearest is ``alone`` (N,): nearer by more than the resolution of distances."""
 
     index: Integers
     best: Float
@@ -123,7 +121,7 @@ class Nearest:
 
 
 def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
-    """Of N rows of ``distances`` (N, M), M > 0, which column is nearest; ``resolution`` (N,): see :func:`resolution`."""
+    """The nearest column in each of N rows of ``distances`` (N, M), M > 0; ``resolution`` (N,): see :func:`resolution`."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
@@ -134,9 +132,9 @@ def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
 
 
 def resolution(descriptors: Descriptors, *, binary: bool) -> Float:
-    """The squared distance (N,) from each of ``descriptors`` (N, D) that rounding alone may give: 0 of bits, which are
-    counted; else the bound of the three products of D single-precision terms that :func:`distance_matrix` adds up
-    (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 3.1), of descriptors that are alike."""
+    """The squared distance (N,) of ``descriptors`` (N, D) that rounding alone may cause: 0 for bits; otherwise the bound of the
+    three products of D single-precision terms in :func:`distance_matrix` (Higham, Accuracy and Stability of Numerical Algorithms,
+    2002, section 3.1), for similar descriptors."""
     if binary:
         return np.zeros(len(descriptors), dtype=np.float32)
     values = descriptors.astype(np.float32)
@@ -145,8 +143,8 @@ def resolution(descriptors: Descriptors, *, binary: bool) -> Float:
 
 
 def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) -> Float:
-    """Distances (N, M) between ``first`` (N, D) and ``second`` (M, D): the number of bits that differ, or Euclidean,
-    and 0 where it is below the :func:`resolution`. InputError for descriptors that are not alike, or not finite."""
+    """Distances (N, M), Hamming or Euclidean, between ``first`` (N, D) and ``second`` (M, D), 0 below the :func:`resolution`.
+    Raises InputError for incompatible or non-finite descriptors."""
     for which, descriptors in (("first", first), ("second", second)):
         if descriptors.ndim != 2 or (binary and descriptors.dtype != np.uint8):
             kind = f"{descriptors.dtype} of shape {descriptors.shape}"
@@ -163,7 +161,7 @@ def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) ->
     squared = -2.0 * left @ right.T
     squared += np.einsum("nd,nd->n", left, left)[:, None]
     squared += np.einsum("md,md->m", right, right)
-    if binary:  # the square is the number of those that differ
+    if binary:  # the square is the number of differing bits
         return np.maximum(squared, 0.0)
     squared[squared <= resolution(first, binary=False)[:, None]] = 0.0
     return np.sqrt(squared)

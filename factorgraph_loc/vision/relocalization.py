@@ -1,8 +1,8 @@
-"""Where a camera is, from points of the map that it sees, without any prediction.
+"""Camera pose from matched map points without a prediction.
 
-Three points at a time give up to four poses, of which the one that most others agree with is kept (universal RANSAC: Raguram, Chum,
-Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as OpenCV has it), and refined by all that agree. On a robot that stays on the floor
-three values tell the pose: they are refined alone, and a camera that would float or tilt is not believed.
+Samples of three points give up to four poses each; the one with most inliers is kept (universal RANSAC: Raguram, Chum, Pollefeys,
+Matas, Frahm, PAMI 35(8), 2013, as in OpenCV) and refined with all inliers. For a robot on the floor only three values are
+refined, and a camera that would float or tilt is rejected.
 """
 
 import math
@@ -19,18 +19,18 @@ from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel, huber_weight
 from factors.se2 import Array
 
-REACH = 3.0  # standard deviations of a pixel that an agreeing point may be off
+REACH = 3.0  # standard deviations of a pixel for inliers
 CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
 REFINEMENTS = 10
 CONVERGED = 1e-6  # m, rad
-# m, rad: how high and how tilted a robot on the floor may seem: errors of a pose in space, and of the camera's mounting
+# m, rad: height and tilt tolerated for a robot on the floor: errors of a pose in space, and of the camera's mounting
 FLOATS, TILTS = 0.3, 0.15
-DETERMINED = 0.5  # m, rad: standard deviations beyond which a pose is not known
+DETERMINED = 0.5  # m, rad: standard deviations beyond which a pose is not determined
 
 
 @dataclass(frozen=True)
 class Found:
-    """A camera's pose, and which of the points agree with it (K,)."""
+    """A camera pose and its inliers (K,)."""
 
     camera: CameraPose
     inliers: Truths
@@ -38,7 +38,7 @@ class Found:
 
 @dataclass(frozen=True)
 class FoundOnFloor:
-    """A robot's ``pose`` (3,) with its body-frame ``covariance`` (3, 3), and which of the points agree with it (K,)."""
+    """A robot's ``pose`` (3,) with body-frame ``covariance`` (3, 3), and its inliers (K,)."""
 
     pose: Array
     covariance: Array
@@ -46,7 +46,7 @@ class FoundOnFloor:
 
 
 def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None) -> Found | None:
-    """The pose that most of ``points`` (K, 3), seen at ``pixels`` (K, 2), agree with; None where there is none.
+    """The pose with most inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2); None if there is none.
 
     ``spreads`` (K, 3, 3) [m^2]: covariances of the points.
     """
@@ -63,7 +63,7 @@ def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | N
         found, _, turn, shift, inliers = cv2.solvePnPRansac(
             np.ascontiguousarray(points), ideal, model.matrix(), None, params=parameters
         )
-    except cv2.error:  # of degenerate samples
+    except cv2.error:  # degenerate samples
         return None
     if not found or inliers is None or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
         return None
@@ -74,7 +74,7 @@ def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | N
 def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array | None = None
 ) -> FoundOnFloor | None:
-    """The pose of a robot on the floor whose camera was found at ``camera``; None where it floats, tilts or is not determined."""
+    """The pose of a robot on the floor whose camera was found at ``camera``; None if it floats, tilts or is not determined."""
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
     if abs(position[2]) > FLOATS or tilt > TILTS:
@@ -111,7 +111,7 @@ def _refined(
         whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
-        # wrong points far off would pull as one under the loss
+        # distant outliers would still have an effect under the loss
         weight = np.where(squared < (2.0 * GATE if i < 3 else GATE), huber_weight(squared, model.robust), 0.0)
         by_camera = whitener @ by_camera
         information = np.einsum("k,kri,krj->ij", weight, by_camera, by_camera)
@@ -132,7 +132,7 @@ def _refined(
 def found_on_floor(
     model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None
 ) -> FoundOnFloor | None:
-    """Where a robot on the floor is, from K points that may be wrong; ``inliers`` tells of all of them."""
+    """The pose of a robot on the floor from K points with outliers; ``inliers`` refers to all of them."""
     found = located(model, points, pixels, spreads)
     if found is None:
         return None

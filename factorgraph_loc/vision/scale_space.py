@@ -1,8 +1,7 @@
-"""An image at many scales: a Gaussian pyramid whose octaves hold four characteristic scales and their neighbours.
+"""Gaussian scale space: a pyramid whose octaves hold four characteristic scales and their neighbours.
 
-One :class:`ScaleSpace` serves all images of a size: its memory is used again for each, as new memory costs as much
-time as a blur. Derivatives are multiplied by the scale to their order: Lindeberg, "Feature detection with automatic
-scale selection", IJCV 30, 1998."""
+One :class:`ScaleSpace` serves all images of a size, to reuse its memory. Derivatives are multiplied by powers of the scale:
+Lindeberg, "Feature detection with automatic scale selection", IJCV 30, 1998."""
 
 from __future__ import annotations
 
@@ -21,15 +20,15 @@ SCALES = 4  # characteristic scales of an octave
 STEP = 2.0 ** (1.0 / SCALES)
 FINEST = 1.3  # px: standard deviation of the first characteristic scale
 
-# of each octave, in its own pixels: the four scales, one below them and one above
+# of each octave, in its own pixels: the four scales, one below and one above
 SIGMAS: Array = FINEST * STEP ** np.arange(-1.0, SCALES + 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Octave:
-    """Memory for one octave: ``planes`` (6, H, W), E at each of :data:`SIGMAS`; ``colours`` (C, H, W), the other
-    channels at one scale; ``products`` (3, H, W) and ``strength``, ``largest`` (H, W), what the detector computes at
-    one scale. ``step`` [px]: a pixel of the octave in pixels of the image."""
+    """Memory for one octave: ``planes`` (6, H, W), E at each of :data:`SIGMAS`; ``colours`` (C, H, W), the other channels at one
+    scale; ``products`` (3, H, W) and ``strength``, ``largest`` (H, W): work arrays of the detector. ``step`` [px]: size of a
+    pixel of the octave in pixels of the image."""
 
     planes: Float
     colours: Float
@@ -46,8 +45,8 @@ class Octave:
 
 
 class ScaleSpace:
-    """Octaves of images of ``shape`` (H, W) with ``colours`` channels beside E, each half as large as the one before,
-    down to 16 px."""
+    """Octaves for images of ``shape`` (H, W) with ``colours`` channels besides E, each half as large as the previous, down to 16
+    px."""
 
     def __init__(self, shape: tuple[int, ...], colours: int) -> None:
         self.shape, self.colours = shape, colours
@@ -67,7 +66,7 @@ class ScaleSpace:
         self._steps: Array = np.array([2.0**o for o, _ in levels])
 
     def fill(self, intensity: Float) -> None:
-        """The planes of all octaves from E (H, W) of an image."""
+        """Compute the planes of all octaves from E (H, W)."""
         blur(intensity, self.octaves[0].planes[0], SIGMAS[0])
         for o, octave in enumerate(self.octaves):
             if o > 0:
@@ -76,14 +75,13 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """The characteristic scale, counted through all octaves, that is nearest to each of ``sigmas`` (N,) [px]."""
+        """The index over all octaves of the characteristic scale nearest to each of ``sigmas`` (N,) [px]."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 
     def patches(self, points: Array, sigmas: Array, angles: Array, offsets: Float) -> Float:
-        """E (N, M) around ``points`` (N, 2) [px], each at its own scale ``sigmas`` (N,) [px]: at ``offsets`` (M, 2),
-        in units of the scale, along axes turned by ``angles`` (N,) [rad]. Beyond the border the nearest pixel
-        counts."""
+        """Samples (N, M) of E around ``points`` (N, 2) [px], at scales ``sigmas`` (N,) [px] and ``offsets`` (M, 2) in units of
+        the scale, along axes rotated by ``angles`` (N,) [rad]. Beyond the border the nearest pixel counts."""
         levels = self.levels(sigmas)
         steps = self._steps[levels]
         axis = (sigmas / steps)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -94,12 +92,11 @@ class ScaleSpace:
 
 
 def blur(source: Float, target: Float, sigma: float) -> None:
-    """Gaussian blur of ``source`` (H, W) to ``target``, which may be the same; ``sigma`` [px]; beyond the border is a
-    mirror."""
+    """Gaussian blur of ``source`` (H, W) to ``target``, which may be the same, with mirrored borders; ``sigma`` [px]."""
     side = 2 * int(np.ceil(3.0 * sigma)) + 1
     cv2.GaussianBlur(source, (side, side), sigma, dst=target, borderType=cv2.BORDER_REFLECT_101)
 
 
 def more_blur(have: float, want: float) -> float:
-    """Standard deviation of the blur that makes one of ``have`` one of ``want``."""
+    """Standard deviation of the blur that takes an image of blur ``have`` to ``want``."""
     return float(np.sqrt(want**2 - have**2))

@@ -1,4 +1,4 @@
-"""Settings of the features that are found in images."""
+"""Settings of feature detection in images."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from factorgraph_loc.maps.points import Feature
 
 
 class FrontendSettings(FileModel):
-    """What is looked for in images: the ``feature`` by its name, and at most how many (``count``) in an image."""
+    """The ``feature`` to detect, by name, and the maximum number (``count``) per image."""
 
     feature: Feature = "colour"
     count: Annotated[int, Field(ge=10, le=20_000)] = 500

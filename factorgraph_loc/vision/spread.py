@@ -1,4 +1,4 @@
-"""A choice of pixels that is spread over an image: neighbours tell nearly the same."""
+"""Selection of pixels that are spread over an image, as neighbours are redundant."""
 
 import math
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from factors.se2 import Array
 
 
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None) -> Integers:
-    """Places of at most ``count`` of ``pixels`` (K, 2), ascending: cell by cell of a grid in turn, of each cell those with the
-    highest ``priority`` (K,) first, else in their order."""
+    """Indices of at most ``count`` of ``pixels`` (K, 2), ascending, taken from the cells of a grid in turn; in each cell by
+    ``priority`` (K,), highest first, else in their order."""
     if len(pixels) <= count:
         return np.arange(len(pixels))
     low, high = pixels.min(axis=0), pixels.max(axis=0)
@@ -20,7 +20,5 @@ def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None)
     cells = column * (line.max() + 1.0) + line
     order = np.lexsort((np.zeros(len(pixels)) if priority is None else -np.asarray(priority), cells))
     turns = np.empty(len(pixels), dtype=np.int64)
-    turns[order] = np.arange(len(pixels)) - np.searchsorted(
-        cells[order], cells[order]
-    )  # how many of its cell come before
+    turns[order] = np.arange(len(pixels)) - np.searchsorted(cells[order], cells[order])  # rank within the cell
     return np.sort(np.argsort(turns, kind="stable")[:count])

@@ -1,9 +1,8 @@
-"""What is followed from image to image: features of one number are, as far as their neighbours tell, one point.
+"""Feature tracks over consecutive images.
 
-Between two images descriptors must be mutually nearest, clearly nearer than the second nearest and not far apart in the
-image, and the pairs together must obey one epipolar geometry: an essential matrix, found by USAC (Raguram et al., PAMI 35,
-2013) as OpenCV has it, whose random numbers are the same each time. A fundamental matrix would be too obliging: it often fits
-a moving object too. What an image misses is looked for in the one before.
+Matches between two images are mutual nearest neighbours that pass the ratio test, with bounded displacement, and must fit one
+essential matrix, found by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix would often
+fit a moving object too. Features without a match are also compared with the last image but one.
 """
 
 import math
@@ -19,20 +18,20 @@ from factorgraph_loc.vision.matching import Truths, match
 from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array
 
-RADIUS = 0.25  # of the longer side of an image: how far a feature may move
+RADIUS = 0.25  # of the longer side of an image: largest displacement of a feature
 EPIPOLAR = 1.5  # px from the epipolar line
-CONFIDENCE, DRAWS = 0.99, 300  # of five pairs
-FEWEST = 16  # pairs: with fewer, a geometry that eight of them fit says nothing of the others
+CONFIDENCE, DRAWS = 0.99, 300  # samples of five pairs
+FEWEST = 16  # pairs needed for a meaningful consensus
 THREADS = 2
 
 
 def follow(
     pixels: Sequence[Array], descriptors: Sequence[Descriptors], camera: CameraModel, *, binary: bool
 ) -> list[Integers]:
-    """Numbers (K,) of the features of each of N images, given in the order of time.
+    """Track numbers (K,) of the features of each of N images in order of time.
 
-    ``pixels``: N times (K, 2) as the ``camera`` has them; ``descriptors``: N times (K, D), ``binary`` or not. A number stands at
-    most once in an image; what is seen once has one of its own.
+    ``pixels``: N times (K, 2) of the ``camera``; ``descriptors``: N times (K, D), ``binary`` or not. A number occurs at most once
+    per image; a feature seen only once has a number of its own.
     """
     count = len(pixels)
     directions = [undistorted(camera, p) for p in pixels]
@@ -48,10 +47,10 @@ def follow(
         return np.column_stack((first[found[:, 0]], second[found[:, 1]]))
 
     every = [np.arange(len(p)) for p in pixels]
-    with ThreadPoolExecutor(THREADS) as pool:  # the work is done by numpy and OpenCV, outside of the interpreter
+    with ThreadPoolExecutor(THREADS) as pool:  # numpy and OpenCV release the interpreter lock
         steps = range(1, count)
         near = list(pool.map(lambda j: matched(j - 1, j, every[j - 1], every[j]), steps))
-        missed = [np.setdiff1d(every[j], near[j][:, 0]) for j in range(count - 1)]  # of image j in the one after
+        missed = [np.setdiff1d(every[j], near[j][:, 0]) for j in range(count - 1)]  # of image j, not in the next
         new = [np.setdiff1d(every[j], near[j - 1][:, 1]) for j in steps]  # of image j
         far = list(pool.map(lambda j: matched(j - 2, j, missed[j - 2], new[j - 1]), range(2, count)))
     tracks: list[Integers] = []
@@ -72,7 +71,7 @@ def follow(
 def pairs(
     first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel, *, binary: bool
 ) -> Integers:
-    """Pairs (M, 2) of features of two images, each given as directions (K, 2), as (x, y) at depth 1, and descriptors (K, D)."""
+    """Pairs (M, 2) of features of two images, each given as directions (K, 2), i.e. (x, y) at depth 1, and descriptors (K, D)."""
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)
     focal = math.sqrt(camera.fx * camera.fy)
@@ -86,10 +85,10 @@ def pairs(
 
 
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
-    """Which of M pairs of pixels (M, 2), from the principal point, obey the epipolar geometry that most of them do."""
+    """The inliers of M pairs of pixels (M, 2), relative to the principal point, of one epipolar geometry."""
     matrix = np.diag((focal, focal, 1.0))
     try:
         _, inliers = cv2.findEssentialMat(first, second, matrix, cv2.USAC_FAST, CONFIDENCE, EPIPOLAR, DRAWS)
-    except cv2.error:  # USAC of OpenCV 5.0 fails now and then where a camera hardly moves
+    except cv2.error:  # USAC of OpenCV 5.0 fails occasionally if the camera hardly moves
         inliers = None
     return np.ones(len(first), dtype=bool) if inliers is None else np.asarray(inliers.ravel() != 0)

@@ -1,4 +1,4 @@
-"""How far a robot drives until it knows where it is: policies in three worlds, with the filter of the paper."""
+"""Distance until localized: policies in three worlds, with the filter of the paper."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ SETTINGS = ActiveSettings()
 def compared(
     name: str, options: Options, estimators: Mapping[str, Sequence[str]], seeds: Sequence[int], text: str
 ) -> Report:
-    """The section ``name`` of all worlds and ``estimators``, each with its policies."""
+    """The section ``name``: all worlds and ``estimators``, each with its policies."""
     report = Report(name, options)
     jobs = [
         job
@@ -48,7 +48,7 @@ def tell(name: str, done: Any, total: Any) -> None:
 
 
 def goal(seeds: Sequence[int]) -> str:
-    """What is told of every table of runs."""
+    """The caption of every table of runs."""
     degrees = math.degrees(SETTINGS.heading_limit)
     return (
         f"{len(seeds)} robots in each world, the same for all policies; one gives up after {SETTINGS.max_metres:.0f} m. "

@@ -1,4 +1,4 @@
-"""A planning step: how long it takes, and what is lost if fewer of the particles are looked at. One process at a time."""
+"""Time of a planning step, and the loss if fewer particles are used. One process at a time."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 
 SEEDS = 10  # beliefs of each world
-FIRST = 2000  # seeds that no other section uses
+FIRST = 2000  # first seed, not used by other sections
 SAMPLES = (16, 32, 64, 128, 256, 512)
-BEST = 1024  # particles, and as many scans, of what the others are compared with
+BEST = 1024  # particles and scans of the reference that others are compared with
 REPEATS = 5
-DRIVEN = 2.0  # m, until the belief is taken
+DRIVEN = 2.0  # m driven before the belief is taken
 CANDIDATES = 100
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """``modes``: whether the belief had several; by size ``ms`` (REPEATS,) of a step, and ``lost`` (REPEATS,) [nats]: by how much
-    less the chosen path is expected to tell than the best, by as many particles as :data:`BEST`. ``best``: what that tells."""
+    """``modes``: whether the belief had several; by size ``ms`` (REPEATS,) of a step, and ``lost`` (REPEATS,) [nats]: the
+    difference between the expected gains of the chosen path and of the best, with :data:`BEST` particles. ``best``: the latter.
+    """
 
     modes: bool
     ms: dict[int, np.ndarray]
@@ -41,7 +42,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Belief:
-    """Particles (M, 3) with weights (M,), the tags, and where walls are."""
+    """Particles (M, 3) with weights (M,), the tags, and the walls."""
 
     particles: np.ndarray
     weights: np.ndarray
@@ -115,7 +116,7 @@ def gains(belief: Belief, paths: list[Path], samples: int, scans: int, seed: int
 
 
 def belief_of(name: str, seed: int) -> Belief:
-    """What the filter believes after a robot that began anywhere has gone :data:`DRIVEN` straight on."""
+    """The filter's belief after a robot with an unknown start has driven :data:`DRIVEN` straight on."""
     simulation = preset(name)
     rng = np.random.default_rng(seed)
     world = make_world(simulation.world, rng)

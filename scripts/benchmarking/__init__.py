@@ -1,1 +1,1 @@
-"""What scripts/bench_rfid and scripts/bench_camera share: their command line, their tables, and jobs in processes."""
+"""Common parts of the benchmarks: their command line, tables, and parallel jobs."""

@@ -1,4 +1,4 @@
-"""The command line of a benchmark: sections, each a module with ``section(options)``, and a page that takes their tables."""
+"""The command line of a benchmark: sections, each a module with ``section(options)``, and a page for their tables."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TABLES = "<!-- tables -->\n"
 
 
 def parser(description: str, sections: Sequence[str], out: str) -> argparse.ArgumentParser:
-    """What every benchmark asks for; results go to ``out`` unless told."""
+    """The common options; results go to ``out`` by default."""
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument(
         "sections", nargs="*", choices=[*sections, []], default=[], metavar="SECTION", help="by default all"
@@ -49,7 +49,7 @@ def run_sections(package: str, sections: Sequence[str], options: Options, page: 
 
 
 def with_tables(page: str, name: str, lines: Sequence[str]) -> str:
-    """The page with ``lines`` in place of what stands between the mark of tables of this section and the next section."""
+    """The page with the tables of this section replaced by ``lines``."""
     before, heading, rest = page.partition(f"## {name}\n")
     section, following, after = rest.partition("\n## ")
     prose, mark, _ = section.partition(TABLES)

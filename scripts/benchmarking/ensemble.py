@@ -1,4 +1,4 @@
-"""Many simulated logs, each run by several estimators in one process, and nothing but the errors kept."""
+"""Many simulated logs, each run by several estimators in one process, of which only the errors are kept."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Series:
-    """Errors at the stamps ``t`` (N,) of the reference that are scored: ``position`` [m], ``heading`` [rad, absolute] and ``nees``,
-    each (N,); NaN where there is nothing to say."""
+    """Errors at the scored stamps ``t`` (N,) of the reference: ``position`` [m], ``heading`` [rad, absolute] and ``nees``, each
+    (N,); NaN where undefined."""
 
     t: Array
     position: Array
@@ -38,13 +38,13 @@ class Series:
         return float(np.sqrt(np.nanmean(np.square(self.heading))))
 
     def where(self, keep: NDArray[np.bool_]) -> Series:
-        """At the times that are marked (N,)."""
+        """The errors at the selected times (N,)."""
         return Series(self.t[keep], self.position[keep], self.heading[keep], self.nees[keep])
 
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Of one run: ``causal``, NaN before the first localized estimate; ``final``; ``status`` at each tick."""
+    """Errors of one run: ``causal``, NaN before the first localized estimate; ``final``; ``status`` at each tick."""
 
     causal: Series
     final: Series
@@ -52,7 +52,7 @@ class RunErrors:
     timings: Timings
 
     def share(self, status: Status) -> float:
-        """Share of the ticks with this status."""
+        """Fraction of the ticks with this status."""
         return self.status.count(status) / len(self.status)
 
 

@@ -1,4 +1,4 @@
-"""What the sections share: options, jobs in processes, tables, figures of many runs."""
+"""Common parts of the sections: options, parallel jobs, tables, statistics of many runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from factorgraph_loc.processes import run_each
 
 @dataclass(frozen=True)
 class Options:
-    """``seeds``: simulated logs of each kind, None for the number that each section has; ``jobs``: processes at a time."""
+    """``seeds``: number of simulated logs of each kind, None for each section's default; ``jobs``: parallel processes."""
 
     seeds: int | None
     jobs: int
@@ -34,7 +34,7 @@ class Options:
 
 @dataclass
 class Report:
-    """The markdown of a section, and what failed."""
+    """The Markdown of a section, and its failures."""
 
     name: str
     options: Options
@@ -49,7 +49,7 @@ class Report:
         self.lines.append("")
 
     def figures(self, name: str, heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Figures of single runs, as CSV beside the report."""
+        """Write results of single runs as CSV beside the report."""
         folder = self.options.out / self.name
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
@@ -58,7 +58,7 @@ class Report:
     def collect(
         self, function: Callable[[Any], Any], jobs: Sequence[Any], labels: Sequence[str], workers: int | None = None
     ) -> dict[int, Any]:
-        """The outcomes of the jobs that did not fail, by place."""
+        """The results of the successful jobs, by index."""
         found: dict[int, Any] = {}
         for i, outcome in run_each(function, jobs, self.options.jobs if workers is None else workers):
             if isinstance(outcome, Exception):

@@ -1,4 +1,4 @@
-"""What many runs of one kind say together: covariances at each time, ratios of errors, counts, times.
+"""Statistics of many runs of one kind: consistency at each time, ratios of errors, counts, times.
 
 NEES over runs: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.2.
 """
@@ -17,13 +17,13 @@ from factorgraph_loc.evaluation.statistics import pooled_rms
 from factors.se2 import Array
 
 DRAWS = 4000
-_SEED = 0  # of the bootstrap: the same results give the same intervals
+_SEED = 0  # of the bootstrap, for reproducible intervals
 
 
 def share_in_band(nees: Array, dof: int = 3) -> float:
-    """Share of the times at which the mean NEES over runs lies in its 95 % band; of a consistent estimator 95 %.
+    """Fraction of the times at which the mean NEES over runs is in its 95 % band; 95 % for a consistent estimator.
 
-    ``nees`` (R, N): of R independent runs at N times, NaN where there is none. Times without any run do not count; NaN if all are.
+    ``nees`` (R, N): of R independent runs at N times, NaN where missing. Times without any run do not count; NaN if all are.
     """
     known = np.isfinite(nees)
     count = known.sum(axis=0)
@@ -54,9 +54,10 @@ def rmse_ratio(a: Array, b: Array) -> Ratio:
 
 
 def first_held(t: Array, good: NDArray[np.bool_], hold: float) -> float:
-    """The first of the times ``t`` (N,), ascending, from which on all are ``good`` (N,) for ``hold`` seconds; NaN if there is none.
+    """The first of the times ``t`` (N,), ascending, from which on all are ``good`` (N,) for ``hold`` seconds; NaN if there is
+    none.
 
-    What ends before it has held so long does not count.
+    Times less than ``hold`` before the end do not count.
     """
     bad = np.concatenate((np.zeros(1, dtype=np.int64), np.cumsum(~good)))
     end = np.searchsorted(t, t + hold + 1e-9, side="right")

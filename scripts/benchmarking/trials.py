@@ -1,4 +1,4 @@
-"""Trials of an unknown start and of kidnapping, made from a recorded log: it is cut, or cut and joined."""
+"""Trials of an unknown start and of kidnapping, made from a recorded log by cutting and joining."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factors import se2
 from factors.se2 import Array
 
-POSITION, HEADING = 0.5, math.radians(15.0)  # m, rad: an estimate nearer than both is right
-HOLD = 10.0  # s that it must stay right
-LANDMARKS = 3  # different ones that are enough to be localized by
+POSITION, HEADING = 0.5, math.radians(15.0)  # m, rad: an estimate with smaller errors is correct
+HOLD = 10.0  # s that it must remain correct
+LANDMARKS = 3  # number of different landmarks sufficient for localization
 START_TIME, RECOVERY_TIME = 60.0, 30.0  # s
-BEFORE = 30.0  # s that a robot drives before it is carried off
+BEFORE = 30.0  # s of driving before the kidnapping
 JUMP = 0.2  # s between the two parts of a kidnapping
 REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial. ``right``: localized (or recovered) rightly in time; ``false``: the first claim to be localized was wrong (after a
-    kidnapping: localized is what it claimed when the time was up, without having recovered); ``seconds``: until it was right,
-    NaN if it never was."""
+    """One trial. ``right``: localized (or recovered) correctly in time; ``false``: the first claim to be localized was wrong
+    (after a kidnapping: localized was claimed at the deadline without recovery); ``seconds``: until correct, NaN if never."""
 
     t: float
     right: bool
@@ -56,8 +55,8 @@ def run_trials(job: TrialJob) -> list[Trial]:
 def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
     """Unknown starts at ``count`` times spread evenly over a log with reference, as long as 3 landmarks are still to be seen.
 
-    A start is right if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks where
-    that takes longer, and then stays within 0.5 m and 15 degrees for 10 s.
+    A start is correct if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks if
+    that is longer, and then stays within 0.5 m and 15 degrees for 10 s.
     """
     first, last = log.span()[0], _last_start(log)
     trials = []
@@ -76,9 +75,9 @@ def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, An
 
 
 def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
-    """A robot that is carried, ``count`` times, from one time of the log to one half the log later (or earlier).
+    """A robot that is kidnapped, ``count`` times, from one time of the log to one half the log later (or earlier).
 
-    It is recovered if it is right within 30 s of having seen 3 different landmarks at the new place, for 10 s.
+    It is recovered if it is correct for 10 s, within 30 s of having seen 3 different landmarks at the new place.
     """
     first, last = log.span()
     trials = []
@@ -101,7 +100,7 @@ def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[st
 
 
 def _third_landmark(log: Log, t: float) -> float:
-    """When the third different landmark of the map is seen after ``t``; the log's end if that never happens."""
+    """The time of the third different landmark of the map after ``t``; the log's end if there is none."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
     met: set[str] = set()
@@ -114,7 +113,7 @@ def _third_landmark(log: Log, t: float) -> float:
 
 
 def _last_start(log: Log) -> float:
-    """The last time from which 3 different landmarks of the map are still seen; the log's begin if that never happens."""
+    """The last time from which 3 different landmarks of the map are still seen; the log's begin if there is none."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
     met: set[str] = set()
@@ -127,7 +126,7 @@ def _last_start(log: Log) -> float:
 
 
 def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
-    """Which causal estimates are right; where the reference has a gap, as the one before, or at the beginning as the next."""
+    """Which causal estimates are correct; in a gap of the reference, as the one before (at the beginning, the one after)."""
     assert log.reference is not None
     truth = log.reference.at(result.t, max_gap=REFERENCE_GAP)
     error = result.poses - truth
@@ -141,6 +140,6 @@ def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
 
 
 def _holds(t: Array, right: np.typing.NDArray[np.bool_], first: int) -> bool:
-    """Whether all estimates of the following 10 s are right."""
+    """Whether all estimates of the following 10 s are correct."""
     during = (t >= t[first]) & (t <= t[first] + HOLD)
     return bool(right[during].all())

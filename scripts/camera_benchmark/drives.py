@@ -1,6 +1,6 @@
-"""Drives through rendered offices: the features of their images, kept in files, and the map that another drive teaches.
+"""Drives through rendered offices: the features of their images, stored in files, and the map from another drive.
 
-Images are compressed as those of a log, and never written. What is kept is named by a hash of everything that it depends on.
+Images are JPEG-compressed but not stored. Stored features are named by a hash of everything that they depend on.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from factorgraph_loc.vision.tracks import follow
 
 TAGS = 20
 RATE, MAP_RATE = 5.0, 2.0  # images/s
-COUNT = 500  # features of an image
+COUNT = 500  # features per image
 MAP_DURATION = 600.0  # s
-MAP_SEED = 100_000  # is added to the seed of the drive that the map is learnt from
+MAP_SEED = 100_000  # added to the seed of a drive for that of its mapping drive
 SIGMAS = np.array(
     (REFERENCE_POSITION_SIGMA, REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
 )  # of that drive's poses
@@ -47,7 +47,7 @@ SIGMAS = np.array(
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive of ``seed`` through the office of ``world``, ``duration`` [s] long, and what is looked for in its images."""
+    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long, and the features to detect."""
 
     world: int
     seed: int
@@ -67,13 +67,13 @@ class Drive:
         return preset("office", changes)
 
     def mapping(self) -> Drive:
-        """The other drive through the same office, which the map is learnt from."""
+        """The other drive through the same office, from which the map is learnt."""
         return replace(self, seed=self.seed + MAP_SEED, duration=MAP_DURATION, rate=MAP_RATE)
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """What it took to make a drive's features: to render, to find and to follow them [s], for all images."""
+    """Times [s] to render all images of a drive, and to detect and track their features."""
 
     render: float
     find: float
@@ -81,7 +81,7 @@ class Seconds:
 
 
 def log_of(drive: Drive, folder: Path) -> tuple[Log, Seconds]:
-    """The log of a drive with the features of its images and without a map of points; these are kept in ``folder``."""
+    """The log of a drive with features and without a map of points; stored in ``folder``."""
     keep_features([drive], folder)
     log = simulate(drive.settings(), drive.seed)
     stream, seconds = _read_features(drive, _path(drive, folder))
@@ -91,7 +91,7 @@ def log_of(drive: Drive, folder: Path) -> tuple[Log, Seconds]:
 
 
 def keep_features(drives: Sequence[Drive], folder: Path) -> None:
-    """Find the features of a drive that are not yet in ``folder``; ``drives`` differ in what is looked for alone."""
+    """Detect and store the features that are not yet in ``folder``; ``drives`` differ only in the features."""
     missing = [drive for drive in drives if not _path(drive, folder).exists()]
     if missing:
         folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def keep_features(drives: Sequence[Drive], folder: Path) -> None:
 
 
 def written(drive: Drive, folder: Path) -> Log:
-    """The log of a drive with the files of its images, which are kept in ``folder``, and without a map of points."""
+    """The log of a drive with image files, stored in ``folder``, and without a map of points."""
     settings = drive.settings()
     log = simulate(settings, drive.seed)
     path = folder / f"{_key(drive)}-images"
@@ -107,13 +107,13 @@ def written(drive: Drive, folder: Path) -> Log:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as name:
             with_images(log, settings, drive.seed, Path(name))
-            Path(name).rename(path)  # the context does not mind
+            Path(name).rename(path)  # the context manager does not mind
     times = film(settings, drive.seed).stamps
     return replace(log, streams={**log.streams, "camera": ImageStream(times, sorted(path.glob("*.jpg")))})
 
 
 def map_of(drive: Drive, folder: Path) -> PointMap:
-    """What the mapping drive of a drive teaches; its poses are known as well as a reference is."""
+    """The map from the mapping drive of a drive, with poses as accurate as a reference."""
     other = drive.mapping()
     path = folder / f"{_key(other)}-{code_of('calibration')}.points.parquet"
     if not path.exists():
@@ -130,7 +130,7 @@ def with_map(log: Log, points: PointMap) -> Log:
 
 
 def with_errors(log: Log, seed: int) -> Log:
-    """The log with a reference that is wrong by as much as it says."""
+    """The log with a reference that has errors as stated."""
     truth = log.reference
     assert truth is not None
     noise = SIGMAS * np.random.default_rng(seed).standard_normal((len(truth), 3))
@@ -139,7 +139,7 @@ def with_errors(log: Log, seed: int) -> Log:
 
 
 def images(settings: SimulationSettings, seed: int) -> Iterator[np.ndarray]:
-    """The images of a drive as they come out of a log."""
+    """The images of a drive after compression."""
     cv2.setNumThreads(1)
     for _, image in film(settings, seed):
         yield compressed(image)

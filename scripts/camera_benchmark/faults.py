@@ -1,4 +1,4 @@
-"""What goes wrong, one thing at a time: what it costs, what is said about it, and whether the estimate comes back."""
+"""One fault at a time: its effect on the errors, the messages about it, and the recovery."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from factorgraph_loc.vision.feature_cache import VARIABLE
 SEEDS = 3
 FIRST = 9000
 DURATION = 150.0  # s
-AFTERWARDS = 30.0  # s at the end, when whatever lasts for a time is over
-BACK = 0.10  # m: an estimate that is no farther off then has recovered
+AFTERWARDS = 30.0  # s at the end, after the end of temporary faults
+BACK = 0.10  # m: an estimate with a smaller error has recovered
 RIGHT = "none"
 CONFIGS = {
     "ekf, camera": RunConfig("ekf", sensors=CAMERA),
@@ -45,7 +45,7 @@ class Job:
 def section(options: CameraOptions) -> Report:
     report = Report("faults", options)
     drives = [Drive(FIRST + i, FIRST + i, options.seconds(DURATION)) for i in range(options.count(SEEDS))]
-    # a drive's images are written and mapped once, before several processes want them
+    # write and map a drive's images once, before several processes need them
     ready = report.collect(
         prepared, [Job(RIGHT, drive, options.drives) for drive in drives], [str(d.seed) for d in drives]
     )
@@ -73,7 +73,7 @@ def prepared(job: Job) -> int:
 
 
 def faulty(job: Job) -> dict[str, Attempt]:
-    """All runs on a drive with a fault, from the files of its images."""
+    """All runs on a drive with a fault, from image files."""
     os.environ[VARIABLE] = str(job.folder)
     log = with_map(written(job.drive, job.folder), map_of(job.drive, job.folder))
     folder = job.folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', job.fault.lower())}-{job.drive.seed}"
@@ -92,7 +92,7 @@ def cells(runs: Sequence[Attempt]) -> tuple[str, str, str]:
 
 
 def said(one: Attempt, right: Attempt) -> str:
-    """What a user is told that is not told without the fault."""
+    """Messages that do not occur without the fault."""
     if one.failure:
         return short(one.failure)
     parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]

@@ -1,4 +1,4 @@
-"""Faults of a camera, of its images, and of what is known about it: each makes another log of one."""
+"""Faults of a camera, of its images, and of its calibration: each is a change of a log."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ EACH = 5  # images that are missing, truncated, or of another size
 BLACK, BLACK_FROM = 100, 40.0  # images, s
 BLIND_FROM, BLIND = 40.0, 60.0  # s
 WRONG = 0.4
-MOVED, MOVED_RADIUS = 1.0, 0.5  # m; what hangs or stands in that radius is one thing
-FOCAL, OFFSET = 0.05, 0.1  # as a share, s
-PERIOD = 8.0  # s in which the object that is in the way goes to and fro
+MOVED, MOVED_RADIUS = 1.0, 0.5  # m; everything in that radius moves together
+FOCAL, OFFSET = 0.05, 0.1  # relative, s
+PERIOD = 8.0  # s, of the motion of the object in the way
 GREY = 128
 
 
 @dataclass(frozen=True)
 class Given:
-    """A ``log`` with files of images, a generator ``rng``, and a ``folder`` for other files."""
+    """A ``log`` with image files, a generator ``rng``, and a ``folder`` for other files."""
 
     log: Log
     rng: np.random.Generator
@@ -44,7 +44,7 @@ def right(given: Given) -> Log:
 
 
 def damaged(given: Given) -> Log:
-    """Some images are missing, some cut off in the middle, some of half the size."""
+    """Some images are missing, some truncated, some of half the size."""
     stream = images_of(given.log)
     files = list(stream.file)
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -70,13 +70,13 @@ def black(given: Given) -> Log:
 
 
 def nothing_in_view(given: Given) -> Log:
-    """For a minute the camera looks at something grey."""
+    """For a minute the camera sees a grey surface."""
     t = images_of(given.log).t
     return blank(given.log, np.flatnonzero((t >= BLIND_FROM) & (t < BLIND_FROM + BLIND)).tolist(), GREY, given.folder)
 
 
 def object_in_the_way(given: Given) -> Log:
-    """Something with a rich texture covers a third of every image, and moves to and fro."""
+    """A textured object covers a third of every image, and moves to and fro."""
     stream = images_of(given.log)
     given.folder.mkdir(parents=True, exist_ok=True)
     camera = given.log.rig.camera
@@ -95,7 +95,7 @@ def object_in_the_way(given: Given) -> Log:
 
 
 def wrong_matches(given: Given) -> Log:
-    """Of the features of every image four in ten look like others of the same image."""
+    """Four in ten features of every image have the descriptors of others."""
     stream = features_of(given.log)
     frames = []
     for frame in stream.frame:
@@ -107,7 +107,7 @@ def wrong_matches(given: Given) -> Log:
 
 
 def moved_landmark(given: Given) -> Log:
-    """What is around one place of the map has been moved by a metre since; the place is the one with the most points around it."""
+    """One part of the map, with the most points around it, has moved by a metre."""
     points = given.log.world.points
     assert points is not None
     cells = np.round(points.positions[:, :2] / MOVED_RADIUS)
@@ -133,7 +133,7 @@ def late_stamps(given: Given) -> Log:
 
 
 def estimated(change: Change, **uncertainty: float) -> Change:
-    """The fault, with the constant that is wrong being estimated."""
+    """The fault, with estimation of the wrong constant."""
 
     def changed(given: Given) -> Log:
         log = change(given)
@@ -199,7 +199,7 @@ def with_camera(log: Log, **changes: Any) -> Log:
 
 
 def blank(log: Log, which: Sequence[int], value: int, folder: Path) -> Log:
-    """The images of these places show one grey."""
+    """Replace the images ``which`` by one grey value."""
     stream = images_of(log)
     camera = log.rig.camera
     assert camera is not None

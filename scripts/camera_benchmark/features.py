@@ -1,4 +1,4 @@
-"""Which feature: the same rendered offices with each of them, in the map and in the images."""
+"""Comparison of features in the same rendered offices, in the map and in the images."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """``runs`` by label; ``points`` of the map; how many features an image has, and how many of them are ``matched`` with the map;
-    milliseconds that an image takes."""
+    """``runs`` by label; number of ``points`` in the map, of features per image, and of features ``matched`` with the map;
+    milliseconds per image."""
 
     runs: dict[str, Attempt]
     points: int
@@ -69,7 +69,7 @@ def section(options: CameraOptions) -> Report:
 
 
 def localized(job: Job) -> dict[str, Outcome]:
-    """Both runs on one drive with each feature, which are found in the same images."""
+    """Both runs on one drive with each feature, detected in the same images."""
     drives = {feature: replace(job.drive, feature=feature) for feature in FEATURES}
     for variants in (list(drives.values()), [drive.mapping() for drive in drives.values()]):
         keep_features(variants, job.folder)

@@ -1,4 +1,4 @@
-"""Rendered offices with a map that another drive taught: every estimator with every sensor that it takes."""
+"""Rendered offices with a map from another drive: every estimator with every sensor that it uses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from camera_benchmark.report import (
 from factorgraph_loc.experiments.run import RunConfig
 
 SEEDS = 20
-SLOW_SEEDS = 6  # of what takes longer than all the others together; the fewest that give an interval
+SLOW_SEEDS = 6  # for slow estimators; the minimum for an interval
 DURATION = 600.0  # s
 FIRST = 7000
 RFID, CAMERA, BOTH = ("odometry", "rfid"), ("odometry", "camera"), ("odometry", "rfid", "camera")
@@ -58,7 +58,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """``runs`` by label; ``points`` of the map."""
+    """``runs`` by label; number of ``points`` in the map."""
 
     runs: dict[str, Attempt]
     points: int

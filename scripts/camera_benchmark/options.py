@@ -1,4 +1,4 @@
-"""What the sections of this benchmark are told."""
+"""Options of this benchmark."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarking.report import Options
 
 @dataclass(frozen=True)
 class CameraOptions(Options):
-    """``duration`` [s] of simulated drives, None for what each section has; ``cache``: folder of rendered drives, None for one
+    """``duration`` [s] of simulated drives, None for each section's default; ``cache``: folder of rendered drives, None for one
     below ``out``."""
 
     duration: float | None = None

@@ -1,4 +1,4 @@
-"""Runs that may fail, and the cells of the tables that compare them."""
+"""Runs that may fail, and the cells of tables that compare them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NOTHING = "–"
 @dataclass(frozen=True)
 class Attempt:
     """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``.
-    ``seen``: how many points the camera's update had in the mean, NaN without any. ``events``: what happened, each text once."""
+    ``seen``: mean number of points in the camera's updates, NaN without any. ``events``: each text once."""
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
@@ -47,7 +47,7 @@ Attempts = Mapping[int, Mapping[str, Attempt]]  # by seed, then by label
 
 
 def attempt(log: Log, config: RunConfig) -> Attempt:
-    """One that fails is a finding: the others go on."""
+    """Run an estimator; a failure is a result."""
     try:
         result = run(log, config)
     except FglocError as error:
@@ -65,7 +65,7 @@ def attempts(log: Log, configs: Mapping[str, RunConfig]) -> dict[str, Attempt]:
 
 
 def failures(report: Report, found: Attempts) -> None:
-    """Tell of the runs that failed."""
+    """Report failed runs."""
     for seed, runs in sorted(found.items()):
         report.failed += [f"{label}, seed {seed}: {one.failure}" for label, one in runs.items() if one.failure]
 
@@ -87,7 +87,7 @@ def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
         if any(np.isfinite(one.position).any() for one in members):
             position, heading = pooled(members)
             cells += [f"{position:.4f}", f"{heading:.3f}"]
-        else:  # an estimator that says nothing before the end
+        else:  # an offline estimator
             cells += [NOTHING, NOTHING]
     finals = together([one.final for one in runs])
     nees, inside = [], []

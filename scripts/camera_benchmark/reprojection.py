@@ -1,4 +1,4 @@
-"""Where known points are seen from poses in space."""
+"""Reprojection of known points from poses in space."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from factors.se2 import Array
 
 
 def reprojection_residuals(found: Trajectory3, log: Log, sensor: str = "sightings") -> Array:
-    """Where the points of the map that a camera names are seen, less where they should be from the trajectory (K, 2) [px].
+    """Measured minus predicted pixels (K, 2) of the map points that a camera names.
 
     ``sensor``: ``sightings`` or ``sightings_right``. Points that the map lacks, and sightings before or after the trajectory, are
-    left out.
+    omitted.
     """
     stream = log.streams[sensor]
     settings = log.rig.camera if sensor == "sightings" else log.rig.camera_right

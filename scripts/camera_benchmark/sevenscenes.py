@@ -1,4 +1,4 @@
-"""Real images: some of 7-Scenes are mapped, others located in that map, with each kind of feature."""
+"""Real images: some of 7-Scenes are mapped, others are located in that map, with each kind of feature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No map: the points that the camera sees are estimated with the poses; identified points in many worlds, images in a few."""
+"""SLAM: points are estimated with the poses; identified points in many worlds, images in a few."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from factorgraph_loc.simulation import preset, simulate
 
 RUNS, DURATION = 50, 120.0  # s; identified points
 RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # s; images
-FIRST, FIRST_RENDERED = 5000, 7000  # the latter are those of the section office
+FIRST, FIRST_RENDERED = 5000, 7000  # the latter as in the section office
 POINTS = 600
 NO_MAP = {"landmarks": "unknown"}
 TARGET = 0.15  # m

@@ -1,4 +1,4 @@
-"""How long it takes; one process at a time, except where images are said to be looked at by several."""
+"""Run times; one process at a time, except for parallel feature detection."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE
 
-POINTS = 3000  # so many that 20 are in sight nearly always
+POINTS = 3000  # enough for 20 in view nearly always
 SEED = 0
-WARM_UP = 20.0  # s of another drive: what is compiled at first use is no part of a step
+WARM_UP = 20.0  # s of another drive, to exclude compilation
 DURATION = 300.0  # s
 FIRST = 6000
 IMAGES, RENDERED = 600, 200
 KNOWN: Mapping[str, Any] = {"rounds_per_second": 10.0, "pixels": {"rate": 10.0}}
-KEYFRAMES: Mapping[str, Any] = {"pixels": {"rate": 2.0}}  # an image for each keyframe
+KEYFRAMES: Mapping[str, Any] = {"pixels": {"rate": 2.0}}  # one image per keyframe
 NO_MAP: Mapping[str, Any] = {"landmarks": "unknown"}
 ALL, SEEN = ("odometry", "rfid", "sightings"), ("odometry", "sightings")
 
 
 @dataclass(frozen=True)
 class Steps:
-    """A run whose steps are timed: what is measured in it, the run itself, and the target [ms], median and 99 %."""
+    """A run whose steps are timed: its measurements, the configuration, and the targets [ms], median and 99 %."""
 
     what: str
     changes: Mapping[str, Any]
@@ -72,7 +72,7 @@ class Chain:
 
 @dataclass(frozen=True)
 class Links:
-    """Seconds that a drive of some ``images`` takes, with a map of some ``points``."""
+    """Seconds for a drive with ``images``, and a map of ``points``."""
 
     images: int
     feature: str
@@ -97,7 +97,7 @@ def section(options: CameraOptions) -> Report:
 
 
 def chain(report: Report, options: CameraOptions) -> None:
-    """From images to poses, and how fast images are made."""
+    """From images to poses, and the rendering speed."""
     job = Chain(options.drives)
     for what, function in (("chain", chained), ("renderer", rendered)):
         found = report.collect(function, [job], [what], workers=1)
@@ -136,7 +136,7 @@ def estimators(report: Report, duration: float) -> None:
 
 
 def chained(job: Chain) -> Links:
-    """From the files of a drive to its poses, nothing of it in a cache."""
+    """From the files of a drive to its poses, without a cache."""
     drive = Drive(FIRST, FIRST, IMAGES / RATE)
     points = map_of(drive, job.folder)
     config = RunConfig("smoother", {"lag": 10.0}, ("odometry", "rfid", "camera"))
@@ -163,7 +163,7 @@ def chained(job: Chain) -> Links:
 
 
 def rendered(_: Chain) -> float:
-    """Images per second, the scene and what is compiled at first use left out."""
+    """Images per second, without the scene and compilation."""
     drive = Drive(FIRST, FIRST, RENDERED / RATE)
     images = iter(film(drive.settings(), drive.seed))
     next(images)
@@ -174,7 +174,7 @@ def rendered(_: Chain) -> float:
 
 @contextmanager
 def spent(owner: object, name: str) -> Iterator[list[float]]:
-    """The seconds of each call of a function of a module or class."""
+    """Record the seconds of each call of a function of a module or class."""
     function, seconds = getattr(owner, name), []
 
     def timed_call(*arguments: Any, **named: Any) -> Any:
@@ -192,7 +192,7 @@ def spent(owner: object, name: str) -> Iterator[list[float]]:
 
 
 def timed(job: Job) -> tuple[np.ndarray, float, str]:
-    """Milliseconds (M,) of each step, how many points an image has in the mean, and of how many the filter knows the depth."""
+    """Milliseconds (M,) of each step, mean number of points per image, and number of points with known depth."""
     run(simulate(preset("office", changed(job.steps, WARM_UP)), SEED + 1), job.steps.config)
     log = simulate(preset("office", changed(job.steps, job.duration)), SEED)
     _, counts = np.unique(log.streams["sightings"].t, return_counts=True)

@@ -1,6 +1,6 @@
-"""A stereo camera carried by hand among known points (real pixels): the camera's model, and the estimators in space.
+"""A hand-held stereo camera among known points (real pixels): the camera model, and the estimators in space.
 
-Needs the recorded data. The noise is what the data set states: nothing is fitted.
+Needs the recorded data. The noise is that stated by the data set, without fitting.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def accuracy(figures: dict[str, float], kind: str) -> list[str]:
 
 
 def draw(results: dict[str, RunResult], log: Log, options: CameraOptions) -> None:
-    """How far off the final positions are over time, and how many points are in view."""
+    """Plot errors of the final positions over time, and the number of points in view."""
     assert log.reference3 is not None
     mpl.use("Agg")
     figure, (above, below) = plt.subplots(

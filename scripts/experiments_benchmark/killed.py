@@ -1,4 +1,4 @@
-"""An experiment that is killed at random moments, and started again until it is done, against one that nothing disturbs."""
+"""An experiment that is killed at random moments and restarted until it is finished, compared with an undisturbed one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def section(options: ExperimentOptions) -> Report:
     report = Report("killed", options)
     file = file_of(options.out, "killed", runs=RUNS, duration=5.0, particles=50)
     calm = options.out / "calm"
-    for _ in range(2):  # the first compiles what is compiled once
+    for _ in range(2):  # the first run compiles
         fresh(file, calm)
         started = time.perf_counter()
         start(file, calm).wait()
@@ -73,13 +73,13 @@ def start(file: Path, folder: Path) -> subprocess.Popen[bytes]:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The bytes of all results but times."""
+    """The bytes of all results except times."""
     files = sorted((folder / "store").glob("??/*/*"))
     return {str(file.relative_to(folder)): file.read_bytes() for file in files if file.name != TIMINGS}
 
 
 def done_again(folder: Path, seen: dict[Path, int]) -> int:
-    """How many results were written anew since the last look; ``seen`` is brought up to date."""
+    """The number of results written again since the last call; updates ``seen``."""
     now = {path: path.stat().st_mtime_ns for path in (folder / "store").glob(f"??/*/{MANIFEST}")}
     count = sum(now.get(path) != stamp for path, stamp in seen.items())
     seen.update(now)

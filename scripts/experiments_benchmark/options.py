@@ -1,4 +1,4 @@
-"""What the sections are told, and the experiments that they run."""
+"""Options of the sections, and their experiments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ExperimentOptions(Options):
 
 
 def file_of(folder: Path, name: str, *, runs: int, duration: float, particles: int) -> Path:
-    """An experiment of a particle filter with as many seeds as ``runs``, in an office, on a drive of ``duration`` [s]."""
+    """An experiment of a particle filter with ``runs`` seeds, in an office, on a drive of ``duration`` [s]."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{name}.toml"
     content = {
@@ -36,12 +36,12 @@ def file_of(folder: Path, name: str, *, runs: int, duration: float, particles: i
 
 
 def many(options: ExperimentOptions) -> Prepared:
-    """The experiment of many runs, as far as it is done."""
+    """The experiment of many runs, in its present state."""
     file = file_of(options.out, "many", runs=options.many_runs, duration=10.0, particles=20)
     return prepare(file, out=options.out / "many")
 
 
 def fresh(file: Path, out: Path) -> Prepared:
-    """The experiment of a file with nothing done."""
+    """The experiment of a file, from scratch."""
     shutil.rmtree(out, ignore_errors=True)
     return prepare(file, out=out)

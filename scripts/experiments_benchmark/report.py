@@ -1,4 +1,4 @@
-"""How long it takes to make the page of many runs, and how large it is."""
+"""Time to make the report of many runs, and its size."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from experiments_benchmark.options import ExperimentOptions, many
 from factorgraph_loc.experiments.experiment import run_experiment
 from factorgraph_loc.experiments.reporting import report_experiment
 
-SECONDS, BYTES = 20.0, 10e6  # at most
+SECONDS, BYTES = 20.0, 10e6  # limits
 
 
 def section(options: ExperimentOptions) -> Report:
     report = Report("report", options)
     prepared = many(options)
     run_experiment(prepared, jobs=options.jobs)
-    prepared = many(options)  # as it is now
+    prepared = many(options)  # with the present states
     started = time.perf_counter()
     page = report_experiment(prepared)
     taken, size = time.perf_counter() - started, page.stat().st_size

@@ -1,4 +1,4 @@
-"""How long it takes to find that a finished experiment is finished."""
+"""Time to detect that an experiment is finished."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much faster two processes are than one, and what a run costs beside its estimator."""
+"""Speedup with two processes, and the overhead of a run."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from benchmarking.report import Report
 from experiments_benchmark.options import ExperimentOptions, file_of, fresh
 from factorgraph_loc.experiments.experiment import run_experiment
 
-RATIO, OVERHEAD = 1.7, 0.15  # at least; at most, in seconds
+RATIO, OVERHEAD = 1.7, 0.15  # least speedup; largest overhead [s]
 
 
 def section(options: ExperimentOptions) -> Report:
     report = Report("speed", options)
     file = file_of(options.out, "short", runs=options.short_runs, duration=30.0, particles=500)
     warm = file_of(options.out, "warm", runs=1, duration=30.0, particles=500)
-    run_experiment(fresh(warm, options.out / "warm"))  # what is compiled once is no cost of a run
+    run_experiment(fresh(warm, options.out / "warm"))  # exclude compilation
     rows, walls = [], []
     for jobs in (1, 2):
         prepared = fresh(file, options.out / f"short-{jobs}")
@@ -28,7 +28,7 @@ def section(options: ExperimentOptions) -> Report:
         ).rows
         walls.append(time.perf_counter() - started)
         own = (table["timing.causal_seconds"] + table["timing.final_seconds"]).to_numpy()
-        whole = np.mean(np.diff(heard)[1:]) * jobs  # from one result to the next, in one process
+        whole = np.mean(np.diff(heard)[1:]) * jobs  # between results, in one process
         rows.append(
             [
                 str(jobs),

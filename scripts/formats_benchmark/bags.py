@@ -1,4 +1,4 @@
-"""ROS bags: a drive of ten minutes there and back, small messages a second, images as megabytes a second, and the memory."""
+"""ROS bags: a drive of ten minutes to a bag and back, small messages per second, images in MB per second, and memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStr
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 KINDS = {"ROS 1": "bag", "ROS 2, mcap": "mcap", "ROS 2, sqlite3": "db3"}
-SECONDS, MESSAGES, MEGABYTES = 10.0, 20_000, 50.0  # at most, and at least a second
+SECONDS, MESSAGES, MEGABYTES = 10.0, 20_000, 50.0  # largest time; least throughputs
 IMAGES, IMAGE_BYTES = 400, 1_000_000
 T0 = 1_700_000_000 * 10**9
 
@@ -124,7 +124,7 @@ def ten_minutes() -> Log:
 
 
 def photographs(folder: Path) -> Log:
-    """Files that begin as JPEG does: nobody looks further."""
+    """Files that begin as JPEG does, which is all that is checked."""
     rng = np.random.default_rng(0)
     files = []
     for i in range(8):
@@ -136,14 +136,14 @@ def photographs(folder: Path) -> Log:
 
 
 def proposed(bag: Path) -> tuple[rosbag.Options, int]:
-    """What is proposed for a bag, and how many messages it has."""
+    """The proposed options for a bag, and its number of messages."""
     with open_bag(bag) as opened:
         count = sum(topic.count for topic in opened.topics.values())
         return parse_model(rosbag.Options, propose(opened).options, bag), count
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, float, Any]:
-    """Seconds by the clock and of the processor, and what came out."""
+    """Wall-clock and processor seconds, and the result."""
     clock, processor = time.perf_counter(), time.process_time()
     result = work()
     return time.perf_counter() - clock, time.process_time() - processor, result

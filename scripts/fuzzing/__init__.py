@@ -1,1 +1,1 @@
-"""What ``scripts/fuzz`` tries: damaged files of every format, calls of ``Localizer`` in any order, runs on logs with faults."""
+"""Cases of ``scripts/fuzz``: damaged files of every format, random calls of ``Localizer``, runs on logs with faults."""

@@ -1,4 +1,4 @@
-"""Values that nobody means: as texts for the cells of any file, and as values of a tree of TOML or JSON."""
+"""Absurd values: as texts for the cells of any file, and as values of a tree of TOML or JSON."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ TEXTS = (
         "[" * 5000,
     ),
 )
-# as they would stand in a file of TOML, JSON or YAML, without quotes
+# as written in a TOML, JSON or YAML file, without quotes
 RAW = (
     *(
         "9" * 5000,
@@ -172,12 +172,12 @@ def pick(rng: Generator, items: Sequence[Any]) -> Any:
 
 
 def text(rng: Generator) -> str:
-    """What might stand in a cell or as a word."""
+    """A random text for a cell or a word."""
     return str(pick(rng, TEXTS))
 
 
 def number(rng: Generator, value: float) -> float:
-    """A number in place of another: near it, of another size, or absurd."""
+    """A replacement for a number: nearby, of another magnitude, or absurd."""
     choice = rng.integers(6)
     if choice == 0:
         return -value
@@ -192,7 +192,7 @@ def number(rng: Generator, value: float) -> float:
 
 
 class Marks:
-    """Texts in the place of raw ones, which no writer of TOML or JSON would write; they are put in when all is written."""
+    """Placeholders for raw texts that no TOML or JSON writer would write; replaced after writing."""
 
     def __init__(self) -> None:
         self._raw: list[str] = []
@@ -208,7 +208,7 @@ class Marks:
 
 
 def value(rng: Generator, old: Any, marks: Marks) -> Any:
-    """A value of a tree in place of ``old``."""
+    """A replacement for the value ``old`` of a tree."""
     choice = rng.integers(8)
     if choice < 3 and isinstance(old, (int, float)) and not isinstance(old, bool):
         new = number(rng, float(old))

@@ -1,4 +1,4 @@
-"""Damage to files that are not text, by their structure: Parquet, arrays, pictures, MATLAB, and the three kinds of ROS bags."""
+"""Damage to binary files by their structure: Parquet, arrays, images, MATLAB, and the three kinds of ROS bags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ INTEGERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 2**31, 2**
 
 
 def raw(content: bytes, rng: Generator) -> bytes:
-    """Bytes that are flipped, cut off, taken out, put in, repeated, or taken for a length."""
+    """Bytes flipped, truncated, removed, inserted, repeated, or interpreted as a length."""
     out = bytearray(content)
     choice, n = rng.integers(8), max(1, len(out))
     at = int(rng.integers(n if rng.random() < 0.7 else min(n, 200)))
@@ -144,7 +144,7 @@ def npz(content: bytes, rng: Generator) -> bytes:
     out = io.BytesIO()
     pick(rng, (np.savez, np.savez_compressed))(out, **arrays)
     written = out.getvalue()
-    if choice == 5:  # a header that tells of another shape, as wide as the right one
+    if choice == 5:  # a header with another shape of the right size
         shape = f"({', '.join(map(str, np.shape(arrays[name])))}"
         told = pick(rng, ("(10000000000000", "(-1", "(1e9", "((((", "([]", "(0", "(2, 2", "('a'")).ljust(len(shape))
         written = written.replace(shape.encode(), told.encode()[: max(len(shape), 1)])
@@ -168,7 +168,7 @@ def matlab(content: bytes, rng: Generator) -> bytes:
 
 
 def picture(content: bytes, rng: Generator) -> bytes:
-    """Of PNG and PGM the header; of others any bytes."""
+    """The header of PNG and PGM; any bytes of other images."""
     if content.startswith(b"\x89PNG"):
         width, height = struct.unpack(">II", content[16:24])
         size = pick(
@@ -189,7 +189,7 @@ def picture(content: bytes, rng: Generator) -> bytes:
 
 
 def sqlite(content: bytes, rng: Generator) -> bytes:
-    """A bag of ROS 2 as a data base, with other rows or tables."""
+    """A ROS 2 bag as an SQLite database with changed rows or tables."""
     with sqlite3.connect(":memory:") as base:
         base.deserialize(content)
         tables = [name for (name,) in base.execute("select name from sqlite_master where type = 'table'")]
@@ -220,7 +220,7 @@ def _change_row(base: sqlite3.Connection, kind: str, rng: Generator) -> None:
 
 
 def messages(suffix: str) -> Callable[[bytes, Generator], bytes]:
-    """Of a bag of that kind: other values in one of its messages, or messages in another order."""
+    """A bag of that kind with changed values in a message, or reordered messages."""
 
     def change(content: bytes, rng: Generator) -> bytes:
         from rosbags import rosbag1, rosbag2  # noqa: PLC0415

@@ -1,7 +1,7 @@
-"""Sequences of calls of ``Localizer`` in any order, and what each of them has to keep.
+"""Random sequences of calls of ``Localizer``, and the invariants of each call.
 
-Sequences are drawn from a :class:`Draw`: a generator of numpy here, hypothesis in the tests. Only ``FglocError`` may be raised;
-estimates are finite with positive covariances; what is asked for, and what was refused, changes nothing.
+Sequences are drawn from a :class:`Draw`: a numpy generator here, hypothesis in the tests. Only ``FglocError`` may be raised;
+estimates are finite with positive definite covariances; queries and refused calls change nothing.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ ABSURD: tuple[Any, ...] = (
 
 
 class Draw(Protocol):
-    """Where choices come from."""
+    """A source of random choices."""
 
     def integer(self, low: int, high: int) -> int:
         """A whole number from ``low`` to ``high``."""
@@ -73,7 +73,7 @@ class Draw(Protocol):
 
 
 class RandomDraw:
-    """Choices of a generator."""
+    """Choices of a numpy generator."""
 
     def __init__(self, rng: Generator) -> None:
         self._rng = rng
@@ -87,7 +87,7 @@ class RandomDraw:
 
 @dataclass(frozen=True)
 class Call:
-    """A method of ``Localizer`` and what it is given."""
+    """A method of ``Localizer`` and its arguments."""
 
     method: str
     given: tuple[Any, ...] = ()
@@ -95,7 +95,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Play:
-    """An estimator and what is called, in this order; ``twice``: once more without what was asked and refused."""
+    """An estimator and a sequence of calls; ``twice``: repeat without queries and refused calls."""
 
     estimator: str
     settings: dict[str, Any]
@@ -106,7 +106,7 @@ class Play:
 
 @dataclass
 class Played:
-    """The last estimate, and the calls that were taken and that change something."""
+    """The last estimate, and the accepted calls that change something."""
 
     estimate: Any = None
     taken: list[Call] = field(default_factory=list)
@@ -114,7 +114,7 @@ class Played:
 
 @functools.cache
 def log() -> Log:
-    """What a robot measures that drives in a small world."""
+    """Measurements of a robot in a small world."""
     return drive(4.0)
 
 
@@ -128,7 +128,7 @@ def one_of(draw: Draw, items: Sequence[Any]) -> Any:
 
 
 def sequence(draw: Draw, longest: int = 40) -> Play:
-    """A sequence of calls, most of which mean something."""
+    """A sequence of calls, most of them meaningful."""
     estimator = one_of(draw, CHOSEN)
     calls: list[Call] = []
     start = log().start
@@ -139,7 +139,7 @@ def sequence(draw: Draw, longest: int = 40) -> Play:
     for _ in range(draw.integer(2, longest)):
         kind = draw.integer(0, 19)
         clock += one_of(draw, (0.0, 0.01, 0.05, 0.1, 0.1, 0.1, 0.3, 1.0, 2.0, -0.1, -0.4, -2.0))
-        if kind < 6:  # as a robot does
+        if kind < 6:  # like a real robot
             near = [m for m in measured() if clock - 0.15 <= m.t <= clock]
             calls += [Call("push", (m,)) for m in near]
         elif kind < 13:
@@ -174,7 +174,7 @@ def _time(draw: Draw, clock: float) -> Any:
 
 
 def _value(draw: Draw, usual: float) -> Any:
-    """Mostly what is usual, else another number, or absurd."""
+    """Mostly ``usual``, else another number, or absurd."""
     choice = draw.integer(0, 9)
     if choice < 6:
         return usual
@@ -343,7 +343,7 @@ def _reads(draw: Draw, clock: float) -> Call:
 
 
 def play(sequence: Play) -> None:
-    """Call all of it; WrongResultError, or whatever else is raised that is no ``FglocError``, for what must not be."""
+    """Execute all calls. Raises WrongResultError, or any exception that is not an ``FglocError``."""
     first = _play(sequence, sequence.calls, ask=True)
     if sequence.twice:
         again = _play(sequence, first.taken, ask=False)

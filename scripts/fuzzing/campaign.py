@@ -1,4 +1,4 @@
-"""Many cases of many kinds, and the table of what came of them."""
+"""Many cases of many kinds, and the table of outcomes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fuzzing.uses import FORMATS
 from fuzzing.verdicts import Verdict
 from fuzzing.workers import Worker
 
-SHARES = {LOCALIZER: 20_000, ESTIMATORS: 5_000}  # beside 100,000 damaged inputs of all formats
+SHARES = {LOCALIZER: 20_000, ESTIMATORS: 5_000}  # relative to 100,000 damaged inputs of all formats
 INPUTS = 100_000
 BATCHES = {LOCALIZER: 20, ESTIMATORS: 5}
-BATCH = 100  # cases of a format that one process tries before it goes on to another
+BATCH = 100  # cases of a format that a process tries before another format
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Batch:
 
 @dataclass
 class Outcomes:
-    """How many cases of each kind ended how, the bad ones, and how long they took in all processes [s]."""
+    """Number of cases by kind and outcome, the bad ones, and the total time in all processes [s]."""
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)
     bad: list[tuple[Case, Verdict, Path]] = field(default_factory=list)
@@ -50,7 +50,7 @@ class Outcomes:
         return f"{kind:14s}{found.total():9d}{found['read']:9d}{found['refused']:9d}{found['bad']:7d}{rate:9.1f}"
 
     def faults(self) -> list[str]:
-        """The bad cases by type and place, most frequent first, each with the command that makes the first of them again."""
+        """The bad cases by type and place, most frequent first, each with the command to repeat its first case."""
         alike: dict[tuple[str, str], list[tuple[Case, Verdict, Path]]] = {}
         for one in self.bad:
             alike.setdefault((one[1].error, one[1].place), []).append(one)
@@ -64,7 +64,7 @@ class Outcomes:
 
 
 def batches(kinds: Sequence[str], shares: dict[str, float], total: int | None) -> Iterator[Batch]:
-    """Batches of all kinds in turn, in proportion to ``shares``; ``total``: cases of all of them, else without end."""
+    """Batches of all kinds in turn, in proportion to ``shares``; ``total``: number of cases, by default unlimited."""
     made = dict.fromkeys(kinds, 0)
     whole = sum(shares[kind] for kind in kinds)
     for _ in itertools.count():
@@ -78,13 +78,13 @@ def batches(kinds: Sequence[str], shares: dict[str, float], total: int | None) -
 
 
 def shares_of(kinds: Sequence[str]) -> dict[str, float]:
-    """How often each kind is tried, in the proportion of a whole campaign."""
+    """The proportion of each kind in a whole campaign."""
     weights = sum(one.weight for one in FORMATS.values())
     return {kind: SHARES[kind] if kind in SHARES else INPUTS * FORMATS[kind].weight / weights for kind in kinds}
 
 
 class Campaign:
-    """Tries batches with ``jobs`` processes below ``root``; what was bad is kept below ``keep``."""
+    """Tries batches with ``jobs`` processes below ``root``; bad cases are kept below ``keep``."""
 
     def __init__(self, root: Path, keep: Path, seed: int, jobs: int) -> None:
         self._root, self._keep, self._seed = root, keep, seed
@@ -93,7 +93,7 @@ class Campaign:
         self.outcomes = Outcomes()
 
     def run(self, work: Iterator[Batch], until: float) -> None:
-        """Until there is no more ``work``, or the clock (``time.monotonic()``) says ``until``."""
+        """Run until ``work`` is exhausted, or the clock (``time.monotonic()``) reaches ``until``."""
         threads = [
             threading.Thread(target=self._work, args=(worker, work, until), daemon=True) for worker in self._workers
         ]
@@ -135,5 +135,5 @@ class Campaign:
 
 
 def _no_pipes(folder: str, names: list[str]) -> list[str]:
-    """Named pipes, which nothing can copy."""
+    """Named pipes, which cannot be copied."""
     return [name for name in names if (Path(folder) / name).is_fifo()]

@@ -1,4 +1,4 @@
-"""A case by its kind and number, which is the same whenever it is made."""
+"""A reproducible case, by its kind and number."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Case:
 
 
 class Bench:
-    """Where cases are tried: seeds are kept below ``root``, the files of a case lie in ``folder``."""
+    """The place where cases are tried: seeds are stored below ``root``, the files of a case in ``folder``."""
 
     def __init__(self, root: Path, name: str = "case") -> None:
         self.folder = root / name
@@ -48,7 +48,7 @@ class Bench:
         os.environ["FGLOC_CACHE"] = str(root / f"{name}-cache")
 
     def prepare(self, kind: str) -> None:
-        """Make the seed, and try it as it is: it has to be read. What takes long the first time takes it now."""
+        """Make the seed, and check that it can be read undamaged, which also compiles."""
         if kind in self._ready:
             return
         if not self._ready:
@@ -67,7 +67,7 @@ class Bench:
         self._ready.add(kind)
 
     def try_case(self, case: Case, *, tell: bool = False) -> Verdict:
-        """What comes of a case; its files stay in ``folder`` until the next one. ``tell``: print the traceback of what is bad."""
+        """The verdict on a case; its files stay in ``folder`` until the next one. ``tell``: print the traceback of bad cases."""
         rng = case.generator()
         return judge(lambda: quietly(self._call(case.kind, rng)), tell=tell)
 

@@ -1,4 +1,4 @@
-"""A folder of files with some damage: to its bytes, to what its files say, or to the files themselves."""
+"""Damage to a folder of files: to bytes, to contents, or to the files themselves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LARGEST = 20_000_000  # bytes of a damaged file
 
 @dataclass(frozen=True)
 class Special:
-    """What stands in the place of a file: ``kind`` is missing, folder, link, loop or fifo."""
+    """A replacement for a file: ``kind`` is missing, folder, link, loop or fifo."""
 
     kind: str
     target: str = ""
@@ -46,13 +46,13 @@ BY_SUFFIX: dict[str, tuple[Damage, ...]] = {
     ".mcap": (binaries.messages(".mcap"),),
     ".db3": (binaries.sqlite, binaries.messages(".db3")),
 }
-# these open the file, with libraries that end the process, or panic, at some damaged ones
+# libraries that open these may end the process, or panic, for damaged files
 OF_WHOLE_FILES = (binaries.matlab, binaries.parquet)
 Content = bytes | Special
 
 
 def damaged(files: Mapping[str, bytes], rng: Generator) -> dict[str, Content]:
-    """What is to be written in place of some of ``files``: mostly of one of them."""
+    """Replacements for some of ``files``, mostly for one of them."""
     out: dict[str, Content] = {}
     for _ in range(int(pick(rng, (1, 1, 1, 1, 1, 1, 2, 2, 3, 6)))):
         name = pick(rng, sorted(files))
@@ -71,13 +71,13 @@ def damaged(files: Mapping[str, bytes], rng: Generator) -> dict[str, Content]:
             continue
         try:
             out[name] = change(old, rng)[:LARGEST]
-        except Exception:  # what is damaged already, or a value that the format's writer refuses
+        except Exception:  # damaged already, or a value that the format's writer refuses
             out[name] = binaries.raw(old, rng)
     return out
 
 
 def write(folder: Path, files: Mapping[str, Content]) -> None:
-    """Write files into ``folder``, which is made anew."""
+    """Write files into ``folder``, which is recreated."""
     shutil.rmtree(folder, ignore_errors=True)
     for name, content in files.items():
         path = folder / name
@@ -95,5 +95,5 @@ def write(folder: Path, files: Mapping[str, Content]) -> None:
 
 
 def read(folder: Path) -> dict[str, bytes]:
-    """All files below ``folder`` by their path from there."""
+    """All files below ``folder`` by relative path."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -1,4 +1,4 @@
-"""Small files of other people's formats, which the fuzzer damages: each function writes into a folder that is empty."""
+"""Small files of foreign formats for the fuzzer: each function writes into an empty folder."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _wheels() -> str:
 
 
 def tables(folder: Path) -> None:
-    """A manifest with columns of every sensor, mapped."""
+    """A manifest with mapped columns of every sensor."""
     _mapped(folder, "itemtest", INVENTORIES + OTHERS)
     (folder / "hall.world.toml").write_text('name = "hall"' + WORLD_TABLES)
     (folder / "tags.csv").write_text(TAGS)

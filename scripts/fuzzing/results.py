@@ -1,4 +1,4 @@
-"""What every answer of a ``Localizer`` has to be: finite, with positive covariances."""
+"""Invariants of the answers of a ``Localizer``: finite, with positive definite covariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs of all estimators on short logs with faults: what a sensor, a clock, a map or a rig gets wrong, as it stands in files."""
+"""Runs of all estimators on short logs with faults of sensors, clocks, maps or rigs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PRIORS = (None, None, None, "reference", "log", "unknown", "0,0,0", "10,6", "1e5
 
 
 def run_with_faults(files: Mapping[str, bytes], folder: Path, rng: Generator) -> None:
-    """Put faults into a log, run an estimator on it, and look at what it gives."""
+    """Put faults into a log, run an estimator on it, and check the results."""
     content = dict(files)
     for _ in range(int(pick(rng, (1, 1, 2, 2, 3)))):
         pick(rng, FAULTS)(content, rng)
@@ -64,7 +64,7 @@ def check(run: fgloc.api.Run) -> None:
 
 
 def _check_numbers(tree: Any, where: str) -> None:
-    """What stands in metrics.json is a number, or nothing."""
+    """Check that metrics.json contains numbers or null."""
     if isinstance(tree, Mapping):
         for key, value in tree.items():
             _check_numbers(value, f"{where}.{key}")
@@ -76,7 +76,7 @@ def _check_numbers(tree: Any, where: str) -> None:
 
 
 def _on_table(change: Callable[[Table, Generator], None]) -> Callable[[Files, Generator], None]:
-    """A fault of the rows of one of the sensors' tables, most often the odometry's."""
+    """A fault in the rows of one of the sensors' tables, most often the odometry's."""
 
     def on(files: Files, rng: Generator) -> None:
         name = pick(
@@ -93,7 +93,7 @@ def _on_table(change: Callable[[Table, Generator], None]) -> Callable[[Files, Ge
 def _cell(row: list[str], j: int, change: Callable[[float], float]) -> None:
     try:
         row[j] = repr(change(float(row[j])))
-    except ValueError:  # a name, or nothing
+    except ValueError:  # a name, or empty
         return
 
 
@@ -102,14 +102,14 @@ def _column(rows: Table, rng: Generator) -> int:
 
 
 def glitch(rows: Table, rng: Generator) -> None:
-    """One value, or some, of another size."""
+    """One or several values of another magnitude."""
     j, factor = _column(rows, rng), 10.0 ** int(rng.integers(-12, 9))
     for i in rng.integers(len(rows), size=int(pick(rng, (1, 1, 1, 3, 10)))).tolist():
         _cell(rows[i], j, lambda v: pick(rng, (v * factor, factor, -factor, v + factor, 0.0)))
 
 
 def scaled(rows: Table, rng: Generator) -> None:
-    """A column in another unit, or turned around."""
+    """A column in another unit, or with another sign."""
     j, factor = _column(rows, rng), float(pick(rng, (-1.0, 0.0, 1e-9, 1e-3, 10.0, 57.3, 1000.0, 1e-300)))
     for row in rows:
         _cell(row, j, lambda v: v * factor)
@@ -175,7 +175,7 @@ def _set(tree: Any, path: tuple[Any, ...], value: float) -> None:
 
 
 def of_rig(files: Files, rng: Generator) -> None:
-    """Noise that is tiny or huge, other mountings, constants that are uncertain."""
+    """Tiny or huge noise, other mountings, uncertain constants."""
     tree = tomllib.loads(files["sim.rig.toml"].decode())
     leaves = _leaves(tree)
     for _ in range(int(pick(rng, (1, 2, 4)))):
@@ -186,7 +186,7 @@ def of_rig(files: Files, rng: Generator) -> None:
 
 
 def of_map(files: Files, rng: Generator) -> None:
-    """Landmarks at one place, at the robot's, far away or under other names; no map at all."""
+    """Landmarks at one position, at the robot's, far away or with other names; no map at all."""
     tree, choice = tomllib.loads(files["sim.world.toml"].decode()), rng.integers(6)
     marks = tree.get("landmarks", {})
     start = tomllib.loads(files["run.toml"].decode()).get("start", {"x": 0.0, "y": 0.0})
@@ -208,7 +208,7 @@ def of_map(files: Files, rng: Generator) -> None:
 
 
 def of_tags(files: Files, rng: Generator) -> None:
-    """Tags at one place or far away."""
+    """Tags at one position or far away."""
     head, *rows = [line.split(",") for line in files["sim.tags.csv"].decode().splitlines()]
     factor, same = float(pick(rng, (0.0, 1e-3, 10.0, 1e4))), rng.random() < 0.5
     for row in rows:
@@ -217,7 +217,7 @@ def of_tags(files: Files, rng: Generator) -> None:
 
 
 def of_files(files: Files, rng: Generator) -> None:
-    """A sensor, or the reference, that is not there."""
+    """A missing sensor or reference."""
     files.pop(pick(rng, (*TABLES[1:], "reference.tum")), None)
 
 

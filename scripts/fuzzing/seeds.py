@@ -1,4 +1,4 @@
-"""Small files of our own formats, which the fuzzer damages: each function writes into a folder that is empty."""
+"""Small files of our own formats for the fuzzer: each function writes into an empty folder."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def parquet(folder: Path) -> None:
 
 
 def images(folder: Path) -> None:
-    """A log with two pictures, which need not show anything."""
+    """A log with two images of any content."""
     csv(folder)
     _camera_rig(folder / "sim.rig.toml")
     (folder / "camera").mkdir()
@@ -151,14 +151,14 @@ def simulation(folder: Path) -> None:
 
 
 def result(folder: Path) -> None:
-    """A log, and what a run on it has left behind."""
+    """A log, and the results of a run on it."""
     fgloc.write_native(drive(2.0), folder / "log")
     fgloc.run(str(folder / "log"), "ekf", out=folder / "run")
     shutil.rmtree(folder / "run" / "plots", ignore_errors=True)
 
 
 def experiment(folder: Path) -> None:
-    """The file of an experiment, of which nothing was run."""
+    """An experiment file without any runs."""
     fgloc.write_native(drive(2.0), folder / "log")
     (folder / "e.toml").write_text(EXPERIMENT)
 

@@ -1,4 +1,4 @@
-"""Damage to files of text by their structure: trees of TOML and JSON, tables of cells, and words of any text."""
+"""Damage to text files by their structure: trees of TOML and JSON, tables of cells, and words of any text."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _change(tree: Any, rng: Generator, marks: Marks) -> None:
 
 
 def _plain(tree: Any) -> Any:
-    """What TOML can say: no nulls, keys of text."""
+    """Restrict to TOML: no nulls, text keys."""
     if isinstance(tree, dict):
         return {str(key): _plain(item) for key, item in tree.items() if item is not None}
     if isinstance(tree, list):
@@ -77,7 +77,7 @@ def _plain(tree: Any) -> Any:
 
 
 def words(content: bytes, rng: Generator) -> bytes:
-    """Another word in the place of one, or a line more or less; of any text."""
+    """A replaced word, or a line added or removed, in any text."""
     written = content.decode("utf-8", "surrogateescape")
     found = list(WORD.finditer(written))
     if rng.random() < 0.25 or not found:
@@ -96,7 +96,7 @@ def words(content: bytes, rng: Generator) -> bytes:
 
 
 def table(content: bytes, rng: Generator) -> bytes:
-    """Cells, rows and columns of a table; its separator is the commonest one."""
+    """Cells, rows and columns of a table with its most frequent separator."""
     written = content.decode("utf-8", "surrogateescape")
     counts = {mark: written.count(mark) for mark in SEPARATORS}
     mark = max(SEPARATORS, key=lambda m: counts[m]) if any(counts.values()) else " "

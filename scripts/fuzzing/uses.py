@@ -1,4 +1,4 @@
-"""What is done with the files of each format: they are read, and what was read is looked at, written and shown."""
+"""Uses of the files of each format: they are read, inspected, written and shown."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ LONGEST_WARNING = 600  # letters
 
 @dataclass(frozen=True)
 class Format:
-    """``make`` writes its seed; ``use`` reads what is in a folder. ``damaged``: what the paths of files that are damaged begin or
-    end with, by default all are. ``weight``: how often it is tried."""
+    """``make`` writes the seed; ``use`` reads a folder. ``damaged``: prefixes or suffixes of the paths that are damaged, by
+    default all. ``weight``: relative frequency."""
 
     make: Callable[[Path], None]
     use: Use
@@ -45,7 +45,7 @@ class Format:
 
 
 def a_log(path: str, folder: Path, rng: Generator, *, reader: str | None = None, **options: object) -> None:
-    """Read a log, and do one of the things that are done with logs."""
+    """Read a log, and apply a random operation for logs."""
     for log in fgloc.load(str(folder / path), reader=reader, options=options):
         check_log(log)
         look_at(log, folder / "made", rng)
@@ -83,7 +83,7 @@ def _to_foxglove(log: Log, out: Path, _rng: Generator) -> None:
 
 
 def _to_rerun(log: Log, out: Path, rng: Generator) -> None:
-    if rng.random() < 0.2:  # it takes long
+    if rng.random() < 0.2:  # slow
         write_rrd(log, [], out.with_suffix(".rrd"))
 
 
@@ -108,7 +108,7 @@ LOOKS = (_inspect, _convert, _to_bag, _to_foxglove, _to_rerun, _to_kitti, _see_i
 
 
 def warm_up(folder: Path) -> None:
-    """What takes long the first time in a process: imports, and compiled functions."""
+    """Imports and compilation, which take long once per process."""
     (log,) = fgloc.load(str(folder))
     write_rrd(log, [], folder / "made.rrd")
     fgloc.run(log, "dead_reckoning")
@@ -193,7 +193,7 @@ FORMATS: dict[str, Format] = {
 
 
 class Inputs:
-    """The seeds of formats, made once below ``root``, and the folder in which cases are tried."""
+    """The seeds of formats, made once below ``root``, and the folder for cases."""
 
     def __init__(self, root: Path, scratch: Path) -> None:
         self._root, self._scratch = root, scratch
@@ -219,7 +219,7 @@ class Inputs:
 
 
 def quietly(call: Callable[[], None]) -> None:
-    """Without the warnings of numpy, of which absurd numbers make many."""
+    """Suppress numpy's warnings about absurd numbers."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         call()

@@ -1,4 +1,4 @@
-"""What came of a case: it was read, refused in one short line, or it went wrong."""
+"""Verdict on a case: read, refused in one short line, or bad."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ PACKAGES = ("factorgraph_loc", "factors", "scripts")
 
 
 class WrongResultError(AssertionError):
-    """A result that is not what was promised: not finite, not positive, changed by a question."""
+    """A result that is not finite, not positive definite, or changed by a query."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``error``: the type of what was raised, at ``place``, with ``message``; for a case that was read all are empty."""
+    """``error``: type of the exception, raised at ``place`` with ``message``; empty if the case was read."""
 
     outcome: Literal["read", "refused", "bad"]
     error: str = ""
@@ -32,7 +32,7 @@ class Verdict:
 
 
 def fault_of(message: str, longest: int = LONGEST) -> str:
-    """What keeps a message from being one short line; nothing if it is one."""
+    """Why a message is not one short line; empty if it is."""
     if not message:
         return "empty message"
     if "\n" in message:
@@ -43,7 +43,7 @@ def fault_of(message: str, longest: int = LONGEST) -> str:
 
 
 def judge(call: Callable[[], object], *, tell: bool = False) -> Verdict:
-    """What a call comes to; ``tell``: print the traceback of what went wrong."""
+    """The verdict on a call; ``tell``: print the traceback of bad cases."""
     try:
         call()
     except FglocError as error:
@@ -52,7 +52,7 @@ def judge(call: Callable[[], object], *, tell: bool = False) -> Verdict:
         return Verdict("refused", type(error).__name__, place_of(error), str(error))
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # polars' PanicException is no Exception, and SystemExit is none either
+    except BaseException as error:  # polars' PanicException and SystemExit are not subclasses of Exception
         if tell:
             traceback.print_exc()
         return Verdict("bad", type(error).__name__, place_of(error), str(error)[:300])
@@ -60,7 +60,7 @@ def judge(call: Callable[[], object], *, tell: bool = False) -> Verdict:
 
 
 def place_of(error: BaseException) -> str:
-    """The innermost line of the project from which it was raised."""
+    """The innermost line of the project in the traceback."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         parts = Path(frame.filename).parts
         own = [i for i, part in enumerate(parts) if part in PACKAGES]

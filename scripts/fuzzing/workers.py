@@ -1,4 +1,4 @@
-"""Processes that try cases one after the other, with limits of memory and time; one that ends or hangs is started anew."""
+"""Processes that try cases one after the other, with limits of memory and time; restarted if one ends or hangs."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from typing import IO
 
 from fuzzing.verdicts import Verdict
 
-SECONDS = 8.0  # of the processor, or of waiting for something that does not come
-AT_MOST = 60.0  # s by the clock, on a machine that does other things
-STARTING = 900.0  # s, for a process that imports, compiles and makes seeds
-MEMORY = 2 * 10**9  # bytes, beside what a process has when it is ready
+SECONDS = 8.0  # of processor time, or of blocking
+AT_MOST = 60.0  # s of wall-clock time, on a busy machine
+STARTING = 900.0  # s, for imports, compilation and seeds
+MEMORY = 2 * 10**9  # bytes, in addition to those of a process that is ready
 LIBRARIES = ("OPENBLAS", "OMP", "NUMBA", "RAYON")
 ONE_THREAD = {"POLARS_MAX_THREADS": "1"} | {f"{name}_NUM_THREADS": "1" for name in LIBRARIES}
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Worker:
-    """A process that tries cases below ``root``; ``name`` tells it from others there. ``command``: what is run, as :func:`_serve`
-    speaks; ``seconds``: that a case may take."""
+    """A process that tries cases below ``root``; ``name`` identifies it there. ``command``: the process, which follows the
+    protocol of :func:`_serve`; ``seconds``: limit for a case."""
 
     def __init__(
         self, root: Path, name: str = "w0", command: Sequence[str] = ("-m", "fuzzing.workers"), seconds: float = SECONDS
@@ -41,7 +41,7 @@ class Worker:
         self._said = root / f"{name}.stderr"
 
     def try_cases(self, kind: str, seed: int, first: int, count: int) -> Iterator[tuple[int, Verdict]]:
-        """The verdict of each case by its number. The files of a case are there until the next is asked for."""
+        """The verdict of each case by number. The files of a case exist until the next is requested."""
         number = first
         while number < first + count:
             process = self._running()
@@ -89,10 +89,10 @@ class Worker:
             self._process.stdin.write(json.dumps(what) + "\n")
             self._process.stdin.flush()
         except BrokenPipeError:
-            pass  # it has ended: waiting for its answer tells
+            pass  # it has ended, as waiting for its answer shows
 
     def _wait(self, process: subprocess.Popen[str], seconds: float) -> str | None:
-        """Wait for a line; None when it has come, else what is wrong."""
+        """Wait for a line; None once it has arrived, else the failure."""
         assert process.stdout is not None
         began, used = time.monotonic(), _processor_seconds(process.pid)
         while True:
@@ -108,7 +108,7 @@ class Worker:
                 or waited > max(AT_MOST, seconds)
                 or (waited > seconds and worked < 0.1 * waited and _sleeps(process.pid))
             ):
-                process.send_signal(signal.SIGUSR1)  # it says where it is
+                process.send_signal(signal.SIGUSR1)  # it prints its traceback
                 time.sleep(0.3)
                 return f"hangs for {waited:.0f} s"
 
@@ -116,7 +116,7 @@ class Worker:
         return self._said.read_text(errors="replace")[:3000] if self._said.exists() else ""
 
     def _place(self) -> str:
-        """The innermost line of the project in what it said."""
+        """The innermost line of the project in its output."""
         found = re.findall(r'File "[^"]*?((?:factorgraph_loc|factors)/[^"]+)", line (\d+) in (\w+)', self._last_words())
         return "{}:{} {}".format(*found[0]) if found else "outside of the project"
 
@@ -137,14 +137,14 @@ def _sleeps(pid: int) -> bool:
 
 
 def _limit_memory() -> None:
-    """From now on, that much more than there is."""
+    """Limit further memory to this amount."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
 
 
 def _serve(root: Path, name: str, asked: IO[str], answers: IO[str]) -> None:
-    """Try what is asked for: a line with a case, and one when its answer is awaited."""
+    """Serve requests: one line per case, and one line for each answer."""
     from fuzzing.cases import Bench, Case  # noqa: PLC0415
 
     bench = Bench(root, name)
@@ -156,7 +156,7 @@ def _serve(root: Path, name: str, asked: IO[str], answers: IO[str]) -> None:
             resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             bench.prepare(case.kind)
             ready.add(case.kind)
-        _limit_memory()  # of this case: what libraries keep of thousands before is none of it
+        _limit_memory()  # per case, without what libraries keep from previous ones
         print("ready", file=answers, flush=True)
         os.ftruncate(2, 0)
         asked.readline()
@@ -166,7 +166,7 @@ def _serve(root: Path, name: str, asked: IO[str], answers: IO[str]) -> None:
 
 if __name__ == "__main__":
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # output of libraries is not an answer
     faulthandler.enable(all_threads=False)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _serve(Path(sys.argv[1]), sys.argv[2], sys.stdin, answers)

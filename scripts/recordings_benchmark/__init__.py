@@ -1,1 +1,1 @@
-"""Recordings of other people: which, how they become logs, and what the estimators make of them."""
+"""Public recordings: list, conversion to logs, and results of the estimators."""

@@ -1,4 +1,4 @@
-"""The recordings by name: where their files are, under which licence, and what they become."""
+"""The list of recordings: origin, licence, and conversion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RAW = "https://raw.githubusercontent.com"
 
 @dataclass(frozen=True)
 class File:
-    """A file of a public repository at a commit; ``name``: what it is called here."""
+    """A file of a public repository at a commit; ``name``: its local name."""
 
     repository: str
     commit: str
@@ -24,9 +24,9 @@ class File:
 
 @dataclass(frozen=True)
 class Recording:
-    """``kind``: how it is read, a function of :mod:`recordings_benchmark.prepare`, with its ``options``. ``prior``: where a log
-    without a start begins; ``seconds``: how much of a long one is taken. ``odometry``, ``others``: where it is from, and the other
-    sensors, in the words of the table."""
+    """``kind``: conversion function of :mod:`recordings_benchmark.prepare`, with its ``options``. ``prior``: of logs without a
+    start; ``seconds``: maximum duration. ``odometry``, ``others``: origin of the odometry, and the other sensors, as texts for
+    the table."""
 
     name: str
     title: str
@@ -57,7 +57,7 @@ def listed() -> tuple[Recording, ...]:
 
 
 def commands(recordings: Sequence[Recording]) -> list[str]:
-    """What fetches the files of recordings into the present folder."""
+    """Commands to download the files into the present folder."""
     files = [file for recording in recordings for file in recording.files]
     return [f"curl -L -o {file.name} {RAW}/{file.repository}/{file.commit}/{file.path}" for file in files]
 

@@ -1,4 +1,4 @@
-"""How the files of recordings become logs."""
+"""Conversion of recordings to logs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from factors.se2 import Array
 from recordings_benchmark.listed import Recording
 
 ODOMETRY_SEED = 1
-# the trolley's anchors [m], and where its tag 0 sits; its body frame hangs upside down, so that y is to the right
+# the trolley's anchors [m], and position of its tag 0; its body frame is upside down, so that y is to the right
 ANCHORS = (
     (-3.4203, 3.0053),
     (0.0016, 3.0110),
@@ -41,11 +41,11 @@ ANCHORS = (
     (-3.4858, -0.0098),
 )
 TAG = (-0.0689, 0.1423)
-TAGS, THINNED = 3, 10  # ranges of so many tags in a row; one row of so many is taken, which leaves 10 Hz
+TAGS, THINNED = 3, 10  # ranges per row; decimation factor, to 10 Hz
 
 
 def prepare(recording: Recording, folder: Path, out: Path) -> Log:
-    """The log of a recording whose files lie in ``folder``; it is written to ``out`` too. InputError says what is wrong."""
+    """The log of a recording with files in ``folder``, also written to ``out``. Raises InputError for damaged files."""
     paths = [folder / file.name for file in recording.files]
     if missing := [path for path in paths if not path.is_file()]:
         raise InputError(f"{missing[0]}: is missing, scripts/bench_recordings --fetch prints how to fetch it")
@@ -57,7 +57,7 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
     target = out / recording.name
     if not target.exists():
         write_log(log, target)
-    # what is run is what was written
+    # use what was written
     return load(target)[0]
 
 
@@ -72,7 +72,7 @@ def _bag(recording: Recording, path: Path, out: Path) -> Log:
 
 
 def _librsf(recording: Recording, paths: list[Path]) -> Log:
-    """Lines of libRSF's text format: a name, a stamp and numbers."""
+    """libRSF's text format: lines of a name, a stamp and numbers."""
     rows: dict[str, list[list[float]]] = {}
     for path in paths:
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -82,12 +82,12 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
     landmarks: dict[str, Landmark] = {}
     streams: dict[str, Stream] = {}
     if "odom2diff" in tables:
-        # as libRSF's own factor takes them (OdometryFactor2DDifferential.h): left before right, and half of the track
+        # as in libRSF's own factor (OdometryFactor2DDifferential.h): left before right, and half of the track
         t, left, right, _, half = tables["odom2diff"].T[:5]
         streams["odometry"] = VelocityStream(t, (left + right) / 2.0, (right - left) / (2.0 * half))
     else:
         t, *velocity = tables["odom2"].T[:4]
-        # a row tells the motion up to its stamp
+        # a row contains the motion up to its stamp
         moves = np.stack(velocity, axis=-1) * np.diff(t, prepend=t[0])[:, None]
         streams["odometry"] = IncrementStream(t, *np.ascontiguousarray(moves.T))
     if "range2" in tables:
@@ -103,7 +103,7 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _trajectory(recording: Recording, paths: list[Path]) -> Log:
-    """A reference alone: the odometry is simulated, or what moves between the poses of another program."""
+    """A reference only: the odometry is simulated, or the motion between the poses of another program."""
     form, axis = recording.options["format"], "xyz".index(recording.options.get("axis", "x"))
     if form == "kitti":
         truth = _kitti(paths[0], paths[1])
@@ -127,8 +127,8 @@ def _kitti(path: Path, times: Path) -> Trajectory:
 
 
 def _stamped(path: Path, form: str, axis: int) -> Trajectory:
-    """Poses of TUM (t x y z qx qy qz qw) or EuRoC (ns, x, y, z, qw, qx, qy, qz, ...), seen from above; ``axis``: whose direction
-    is the heading. A camera, or the IMU of EuRoC, looks along z."""
+    """Poses of TUM (t x y z qx qy qz qw) or EuRoC (ns, x, y, z, qw, qx, qy, qz, ...), seen from above; ``axis``: the one whose
+    direction is the heading. A camera, or the IMU of EuRoC, looks along z."""
     if form == "tum":
         t, x, y, _, qx, qy, qz, qw = np.loadtxt(path, comments="#", usecols=range(8)).T
     else:
@@ -144,7 +144,7 @@ def _stamped(path: Path, form: str, axis: int) -> Trajectory:
 
 
 def _trolley(recording: Recording, paths: list[Path]) -> Log:
-    """Ranges of one tag of three, and motion capture, by which wheels are simulated."""
+    """Ranges of one tag of three, and motion capture, from which wheel odometry is simulated."""
     capture, ranges = (_dated(path) for path in paths)
     t0 = float(max(capture[0, 0], ranges[0, 0]))
     x, y, qw, qx, qy, qz = capture[:, (1, 2, 4, 5, 6, 7)].T
@@ -167,7 +167,7 @@ def _trolley(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _dated(path: Path) -> Array:
-    """Rows of a date and numbers, as seconds of the day and numbers; what is no number is NaN."""
+    """Rows of a date and numbers, as seconds of the day and numbers; others are NaN."""
     out = []
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.reader(file):

@@ -1,4 +1,4 @@
-"""What the estimators make of the recordings: position RMSE of causal and final estimates, or in one line why there is none."""
+"""Results of the estimators on the recordings: position RMSE of causal and final estimates, or why there is none."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Found:
-    """``scores`` by estimator, or in their place a line of why there are none; ``seconds`` of log."""
+    """``scores`` by estimator, or a line with the reason for their absence; ``seconds`` of log."""
 
     scores: dict[str, dict[str, Any] | str]
     seconds: float
 
 
 def section(options: Options) -> Report:
-    """The table, and the lines of what was not scored."""
+    """The table, and the reasons for missing scores."""
     assert options.data_root is not None
     report = Report("recordings", options)
     logs = options.out / "logs"
@@ -44,7 +44,7 @@ def section(options: Options) -> Report:
 
 
 def tell(report: Report, results: Sequence[tuple[Recording, Found]]) -> None:
-    """Write the table of results, and below it why there is none."""
+    """Write the table of results, and the reasons below it."""
     rows, notes = [], []
     for recording, result in results:
         told = {name: one for name, one in result.scores.items() if isinstance(one, dict)}

@@ -1,4 +1,4 @@
-"""Real reads: each run localized with what the other run taught."""
+"""Real reads: each run localized with a model learnt from the other run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 
 RUNS = (13, 16)
 SEEDS = 5
-LEARNING_SEED = 100  # of the odometry of the log that is learnt from
+LEARNING_SEED = 100  # of the odometry of the log used for learning
 PLACES = Path(__file__).parents[2] / "datasets" / "rfid-aisle-places.rig.toml"
 DETECTIONS = ("odometry", "rfid")
 SENSORS = {"detections": DETECTIONS, "+ RSSI": (*DETECTIONS, "rssi"), "+ phase": (*DETECTIONS, "phase")}
@@ -32,7 +32,7 @@ RUN = (
     ("smoother", "+ RSSI"),
 )
 SHIPPED = ", shipped rig"
-START_SPAN = 90.0  # s of a run that tell how an unknown start went
+START_SPAN = 90.0  # s of a run for evaluating an unknown start
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Test:
 
 @dataclass(frozen=True)
 class Tested:
-    """``runs``: errors by estimator and sensors; ``starts``: seconds of each estimator until an unknown start is right."""
+    """``runs``: errors by estimator and sensors; ``starts``: seconds of each estimator until an unknown start is correct."""
 
     runs: dict[tuple[str, str], RunErrors]
     starts: dict[str, float]
@@ -118,7 +118,7 @@ def aisle(number: int, seed: int, data_root: Path | None) -> Log:
 
 
 def learnt_on(job: Learning) -> Rig:
-    """The rig that one recording teaches, from antennas as surveyed; the tempering of the shipped rig, set by hand."""
+    """The rig learnt from one recording with surveyed antennas, and with the tempering of the shipped rig."""
     log = aisle(job.run, LEARNING_SEED, job.data_root)
     assert log.rig.rfid is not None
     job.out.mkdir(parents=True, exist_ok=True)
@@ -145,7 +145,7 @@ def tested(job: Test) -> Tested:
 
 
 def seconds_to_right(log: Log, estimator: str, seed: int) -> float:
-    """From the first scan until the estimate stays within half a metre; whatever its status."""
+    """Seconds from the first scan until the estimate stays within half a metre, whatever its status."""
     start = cut(log, 0.0, START_SPAN)
     result = run(start, RunConfig(estimator, sensors=DETECTIONS, prior="unknown", seed=seed))
     errors = series(Trajectory(result.t, result.poses, result.covariances), start)

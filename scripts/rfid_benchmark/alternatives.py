@@ -1,4 +1,4 @@
-"""The compressed factor beside two others in the same batch problem: same logs, same guesses, same solver."""
+"""The compressed factor compared with two others in the same batch problem: same logs, initial values and solver."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CELL = 0.1  # m, of the sums over the antenna's field
 
 
 class StackedFactor:
-    """One row sqrt(2 nll) for each antenna and tag, with its own derivative; numerically, as the models give it only in sum."""
+    """One row sqrt(2 nll) for each antenna and tag, with numerical derivatives."""
 
     def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts) -> None:
         self._likelihood, self._looks = likelihood, looks
@@ -64,8 +64,8 @@ class StackedFactor:
 
 
 class GaussianFactor:
-    """Each detection as a measured place of its tag in the antenna's frame: mean and covariance of the field of detection, by
-    moment matching. What was not read says nothing."""
+    """Each detection as a measured position of its tag in the antenna's frame, with mean and covariance of the detection field by
+    moment matching. Missed reads are ignored."""
 
     def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts, fields: Sequence[tuple[Array, Array]]) -> None:
         rows, tags = np.nonzero(looks.hits)
@@ -94,7 +94,7 @@ class GaussianFactor:
 
 
 def field_moments(likelihood: RfidLikelihood, antenna: int) -> tuple[Array, Array]:
-    """Mean (2,) and covariance (2, 2) of where a tag is, in the antenna's frame, that it reads, if it may be anywhere."""
+    """Mean (2,) and covariance (2, 2) of the position of a read tag in the antenna's frame, for a uniform prior."""
     mounted, model = likelihood.model.antennas[antenna], likelihood.model
     reach = model.models[mounted.model].reach
     axis = np.arange(-reach, reach, CELL)
@@ -129,7 +129,7 @@ class Solved:
 
 
 def solve_all(seed: int) -> dict[str, Solved]:
-    """Each alternative on one log, keyframes at the scans, from the causal estimates of the smoother as the guess."""
+    """Each alternative on one log, with keyframes at the scans, and the smoother's causal estimates as initial values."""
     log = simulate(preset("office", {"drive": {"duration": DURATION}}), seed)
     causal = run(log, RunConfig("smoother", {"smooth": False})).causal()
     assert causal is not None
@@ -137,7 +137,7 @@ def solve_all(seed: int) -> dict[str, Solved]:
     assert tags.likelihood is not None
     found = {}
     for label, make in makers(tags.likelihood).items():
-        for warm in (True, False):  # what is compiled at first use is no part of the time
+        for warm in (True, False):  # exclude compilation from the time
             problem, values, t = problem_of(log, causal, tags, make)
             started = time.perf_counter()
             solution = problem.solve(values, 1 if warm else 100)
@@ -148,7 +148,7 @@ def solve_all(seed: int) -> dict[str, Solved]:
 
 
 def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tuple[Problem, Values, Array]:
-    """The whole log as one problem, a guess of all its variables, and the times of the keyframes."""
+    """The whole log as one problem, initial values of all variables, and the times of the keyframes."""
     prior, _ = resolve_prior(log, "log")
     assert prior is not None
     assert tags.likelihood is not None

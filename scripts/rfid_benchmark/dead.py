@@ -1,4 +1,4 @@
-"""Dead tags: what it costs that nobody says which they are."""
+"""Dead tags: the cost of not knowing them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONFIGS = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfi
 
 
 def told(log: Log, _: int) -> Log:
-    """The log with a map without the dead tags, and a rig that takes the others for alive."""
+    """The log with a map without the dead tags, and a rig that assumes the others alive."""
     dead = set(log.metadata.get("dead", "").split(", "))
     tags = {name: tag for name, tag in log.world.tags.items() if name not in dead}
     assert log.rig.rfid is not None

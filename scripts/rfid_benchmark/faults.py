@@ -1,4 +1,4 @@
-"""What goes wrong, one thing at a time: what it costs, and whether the status says so."""
+"""One fault at a time: its effect on the errors, and whether the status shows it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Change = Callable[[Log, int], Log]
 
 
 def start_elsewhere(log: Log, seed: int) -> Log:
-    """The stated start is 3 m and 60 degrees off, in a direction of the seed, with the deviations that it had."""
+    """The stated start has an error of 3 m and 60 degrees, in a random direction, with unchanged covariance."""
     assert log.start is not None
     distance, turn = ELSEWHERE
     direction, sign = 2.4 * seed, 1.0 if seed % 2 else -1.0

@@ -1,9 +1,9 @@
-"""The optimal filter of a pose, as far as a fine grid goes: what other filters are measured against. Slow, and for small rooms.
+"""The optimal filter of a pose up to the resolution of a grid, as a reference for other filters. Slow, for small rooms.
 
-Histogram filter (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 8.2). A plain one diffuses: motion by less than a
-cell spreads the mass over two. Here each layer of one heading has an offset of its own, so the reported motion moves grids, not
-mass, and is exact. The motion's noise, far smaller than a cell, is a kernel with its mean and covariance; where mass goes over to
-a layer with another offset, it is divided among four cells an axis by Lagrange's weights, which keep its moments up to the third.
+Histogram filter (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 8.2). To avoid the diffusion by motions of less
+than a cell, each layer of one heading has its own offset: the reported motion moves the grids, which is exact. The noise of the
+motion, far smaller than a cell, is a kernel with its mean and covariance; mass that moves to a layer with another offset is
+distributed over four cells per axis by Lagrange weights, which preserve its moments up to the third.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from factors.se2 import Array
 
 CELL = 0.05  # m
 HEADINGS = 120  # layers, of 3 degrees
-NEGLIGIBLE = 1e-13  # of the largest cell: what is less is dropped
-LARGEST_SHARE = 0.25  # of a cell's mass that leaves it in one pass of the noise
+NEGLIGIBLE = 1e-13  # relative to the largest cell: smaller values are dropped
+LARGEST_SHARE = 0.25  # largest fraction of a cell's mass that leaves it in one pass of the noise
 
 
 class GridFilter:
-    """The density of a pose in the rectangle from ``low`` (2,) to ``high`` (2,) [m]; what leaves it is lost.
+    """The density of a pose in the rectangle from ``low`` (2,) to ``high`` (2,) [m]; mass outside is lost.
 
-    Cells are points of a lattice: a density whose standard deviations are above 0.7 of a cell has its variances right to 0.3 %.
+    Cells are points of a lattice; variances are accurate to 0.3 % for standard deviations above 0.7 of a cell.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class GridFilter:
         self.update(density)
 
     def predict(self, increment: Increment) -> None:
-        """Move along the increment of the odometry."""
+        """Apply the increment of the odometry."""
         headings = self._headings()
         c, s = np.cos(headings), np.sin(headings)
         dx, dy, turn = increment.delta
@@ -64,7 +64,7 @@ class GridFilter:
             self._spread(covariance / passes)
 
     def update(self, log_likelihood: Callable[[Array], Array]) -> None:
-        """Weigh by a log-likelihood (N,) of poses (N, 3)."""
+        """Multiply by a likelihood, given its logarithm (N,) at poses (N, 3)."""
         rows = np.nonzero(self._mass)
         values = log_likelihood(self._poses(rows))
         mass = self._mass[rows] * np.exp(values - np.max(values))
@@ -72,7 +72,7 @@ class GridFilter:
         self._mass[rows] = mass / mass.sum()
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) of x, y, heading, in the world's frame."""
+        """Mean (3,) and covariance (3, 3) of x, y, heading, in the world frame."""
         rows = np.nonzero(self._mass)
         poses, mass = self._poses(rows), self._mass[rows]
         heading = math.atan2(float(mass @ np.sin(poses[:, 2])), float(mass @ np.cos(poses[:, 2])))
@@ -96,7 +96,7 @@ class GridFilter:
         """Add noise with a body-frame covariance (3, 3)."""
         variance = float(covariance[2, 2])
         share = variance / (2.0 * self._step**2)
-        # how the place changes with the heading, and what of its noise is left then
+        # regression of the position on the heading, and the remaining noise
         slope = covariance[:2, 2] / variance if variance > 0.0 else np.zeros(2)
         rest = covariance[:2, :2] - variance * np.outer(slope, slope)
         headings = self._headings()
@@ -107,15 +107,15 @@ class GridFilter:
         whole = np.rint(self._offsets)
         self._offsets -= whole
         self._mass = _spread(self._mass, whole.astype(np.int64), self._offsets, share, aside, within)
-        # what is below zero is kept: weights of both signs are what makes the moments right
+        # negative values are kept: weights of both signs preserve the moments
         self._mass[np.abs(self._mass) < NEGLIGIBLE * self._mass.max()] = 0.0
         self._mass /= self._mass.sum()
 
 
 @numba.njit(cache=True)
 def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Array, within: Array) -> Array:
-    """All mass moved by ``whole`` cells (K, 2), the share ``share`` of it to either layer beside, ``aside`` (K, 2) cells from where
-    it was, and then over the cells around by ``within`` (K, 2, 2) cells^2."""
+    """All mass moved by ``whole`` cells (K, 2), the fraction ``share`` of it to either adjacent layer, ``aside`` (K, 2) cells
+    away, and then distributed over neighbouring cells with covariance ``within`` (K, 2, 2) cells^2."""
     layers, nx, ny = mass.shape
     turned = np.zeros_like(mass)
     for k in range(layers):
@@ -153,7 +153,7 @@ def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Arra
 
 @numba.njit(cache=True)
 def _divide(layer: Array, x: float, y: float, value: float) -> None:
-    """Add ``value`` at a place (x, y) between cells."""
+    """Add ``value`` at a position (x, y) between cells."""
     nx, ny = layer.shape
     i, j = math.floor(x), math.floor(y)
     wx, wy = np.empty(4), np.empty(4)
@@ -167,7 +167,7 @@ def _divide(layer: Array, x: float, y: float, value: float) -> None:
 
 @numba.njit(cache=True)
 def _lagrange(f: float, out: Array) -> None:
-    """Weights (4,) of the points -1, 0, 1, 2 for a place ``f`` between 0 and 1."""
+    """Lagrange weights (4,) of the points -1, 0, 1, 2 for a position ``f`` between 0 and 1."""
     out[0] = -f * (f - 1.0) * (f - 2.0) / 6.0
     out[1] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
     out[2] = -(f + 1.0) * f * (f - 2.0) / 2.0

@@ -1,4 +1,4 @@
-"""Trials of an unknown start and of kidnapping on simulated logs, a new world in each, by what is right at which time."""
+"""Trials of an unknown start and of kidnapping on simulated logs, each in a new world, evaluated over time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
 
-AWAY = 3.0  # m that a robot is carried at least
+AWAY = 3.0  # m, least displacement of a kidnapping
 APART = 60.0  # s between the parts of a log that a kidnapping joins
 
 Kind = Literal["unknown start", "kidnapping"]
@@ -25,9 +25,9 @@ Kind = Literal["unknown start", "kidnapping"]
 
 @dataclass(frozen=True)
 class SimulatedTrial:
-    """One trial. ``seconds``: from the first scan (at the new place) until the estimate is right and stays so for 10 s, whatever
-    its status; ``claimed``: until it first is ``localized`` (again right and localized, after a kidnapping); NaN if it never is.
-    ``false``: the first claim is wrong; after a kidnapping: localized is what it says at the deadline without being right."""
+    """One trial. ``seconds``: from the first scan (at the new place) until the estimate is correct and stays so for 10 s,
+    whatever its status; ``claimed``: until it first is ``localized`` (correct and localized again, after a kidnapping); NaN if
+    never. ``false``: the first claim is wrong; after a kidnapping: it is localized at the deadline without being correct."""
 
     seed: int
     seconds: float
@@ -54,7 +54,7 @@ def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
 
 
 def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
-    """The beginning of a drive, from an unknown start. It lasts until a start that is right at three deadlines has held."""
+    """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
     log = simulate(_lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
     result = run(log, RunConfig(job.estimator, job.settings, prior="unknown", seed=seed))
     first = float(log.streams["rfid"].t[0])
@@ -65,8 +65,8 @@ def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
 
 
 def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
-    """A robot that drives from a known start and is then carried to where it is a minute later, or at the first time after that at
-    which this is 3 m away."""
+    """A robot that drives from a known start and is then moved to its position a minute later, or the first one after that which
+    is 3 m away."""
     after = 3.0 * job.deadline + HOLD + 1.0
     log = simulate(_lasting(job.simulation, BEFORE + 2.0 * APART + after), seed)
     assert log.reference is not None
@@ -89,7 +89,7 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
 
 
 def _held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:
-    """Seconds from ``first`` until what is ``good`` (N,) stays so."""
+    """Seconds from ``first`` until ``good`` (N,) holds."""
     later = result.t >= first - 1e-9
     return first_held(result.t[later], good[later], HOLD) - first
 

@@ -1,4 +1,4 @@
-"""How long it takes; one process at a time."""
+"""Run times; one process at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
 
-SCANS, RATE = 5000, 10.0  # of all eight antennas; 1/s
+SCANS, RATE = 5000, 10.0  # with all eight antennas; Hz
 WORLD = {"world": {"tags": 20}, "rounds_per_second": RATE, "drive": {"duration": SCANS / RATE}}
 CALIBRATED = 400.0  # s of a log
 RUNS = {
@@ -28,7 +28,7 @@ RUNS = {
 
 @dataclass(frozen=True)
 class Job:
-    """A run, or a calibration where there is no ``config``; results of learnt grids go to ``out``."""
+    """A run, or a calibration if there is no ``config``; learnt grids are written to ``out``."""
 
     config: RunConfig | None
     out: Path = Path()
@@ -36,7 +36,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Times:
-    """``update_ms`` (M,) of each scan; ``causal``, ``final``: all of it [s]; ``memory`` [MB]."""
+    """``update_ms`` (M,) of each scan; total times ``causal``, ``final`` [s]; ``memory`` [MB]."""
 
     update_ms: np.ndarray
     causal: float
@@ -79,7 +79,7 @@ def timed(job: Job) -> Times | float:
     if job.config is None:
         return calibration_seconds(job.out)
     log = simulate(preset("office", WORLD), 0)
-    # what is compiled at first use is no part of a step
+    # exclude compilation
     run(simulate(preset("office", {**WORLD, "drive": {"duration": 20.0}}), 1), job.config)
     timings = run(log, job.config).timings
     return Times(timings.update_ms, timings.causal_seconds, timings.final_seconds, timings.peak_memory_mb)

@@ -9,8 +9,8 @@ from factorgraph_loc.simulation.settings import preset
 from rfid_benchmark.simulated_trials import Kind, SimulatedTrial, SimulatedTrialJob, run_simulated_trials
 
 SEEDS = 100
-CHUNK = 10  # trials of one process
-FIRST = 1000  # seeds that the other sections do not use
+CHUNK = 10  # trials per process
+FIRST = 1000  # first seed, not used by other sections
 KINDS: tuple[tuple[Kind, str, float], ...] = (
     ("unknown start", "office", 5.0),
     ("unknown start", "sparse", 10.0),
@@ -66,6 +66,6 @@ def row(key: tuple[str, str, str, float], trials: list[SimulatedTrial]) -> tuple
 
 
 def middle(seconds: list[float]) -> str:
-    """The median, what never came being last."""
+    """The median, with infinite times for trials that never succeeded."""
     median = np.median(np.where(np.isnan(seconds), np.inf, seconds))
     return f"{median:.1f}" if np.isfinite(median) else "never"

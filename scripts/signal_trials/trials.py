@@ -1,4 +1,4 @@
-"""A command that a signal ends at a random moment, what it leaves, and what the same command makes of it afterwards."""
+"""A command ended by a signal at a random moment, the files it leaves, and the result of the same command afterwards."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HOWS = {  # signal, and whether all processes of the command get it
     "KILL": (signal.SIGKILL, False),
     "TERM": (signal.SIGTERM, False),
     "HUP": (signal.SIGHUP, False),
-    "INT": (signal.SIGINT, True),  # as a terminal sends it
+    "INT": (signal.SIGINT, True),  # as sent by a terminal
     "KILL of all": (signal.SIGKILL, True),
 }
 EXPERIMENT = """
@@ -32,12 +32,12 @@ logs = [{simulate = "office", settings = {drive = {duration = 5}}}]
 estimators = ["dead_reckoning", "ekf", {name = "particle_filter", settings = {particles = 200}}]
 seeds = "0:2"
 """
-GONE = 60.0  # s after which a process that lives is an orphan, whatever else the machine does
+GONE = 60.0  # s after which a living process is an orphan, even on a busy machine
 
 
 @dataclass
 class Command:
-    """``words``: what is written at OUT; the files of ``out`` are looked at. ``timed``: those that differ from run to run."""
+    """``words``: arguments with OUT; the files of ``out`` are checked. ``timed``: those that differ from run to run."""
 
     name: str
     words: tuple[object, ...]
@@ -48,7 +48,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one signal. ``ended``: seconds until no process was left; ``faults``: what went wrong, if anything did."""
+    """The result of one signal. ``ended``: seconds until no process was left; ``faults``: if any."""
 
     command: str
     how: str
@@ -60,7 +60,7 @@ class Trial:
 
 
 class Bench:
-    """A folder with a log of some ``seconds``, in which commands are tried."""
+    """A folder with a log of ``seconds`` duration, in which commands are tried."""
 
     def __init__(self, folder: Path, seconds: float) -> None:
         self.folder = folder
@@ -71,7 +71,7 @@ class Bench:
         self.run("simulate", "office", "-o", folder / "log", "--duration", seconds)
 
     def commands(self) -> list[Command]:
-        """What is tried; OUT stands for a folder that is new each time."""
+        """The commands; OUT stands for a folder that is new each time."""
         log, two = self.folder / "log", ("--jobs", 2)
         estimators = "dead_reckoning,ekf,particle_filter"
         few = ("--set", "particle_filter.particles=200")
@@ -84,7 +84,7 @@ class Bench:
         ]
 
     def measure(self, command: Command) -> None:
-        """Run it undisturbed, twice: how long it takes, what it writes, and which of that are times."""
+        """Run it undisturbed, twice, for its duration, its files, and which of them contain times."""
         found = []
         for _ in range(2):
             out = self._new()
@@ -96,7 +96,7 @@ class Bench:
         command.timed = {name for name in found[0] if found[0][name] != found[1].get(name)}
 
     def try_signal(self, command: Command, how: str, after: float) -> Trial:
-        """Send a signal ``after`` so many seconds, look at what is there, and give the command again."""
+        """Send a signal after ``after`` seconds, check the files, and repeat the command."""
         out, faults = self._new(), []
         process = self.start(*command.words, out=out)
         try:
@@ -141,24 +141,24 @@ class Bench:
         )
 
     def run(self, *words: object, out: Path | None = None) -> None:
-        """The command, undisturbed; RuntimeError if it fails."""
+        """Run the command undisturbed; RuntimeError if it fails."""
         process = self.start(*words, out=out)
         said = process.communicate()[1]
         if process.returncode != 0:
             raise RuntimeError(f"exit code {process.returncode}: {said.strip()}")
 
     def temporary(self) -> list[Path]:
-        """What is there of temporary files and folders."""
+        """Remaining temporary files and folders."""
         return [path for path in self.folder.rglob(".*") if TEMPORARY.fullmatch(path.name)]
 
     def _again(self, command: Command, out: Path) -> list[str]:
-        """What is wrong after the same command was given again."""
+        """Faults after the same command was repeated."""
         process = self.start(*command.words, out=out)
         said = process.communicate()[1]
         faults = []
         if (
             process.returncode != 0 and "already" not in said and "exists" not in said
-        ):  # what is whole is not made again
+        ):  # complete results are not repeated
             faults.append(f"again: exit code {process.returncode}: {said.strip()[-200:]}")
         found = contents(out)
         for name in sorted({*found} ^ {*command.expected}):
@@ -170,7 +170,7 @@ class Bench:
         return faults
 
     def _damaged(self, command: Command, out: Path) -> list[str]:
-        """Files whose content is neither the expected one nor, where it may differ, whole."""
+        """Files whose content is neither as expected nor, where it may differ, complete."""
         wrong = []
         for name, content in contents(out).items():
             partial = name in command.timed or name == "results.parquet" or name not in command.expected
@@ -179,7 +179,7 @@ class Bench:
         return wrong
 
     def _new(self) -> Path:
-        """An empty folder for the results of one trial; those of the one before are gone."""
+        """An empty folder for the results of one trial; previous ones are removed."""
         out = self.folder / "out"
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
@@ -190,7 +190,7 @@ HALF = b"is half-written"
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The files below a folder, without what is hidden, without times where a format has a place for them."""
+    """The files below a folder, except hidden ones, and without times where a format contains them."""
     found = {}
     for path in sorted(folder.rglob("*")):
         inside = path.relative_to(folder)
@@ -217,7 +217,7 @@ def _untimed(path: Path) -> bytes:
 
 
 def members(leader: int) -> list[int]:
-    """The processes of a group that run."""
+    """The running processes of a group."""
     found = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -235,7 +235,7 @@ def _ordinary_signals() -> None:
 
 
 def drawn(commands: list[Command], each: int, seed: int) -> list[tuple[Command, str, float]]:
-    """The trials of a seed: of each command ``each``, with the kinds of signals in turn, at moments within its usual time."""
+    """The trials of a seed: ``each`` per command, with the kinds of signals in turn, at moments within its usual duration."""
     rng = random.Random(seed)
     hows = list(HOWS)
     return [

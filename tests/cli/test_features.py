@@ -93,7 +93,7 @@ def test_results_are_not_overwritten_unasked(fgloc, images, tmp_path):
     assert fgloc(*command).exit_code == 0
     result = fgloc(*command)
     assert result.exit_code == 2
-    assert "has table.md already; choose another folder or give --overwrite" in result.stderr
+    assert "holds results already (table.md); choose another folder, or --overwrite" in result.stderr
     assert fgloc(*command, "--overwrite").exit_code == 0
 
 
@@ -138,4 +138,4 @@ def test_out_must_be_a_folder(fgloc, images, tmp_path):
     (tmp_path / "out").write_text("")
     result = fgloc("features", "evaluate", images, "-o", tmp_path / "out", "--features", "orb")
     assert result.exit_code == 2
-    assert result.stderr == f"error: {tmp_path / 'out'}: is not a folder\n"
+    assert result.stderr == f"error: {tmp_path / 'out'}: is a file, expected a folder for the results\n"

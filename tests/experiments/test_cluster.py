@@ -150,7 +150,7 @@ def test_a_scheduler_that_goes_away_ends_the_experiment_not_the_results(planned,
         outcomes = cluster.execute(runs, folder, scheduler=made.scheduler_address, limits=Limits())
         first = next(outcomes)
         made.close()
-        with pytest.raises(RunFailedError, match="the scheduler went away"):
+        with pytest.raises(RunFailedError, match="the scheduler has disappeared"):
             list(outcomes)
     assert Store(folder).state(first.key) == "ok"
 

@@ -101,7 +101,7 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
     unseen = replace(log.streams["bearing_range"], landmark=["x", "y"] * 4)
     both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
     assert why(both, "bearing_range") == "no landmark of the map was seen"
-    assert why(both, "bearing_range", "camera") == "its landmarks and points did not tell the place"
+    assert why(both, "bearing_range", "camera") == "its landmarks and points did not determine the pose"
 
 
 def with_sightings(log, **columns):

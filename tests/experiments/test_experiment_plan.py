@@ -64,11 +64,11 @@ def test_a_glob_that_is_none_or_matches_nothing_is_one_line(planned, glob):
         planned(logs=[glob])
 
 
-def test_a_glob_looks_at_so_many_files_and_no_more(planned, logs, monkeypatch):
+def test_a_glob_visits_a_bounded_number_of_files(planned, logs, monkeypatch):
     monkeypatch.setattr(globs, "VISITED", 20)
     for i in range(30):
         (logs / f"x{i}").mkdir()
-    with pytest.raises(InputError, match="looks at more than"):
+    with pytest.raises(InputError, match="visits more than"):
         planned(logs=["**/nothing"])
     assert len(planned(logs=["one"])) == 1
 
@@ -101,13 +101,13 @@ def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
     ("settings", "expected"),
     [
         ({"drive": {"duration": 14_400.0}}, "2,016,000 s and "),
-        ({"drive": {"duration": 600.0}, "world": {"tags": 3000}}, "28,800,000 looks"),
+        ({"drive": {"duration": 600.0}, "world": {"tags": 3000}}, "28,800,000 observations"),
     ],
 )
 def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, monkeypatch, settings, expected):
     """Each kind of limit, with 140 logs; those that are known already need not be simulated."""
     monkeypatch.setattr(facts, "_facts", lambda *_: pytest.fail("a log was looked at"))
-    looks = expected.endswith("looks")
+    looks = expected.endswith("observations")
     monkeypatch.setattr(plan_module, "MOST_LOOKS", 28_799_999 if looks else 10**12)
     with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
         planned(logs=["one", {"simulate": "office", "settings": settings, "seeds": [3] if looks else range(140)}])
@@ -119,7 +119,7 @@ def test_what_is_simulated_already_counts_no_more(planned, monkeypatch):
     first = planned(logs=logs)
     monkeypatch.setattr(plan_module, "MOST_SECONDS", 0)
     assert planned(logs=logs) == first
-    with pytest.raises(InputError, match="20 s and 12,800 looks"):
+    with pytest.raises(InputError, match="20 s and 12,800 observations"):
         planned(logs=[*logs, logs[0] | {"seeds": [3]}])
 
 

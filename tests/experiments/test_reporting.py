@@ -37,7 +37,7 @@ def prepared(tmp_path):
 
 def test_page_of_what_is_stored(prepared):
     page = report_experiment(prepared()).page.read_text(encoding="utf-8")
-    assert "2 estimators on 1 log: 2 runs. All went well." in page
+    assert "2 estimators on 1 log: 2 runs. All succeeded." in page
     assert "Differences from again &amp; again" in page
     assert code_version() in page
     assert "opencv-python-headless" in page
@@ -84,7 +84,7 @@ def test_a_damaged_result_is_named_and_left_out(prepared):
     assert written.damaged == ["office-0, dead_reckoning, seed 0"]
     page = written.page.read_text(encoding="utf-8")
     assert "1 estimator on 1 log: 1 run." in page
-    assert f"1 run is damaged, and left out: <strong>{written.damaged[0]}</strong>" in page
+    assert f"1 run is damaged, and excluded: <strong>{written.damaged[0]}</strong>" in page
     damage(some.runs[1], some.store)
     with pytest.raises(InputError, match=r"no runs to report on \(2 are damaged\)"):
         report_experiment(some)

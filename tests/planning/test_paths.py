@@ -11,7 +11,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import CELL, distance_to_walls, free_space
 from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.paths import STEP, Path, free_length, free_steps, primitives, waypoint_paths, waypoints
+from factorgraph_loc.planning.paths import STEP, Path, free_steps, primitives, waypoint_paths, waypoints
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 from factors import se2
@@ -120,6 +120,10 @@ def test_waypoints_are_spread(office):
     nearest = np.hypot(*(space.centres[:, None] - found[None]).transpose(2, 0, 1)).min(axis=1)
     assert nearest.max() <= apart.min() + 1e-9
     assert len(waypoints(space, 10**6)) == len(space.centres)
+
+
+def free_length(space, poses, path):
+    return path.way[free_steps(space, poses, [path])[0]]
 
 
 def test_free_length_is_that_to_the_wall():

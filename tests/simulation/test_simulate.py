@@ -126,9 +126,9 @@ def test_no_landmark_is_seen_through_a_wall_too_far_or_out_of_view():
     ("changes", "words"),
     [
         ({"world": {"density": 100.0}}, "density makes 24,000 tags, expected at most 10,000"),
-        ({"world": {"tags": 10_000}}, "tags are looked for 96,000,000 times in all, expected at most 50,000,000"),
-        ({"world": {"landmarks": 10_000}, "sightings": {"rate": 100.0}}, "landmarks are looked for 600,000,000 times"),
-        ({"world": {"points": 10_000}, "pixels": {"rate": 100.0}}, "points are looked for 600,000,000 times"),
+        ({"world": {"tags": 10_000}}, "tags are observed 96,000,000 times in all, expected at most 50,000,000"),
+        ({"world": {"landmarks": 10_000}, "sightings": {"rate": 100.0}}, "landmarks are observed 600,000,000 times"),
+        ({"world": {"points": 10_000}, "pixels": {"rate": 100.0}}, "points are observed 600,000,000 times"),
     ],
 )
 def test_what_would_take_all_memory_is_refused(changes, words):

@@ -1,3 +1,3 @@
-"""How well points of images are found again."""
+"""Evaluation of point features: repeatability and matching."""
 
 __all__ = ["feature_evaluation", "repeatability", "scores", "sequences"]

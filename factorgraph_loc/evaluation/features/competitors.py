@@ -1,8 +1,8 @@
 """Detectors that the colour features are compared with, written for evaluation: compact, not fast, without descriptors.
 
-Harris-Laplace and Hessian-Laplace: Mikolajczyk, Schmid, "Scale & Affine Invariant Interest Point Detectors", IJCV 60, 2004, section
-2 (the simplified detector: points are found at each scale and kept where the Laplacian has its maximum over scales).
-Fast-Hessian: Bay, Tuytelaars, Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006, section 3. All take the luminance.
+Harris-Laplace and Hessian-Laplace: Mikolajczyk, Schmid, "Scale & Affine Invariant Interest Point Detectors", IJCV 60, 2004,
+section 2 (the simplified detector: points are detected at each scale and kept where the Laplacian has its maximum over scales).
+Fast-Hessian: Bay, Tuytelaars, Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006, section 3. All use the luminance.
 """
 
 from collections.abc import Callable
@@ -26,10 +26,10 @@ OCTAVES = (
     (27, 51, 75, 99),
     (51, 99, 147, 195),
 )  # sides of Fast-Hessian's filters, px
-BOX_SIGMA = 1.2 / 9.0  # scale over side of a filter, as the paper has it; its lobes are those of a Gaussian of side / 6
-BOX_XY = 0.9  # weight of the mixed derivative, which boxes overrate
+BOX_SIGMA = 1.2 / 9.0  # scale over side of a filter, as in the paper; the lobes are those of a Gaussian of side / 6
+BOX_XY = 0.9  # weight of the mixed derivative, which boxes overestimate
 
-_TAIL = 1e-8  # of responses, relative to the strongest: below are flat parts of an image
+_TAIL = 1e-8  # of responses, relative to the strongest: smaller ones are flat image regions
 _ONE, _SLOPE, _BEND = (np.array(kernel, dtype=np.float32) for kernel in ((0, 1, 0), (-0.5, 0, 0.5), (1, -2, 1)))
 
 Plane = NDArray[np.float32]
@@ -37,7 +37,7 @@ Truths = NDArray[np.bool_]
 
 
 class Detector(Protocol):
-    """What finds points; every :class:`~factorgraph_loc.vision.features.Extractor` is one too."""
+    """A detector; every :class:`~factorgraph_loc.vision.features.Extractor` is one too."""
 
     @property
     def name(self) -> str: ...
@@ -48,7 +48,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True)
 class LaplaceDetector:
-    """Maxima in the image of ``strength``, at scales where the Laplacian is highest; at most ``count``, the strongest first."""
+    """Local maxima of ``strength`` in the image, at scales of maximal Laplacian; at most ``count``, the strongest first."""
 
     name: str
     strength: Callable[[Plane, float], Plane]
@@ -71,7 +71,7 @@ class LaplaceDetector:
 
 @dataclass(frozen=True)
 class FastHessianDetector:
-    """Maxima in image and scale of the determinant of the Hessian, whose derivatives are sums over boxes.
+    """Local maxima over image and scale of the determinant of the Hessian, with derivatives from box filters.
 
     Each octave is computed at full resolution: the paper skips every second pixel of the second octave, and so on.
     """
@@ -80,7 +80,7 @@ class FastHessianDetector:
     count: int
 
     def detect(self, image: object, mask: object = None) -> Keypoints:
-        """Points of an image where ``mask`` (H, W) is not 0; sizes are twice the scale that a filter stands for."""
+        """Points of an image where ``mask`` (H, W) is not 0; sizes are twice the scale of the filter."""
         found = _plane_and_mask(image, mask)
         if found is None:
             return Keypoints.empty()
@@ -100,7 +100,7 @@ class FastHessianDetector:
 
 
 def harris(plane: Plane, sigma: float) -> Plane:
-    """Harris' measure at the integration scale ``sigma`` [px], normalised for scale (Mikolajczyk, Schmid, 2004, eqs. 1 and 2)."""
+    """Harris measure at the integration scale ``sigma`` [px], normalised for scale (Mikolajczyk, Schmid, 2004, eqs. 1 and 2)."""
     dx, dy = _gradient(plane, DERIVATIVE * sigma)
     weight = (DERIVATIVE * sigma) ** 2
     xx, xy, yy = (weight * _blur(product, sigma) for product in (dx * dx, dx * dy, dy * dy))
@@ -123,7 +123,7 @@ def box_hessian(integral: Array, side: int) -> Plane:
         return out
 
     def box(top: int, left: int, rows: int, columns: int) -> Array:
-        """Sums of boxes, whose corner lies at (``top``, ``left``) from the pixel, for all pixels where the filter fits."""
+        """Sums of boxes with a corner at (``top``, ``left``) from the pixel, for all pixels where the filter fits."""
 
         def at(dy: int, dx: int) -> Array:
             return integral[reach + dy : height - reach + dy, reach + dx : width - reach + dx]
@@ -176,12 +176,12 @@ def _laplacian(plane: Plane, sigma: float) -> Plane:
 
 
 def _highest(plane: Plane) -> Plane:
-    """The maximum of the 3 x 3 around each pixel."""
+    """The maximum of the 3 x 3 neighbourhood of each pixel."""
     return np.asarray(cv2.dilate(plane, np.ones((3, 3), dtype=np.uint8)))
 
 
 def _peaks(plane: Plane) -> Truths:
-    """Pixels above all their eight neighbours, or equal to some; not the border, and nothing that is flat."""
+    """Pixels not below any of their eight neighbours, excluding the border and flat regions."""
     out = np.zeros(plane.shape, dtype=bool)
     out[1:-1, 1:-1] = ((plane >= _highest(plane)) & (plane > 0.0))[1:-1, 1:-1]
     return out
@@ -190,7 +190,7 @@ def _peaks(plane: Plane) -> Truths:
 def _strongest(
     strengths: Plane, across: Plane, peaks: Truths, sigmas: Array, where: NDArray[np.uint8] | None, count: int
 ) -> Keypoints:
-    """The ``count`` strongest of ``peaks`` in stacks (L, H, W), their place refined in ``strengths``, their scale in ``across``."""
+    """The ``count`` strongest of ``peaks`` in stacks (L, H, W), refined in position in ``strengths`` and in scale in ``across``."""
     if where is not None:
         peaks = peaks & (where != 0)
     level, y, x = np.nonzero(peaks)
@@ -201,7 +201,7 @@ def _strongest(
     dx = _vertex(*(strengths[level, y, x + d] for d in (-1, 0, 1)))
     dy = _vertex(*(strengths[level, y + d, x] for d in (-1, 0, 1)))
     between = _vertex(*(across[level + d, y, x] for d in (-1, 0, 1)))
-    # filters of one octave are equally spaced, Gaussian scales geometrically: between neighbours either is nearly the other
+    # filters of one octave are equally spaced, Gaussian scales geometrically: between neighbours the two are nearly the same
     scale = np.exp(np.interp(level + between, np.arange(len(sigmas)), np.log(sigmas)))
     points = np.column_stack((x + dx, y + dy))
     none = np.full(len(points), np.nan)
@@ -209,7 +209,7 @@ def _strongest(
 
 
 def _vertex(before: Plane, at: Plane, after: Plane) -> Array:
-    """Where the parabola through three equally spaced values has its top, from -0.5 to 0.5 around the middle one."""
+    """Offset of the vertex of the parabola through three equally spaced values, from -0.5 to 0.5."""
     bend = (before - 2.0 * at + after).astype(float)
     slope = 0.5 * (after - before).astype(float)
     top = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0)
@@ -217,7 +217,7 @@ def _vertex(before: Plane, at: Plane, after: Plane) -> Array:
 
 
 def _merged(parts: list[Keypoints], count: int) -> Keypoints:
-    """The ``count`` strongest of several; a filter that is in two octaves may give a point twice: once here."""
+    """The ``count`` strongest of several; points found twice by a filter in two octaves are merged."""
     columns = [np.concatenate([getattr(part, name) for part in parts]) for name in Keypoints.__dataclass_fields__]
     everything = Keypoints(*columns)
     order = np.argsort(-everything.responses, kind="stable")

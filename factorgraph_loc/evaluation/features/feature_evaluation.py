@@ -1,10 +1,9 @@
-"""Features on sequences of images with known homographies: how well they repeat, match, and tell the homography.
+"""Evaluation of features on image sequences with known homographies: repeatability, matching, and homography estimation.
 
-Matching score and recall against 1 - precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27,
-2005, section 3; a match is right where the regions of its points overlap
-(:mod:`~factorgraph_loc.evaluation.features.repeatability`). Mean
-average accuracy of the homography: Jin et al., "Image Matching across Wide Baselines", IJCV 129, 2021, section 4, with the error
-at the image's corners.
+Matching score and recall over 1 - precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27, 2005,
+section 3; a match is correct if the regions of its points overlap (:mod:`~factorgraph_loc.evaluation.features.repeatability`).
+Mean average accuracy of the homography: Jin et al., "Image Matching across Wide Baselines", IJCV 129, 2021, section 4, with the
+error at the image's corners.
 """
 
 import time
@@ -50,7 +49,7 @@ Matched = tuple[Integers, Integers, Array]  # indices in the first and the secon
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature under evaluation: ``find`` gives the points of an image, and their descriptors if it has any."""
+    """A feature under evaluation: ``find`` returns the points of an image, and their descriptors if it has any."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
@@ -58,12 +57,12 @@ class Feature:
 
 @dataclass(frozen=True)
 class MatchScores:
-    """How the descriptors of a pair of images match; NaN for detectors, which have none.
+    """Matching scores of a pair of images; NaN for detectors without descriptors.
 
-    ``matching_score``: right mutual matches over the smaller number of features in the common part; ``matches``: mutual ones with
-    a ratio below :data:`RATIO`, ``precision``: share of them that is right; ``average_precision``: area below precision over
+    ``matching_score``: correct mutual matches over the smaller number of features in the common part; ``matches``: mutual ones
+    with a ratio below :data:`RATIO`, ``precision``: fraction of correct ones; ``average_precision``: area below precision over
     recall; ``homography_error`` [px]: at the corners, of the homography fitted to them, infinite if there is none; ``accuracy``:
-    share of :data:`THRESHOLDS` that it is within. What has no matches has scores of 0.
+    fraction of :data:`THRESHOLDS` that it is below. Without matches the scores are 0.
     """
 
     matches: int = 0
@@ -78,7 +77,7 @@ class MatchScores:
 class PairScores:
     """The scores of one feature on the first image of a sequence and its image number ``image``.
 
-    ``change`` and ``amount`` are those of the sequence; ``features`` were found in the image, and described, in ``milliseconds``.
+    ``change`` and ``amount`` are those of the sequence; ``features`` were detected and described in ``milliseconds``.
     """
 
     feature: str
@@ -92,17 +91,17 @@ class PairScores:
     matched: MatchScores
 
     def row(self) -> dict[str, Any]:
-        """All of it by name, as a row of a table."""
+        """The scores by name, as a row of a table."""
         content = asdict(self)
         return {**content, **content.pop("found"), **content.pop("matched")}
 
 
 @dataclass(frozen=True, eq=False)
 class RankedMatches:
-    """Mutual nearest neighbours of a pair of images, the clearest first.
+    """Mutual nearest neighbours of a pair of images, by increasing ratio.
 
-    ``ratio`` (M,): of the distances to the nearest and the second nearest; ``right`` (M,): whether it is; ``possible``: as many
-    right ones as a perfect matcher could find.
+    ``ratio`` (M,): of the distances to the nearest and the second nearest; ``right`` (M,): whether the match is correct;
+    ``possible``: the number of correct matches of a perfect matcher.
     """
 
     ratio: Array
@@ -110,18 +109,18 @@ class RankedMatches:
     possible: int
 
     def curve(self) -> tuple[Array, Array]:
-        """Recall (M,) and 1 - precision (M,), with one more match from each to the next."""
+        """Recall (M,) and 1 - precision (M,) for an increasing number of matches."""
         correct = np.cumsum(self.right)
         return correct / max(self.possible, 1), 1.0 - correct / np.arange(1, len(self.right) + 1)
 
     def average_precision(self) -> float:
-        """Sum of the precision at each right match, over ``possible``; 0 where nothing could be matched."""
+        """Sum of the precision at each correct match, over ``possible``; 0 if nothing could be matched."""
         precision = 1.0 - self.curve()[1]
         return float(np.sum(precision[self.right]) / max(self.possible, 1))
 
 
 def feature(name: str, count: int) -> Feature:
-    """The feature or detector of that name, at most ``count`` points an image; InputError if there is none."""
+    """The feature or detector ``name``, with at most ``count`` points per image. Raises InputError if it is unknown."""
     if name not in EXTRACTORS and name not in DETECTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, [*EXTRACTORS, *DETECTORS])}")
     if name in EXTRACTORS:
@@ -137,10 +136,10 @@ def evaluate(
 ) -> Iterator[tuple[PairScores, RankedMatches | None]]:
     """Scores of a feature on each pair of a sequence, with the ranked matches if it has descriptors.
 
-    Each image is taken on one thread; ``progress`` is called after it.
+    Each image is processed on one thread; ``progress`` is called after it.
     """
     with _one_thread():
-        what.find(sequence.first)  # what is compiled or allocated at first use is no part of the time
+        what.find(sequence.first)  # exclude compilation and allocation at first use from the time
         (keypoints, descriptors), _ = _timed(what, sequence.first)
         progress()
         for k, (image, homography) in enumerate(zip(sequence.others, sequence.homographies, strict=True)):
@@ -160,9 +159,9 @@ def evaluate(
 def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     """Mutual nearest neighbours of two sets of descriptors, bits (``uint8``) or vectors.
 
-    Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 0 where
-    there is no second, 1 where another is as near. Those with a ratio below r, r up to 1, are what
-    :func:`~factorgraph_loc.vision.matching.match` gives for r.
+    Their indices (M,), (M,), and the ratio (M,) of the distances to the nearest and the second nearest of ``second``, 0 if there
+    is no second, 1 for ties. For r up to 1, those with a ratio below r are the result of
+    :func:`~factorgraph_loc.vision.matching.match` for r.
     """
     none = np.empty(0, dtype=np.int64)
     if len(first) == 0 or len(second) == 0:
@@ -178,7 +177,7 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
 
 
 def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Array, shapes: Shapes) -> RankedMatches:
-    """Which matches are right: both points lie in the common part of the images, and their regions overlap."""
+    """Mark correct matches: both points lie in the common part of the images, and their regions overlap."""
     i, j, ratio = matches
     in_first, in_second = common(first, second, homography, shapes)
     right = in_first[i] & in_second[j] & (pair_errors(first[i], second[j], homography) < OVERLAP_ERROR)
@@ -194,7 +193,7 @@ def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Arra
 def homography_error(first: Array, second: Array, truth: Array, shape: tuple[int, ...]) -> float:
     """Error [px] at the corners of the first image, of ``shape``, of a homography fitted robustly to matched points (M, 2).
 
-    Infinite if they give none.
+    Infinite if the fit fails.
     """
     if len(first) < 4:
         return np.inf
@@ -223,7 +222,7 @@ def _match_scores(
 
 
 def _timed(what: Feature, image: Image) -> tuple[tuple[Keypoints, Descriptors | None], float]:
-    """What a feature finds in an image, and the milliseconds it took."""
+    """The features of an image, and the time [ms]."""
     started = time.perf_counter()
     found = what.find(image)
     return found, 1e3 * (time.perf_counter() - started)
@@ -231,7 +230,7 @@ def _timed(what: Feature, image: Image) -> tuple[tuple[Keypoints, Descriptors | 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """OpenCV on one thread while the block lasts: times are comparable only so."""
+    """Run OpenCV on one thread, for comparable times."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

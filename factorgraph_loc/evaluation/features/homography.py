@@ -1,4 +1,4 @@
-"""Homographies between two images: mapping points and regions, and what they say about zoom, rotation and tilt."""
+"""Homographies between two images: mapping of points and regions, and the zoom, rotation and tilt they contain."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,11 +11,11 @@ from factorgraph_loc.files.models import read_text
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
-_MAX_CONDITION = 1e12  # of the matrix in pixels: good ones between images of 1000 px have 1e4 to 1e7
+_MAX_CONDITION = 1e12  # of the matrix in pixels: typical values for images of 1000 px are 1e4 to 1e7
 
 
 class View(NamedTuple):
-    """How a second image sees the first: ``zoom`` (above 1: larger there), ``rotation`` [rad], ``tilt`` (ratio of the axes of the
+    """Change of view to a second image: ``zoom`` (above 1: larger there), ``rotation`` [rad], ``tilt`` (ratio of the axes of the
     ellipse that a small circle becomes, at least 1)."""
 
     zoom: float
@@ -24,9 +24,9 @@ class View(NamedTuple):
 
 
 def project(homography: Array, points: Array) -> Array:
-    """Points (N, 2) [px] of the first image in the second (N, 2); NaN where they lie at or behind infinity.
+    """Map points (N, 2) [px] of the first image to the second (N, 2); NaN if they lie at or behind infinity.
 
-    ``homography`` (3, 3) has the sign that :func:`checked` gives it; its inverse then has the sign for the way back.
+    ``homography`` (3, 3) has the sign set by :func:`checked`; its inverse then has the sign for the way back.
     """
     mapped = points @ homography[:, :2].T + homography[:, 2]
     w = np.where(mapped[:, 2] > 0.0, mapped[:, 2], np.nan)
@@ -42,12 +42,12 @@ def jacobians(homography: Array, points: Array) -> Array:
 
 
 def invert(homography: Array) -> Array:
-    """The homography (3, 3) of the way back."""
+    """The inverse homography (3, 3)."""
     return np.asarray(np.linalg.inv(homography), dtype=float)
 
 
 def inside(points: Array, shape: tuple[int, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of ``points`` (N, 2) lie in an image of ``shape`` (height, width, ...); NaN does not."""
+    """Which of ``points`` (N, 2) lie in an image of ``shape`` (height, width, ...); NaN do not."""
     last = np.array((shape[1] - 1.0, shape[0] - 1.0))
     return np.asarray(np.all((points >= 0.0) & (points <= last), axis=1))
 
@@ -59,8 +59,8 @@ def corners(shape: tuple[int, ...]) -> Array:
 
 
 def corner_error(estimate: Array, truth: Array, shape: tuple[int, ...]) -> float:
-    """Mean distance [px] in the second image between the corners of the first, of ``shape``, by both homographies; infinite where
-    ``estimate`` sends one to infinity."""
+    """Mean distance [px] in the second image between the corners of the first, of ``shape``, mapped by both homographies;
+    infinite if ``estimate`` maps one to infinity."""
     at = corners(shape)
     distances = np.linalg.norm(project(estimate, at) - project(truth, at), axis=1)
     return float(np.mean(distances)) if np.isfinite(distances).all() else np.inf
@@ -75,7 +75,9 @@ def view(homography: Array, shape: tuple[int, ...]) -> View:
 
 
 def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
-    """``matrix`` (3, 3) scaled so that the first image, of ``shape``, has w > 0; InputError, naming ``source``, if it is none."""
+    """``matrix`` (3, 3) scaled so that the first image, of ``shape``, has w > 0. Raises InputError, naming ``source``, if it is
+    not a homography.
+    """
     if matrix.shape != (3, 3):
         raise InputError(f"{source}: has {matrix.size} numbers, expected the 3 x 3 of a homography")
     if not np.isfinite(matrix).all():
@@ -92,9 +94,9 @@ def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
 
 
 def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
-    """The homography (3, 3) in a file, for a first image of ``shape``: nine numbers as text, or a matrix as OpenCV writes XML.
+    """Read a homography (3, 3) for a first image of ``shape``: nine numbers as text, or a matrix in OpenCV's XML format.
 
-    InputError if it cannot be read or :func:`checked` refuses it.
+    Raises InputError if it cannot be read or :func:`checked` rejects it.
     """
     text = read_text(path)
     if text.lstrip().startswith("<"):

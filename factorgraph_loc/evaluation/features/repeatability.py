@@ -1,15 +1,14 @@
-"""How well points of a scene are found again in another image of it.
+"""Repeatability of points between two images of a scene.
 
-A point stands for a disc; the homography makes an ellipse of it in the other image, and two regions correspond where they
-overlap. Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4: repeatability is the number of
-one-to-one correspondences over the smaller number of regions in the part of the scene that both images show. Both regions of
-a pair are magnified until the one in the first image has a radius of 30 px: else large regions would overlap however badly they
-are placed.
+A point stands for a disc, which the homography maps to an ellipse in the other image; two regions correspond if they overlap.
+Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4: repeatability is the number of one-to-one
+correspondences over the smaller number of regions in the common part of the scene. Both regions of a pair are scaled such that
+the one in the first image has a radius of 30 px; otherwise large regions would overlap however inaccurate they are.
 
-What this is lenient about, the other scores ask: the size of a region, and its place in units of the size (``strict``); the
-place in pixels of the first image (``near``); how much of the image the regions that are found again cover, each being a Gaussian
-whose standard deviation is the size of its point (``non_redundant``: Rey-Otero, Delbracio, Morel, "Comparing Feature Detectors:
-A Bias in the Repeatability Criteria", ICIP 2015).
+The other scores are stricter: in the size of a region and its position in units of the size (``strict``); in the position in
+pixels of the first image (``near``); in the image area covered by the repeated regions, each as a Gaussian whose standard
+deviation is the size of its point (``non_redundant``: Rey-Otero, Delbracio, Morel, "Comparing Feature Detectors: A Bias in the
+Repeatability Criteria", ICIP 2015).
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from factorgraph_loc.vision.features import Integers, Keypoints
 from factors.se2 import Array
 
 OVERLAP_ERROR = 0.4
-RADIUS = 30.0  # px, of a region of the first image after magnification
-MEASUREMENT = 3.0  # radius of the area that describes a point, in units of half its size
-SCALE_RATIO = 1.2  # the most by which sizes may differ in the strict score
+RADIUS = 30.0  # px, of a scaled region in the first image
+MEASUREMENT = 3.0  # radius of the region that describes a point, in units of half its size
+SCALE_RATIO = 1.2  # maximum ratio of sizes in the strict score
 NEAR = 3.0  # px
 
 _NODES = 64  # of the integration over a disc
-_SAMPLES = 48  # points that stand for one Gaussian
+_SAMPLES = 48  # points that represent one Gaussian
 _CHUNK = 20_000
 
 Truths = NDArray[np.bool_]
@@ -42,7 +41,7 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 class Repeatability:
     """Scores of a pair of images, 0 to 1.
 
-    ``regions``: the smaller number of them in the common part; where there is none, all scores are 0.
+    ``regions``: the smaller number of them in the common part; if it is 0, all scores are 0.
     """
 
     regions: int
@@ -63,7 +62,7 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """The one-to-one pairs among ``chosen`` (M,): the best first, then the best of what is left."""
+        """The one-to-one pairs among ``chosen`` (M,), selected greedily by error."""
         pairs = one_to_one(self.first[chosen], self.second[chosen], self.error[chosen])
         rows = np.flatnonzero(chosen)[pairs]
         return Candidates(self.first[rows], self.second[rows], self.error[rows], self.ratio[rows])
@@ -72,7 +71,7 @@ class Candidates:
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
     """The scores of points found in two images of ``shapes`` (height, width, ...); ``homography`` maps the first to the second.
 
-    Points with several orientations are one region, except where redundancy is asked for: there each of them counts as found.
+    Points with several orientations count as one region, except for the redundancy score.
     """
     in_first, in_second = common(first, second, homography, shapes)
     first, second = first[in_first], second[in_second]
@@ -93,7 +92,7 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Which points of each image lie in the part of the scene that both show."""
+    """Which points of each image lie in the common part of the scene."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),
@@ -104,14 +103,14 @@ def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shape
 def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
     """All pairs of points in the common part whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
 
-    ``magnified``: to :data:`RADIUS`, with the distance of the centres in pixels as it is; else the radius of a region is
+    ``magnified``: scale regions to :data:`RADIUS`, but not the distance of the centres; else the radius of a region is
     :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:
         none = np.empty(0, dtype=np.int64)
         return Candidates(none, none, np.empty(0), np.empty(0))
     mapped = project(invert(homography), second.points)
-    # regions that share more than half of one of them, and are symmetric and convex, have their centres in each other
+    # symmetric convex regions that share more than half of one of them contain each other's centres
     reach = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
     near = cKDTree(mapped).query_ball_point(first.points, reach)
     i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
@@ -124,7 +123,7 @@ def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnifie
 
 def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Array:
     """Overlap error (N,) of point n of ``first`` with point n of ``second``: 1 - intersection / union, as in :func:`overlaps`; 1
-    for points that the homography sends to infinity."""
+    for points that the homography maps to infinity."""
     back = invert(homography)
     radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
     # in units of that radius the first region is the unit disc
@@ -141,9 +140,10 @@ def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magni
 
 
 def shared_area(centres: Array, ellipses: Array) -> Array:
-    """Areas (N,) that the unit disc shares with ellipses {c + x : x^T S^-1 x <= 1}: ``centres`` c (N, 2), ``ellipses`` S (N, 2, 2).
+    """Areas (N,) of the intersection of the unit disc with ellipses {c + x : x^T S^-1 x <= 1}: ``centres`` c (N, 2), ``ellipses``
+    S (N, 2, 2).
 
-    The vertical chords of both are intersected at nodes that lie close where the disc is short; good to 0.006.
+    Integrates over the intersection of vertical chords, with denser nodes where the disc is short; accurate to 0.006.
     """
     angles = (np.arange(_NODES) + 0.5) * np.pi / _NODES - np.pi / 2.0
     x, half = np.sin(angles), np.cos(angles)
@@ -157,7 +157,7 @@ def shared_area(centres: Array, ellipses: Array) -> Array:
 
 
 def one_to_one(first: Integers, second: Integers, error: Array) -> Integers:
-    """Rows of pairs, the least ``error`` first, such that no index of ``first`` or of ``second`` is there twice."""
+    """Rows of pairs, by increasing ``error``, such that no index of ``first`` or of ``second`` occurs twice."""
     taken_first: set[int] = set()
     taken_second: set[int] = set()
     rows = []
@@ -171,11 +171,11 @@ def one_to_one(first: Integers, second: Integers, error: Array) -> Integers:
 
 
 def distinct_count(points: Array, sigmas: Array) -> float:
-    """How many of ``points`` (N, 2) there are without those that repeat others: the volume below the maximum of Gaussians of
-    volume 1 around them, of standard deviations ``sigmas`` (N,) (Rey-Otero et al., 2015, section 3).
+    """The number of ``points`` (N, 2) without redundancy: the volume below the maximum of Gaussians of volume 1 around them, of
+    standard deviations ``sigmas`` (N,) (Rey-Otero et al., 2015, section 3).
 
-    N for points far from each other, 1 for N times the same. Computed as the share of each Gaussian in which it is the highest,
-    by a fixed pattern of points drawn from it.
+    N for distant points, 1 for N identical ones. Computed as the fraction of each Gaussian in which it is the highest, on a fixed
+    sample.
     """
     n = len(points)
     k = np.arange(_SAMPLES) + 0.5
@@ -193,20 +193,20 @@ def distinct_count(points: Array, sigmas: Array) -> float:
 
 
 def distinct(keypoints: Keypoints) -> Keypoints:
-    """Each place and size once, in the order of the points."""
+    """Each position and size once, in the order of the points."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
     _, index = np.unique(rows, axis=0, return_index=True)
     return keypoints[np.sort(index)]
 
 
 def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
-    """The sizes of the second image's points, seen in the first: of the disc of the same area."""
+    """The sizes of the second image's points in the first, for discs of equal area."""
     areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
     return np.asarray(second.sizes * np.sqrt(areas))
 
 
 def _near(first: Keypoints, second: Keypoints, homography: Array) -> int:
-    """One-to-one pairs that lie within :data:`NEAR` of each other in the first image, whatever their sizes."""
+    """Number of one-to-one pairs within :data:`NEAR` in the first image, whatever their sizes."""
     mapped = project(invert(homography), second.points)
     near = cKDTree(mapped).query_ball_point(first.points, NEAR)
     i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)

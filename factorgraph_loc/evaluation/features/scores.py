@@ -1,4 +1,4 @@
-"""Features on several sequences of images: their scores as tables, files and pictures (figure 3 of the paper among them)."""
+"""Scores of features on several sequences of images as tables, files and plots (among them figure 3 of the paper)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.feature_evaluation import Feature, RankedMatches, evaluate
 from factorgraph_loc.evaluation.features.sequences import OTHER, Sequence
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import replacing, write_text
-from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.vision.matching import RATIO
 
 if TYPE_CHECKING:
@@ -25,9 +24,9 @@ if TYPE_CHECKING:
 
 FILES = ("table.md", "pairs.parquet", "matches.parquet", "figure3.png", "matching.png")
 OURS = "colour"
-HOMOGRAPHY = 5.0  # px, within which a homography is called found in the table
+HOMOGRAPHY = 5.0  # px, largest error of a correct homography in the table
 
-# of the table; column: figure of the rows, digits
+# columns of the table: key of the rows, digits
 COLUMNS = {
     "features": ("features", 0),
     "repeatability": ("repeatability", 3),
@@ -42,15 +41,15 @@ COLUMNS = {
     "time [ms]": ("milliseconds", 1),
 }
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_PANELS = 3  # beside each other
+_PANELS = 3  # side by side
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class FeatureScores:
-    """``rows``: one a feature and pair of images, as :class:`~factorgraph_loc.evaluation.features.feature_evaluation.PairScores`
-    names them.
+    """``rows``: one per feature and pair of images, with the fields of
+    :class:`~factorgraph_loc.evaluation.features.feature_evaluation.PairScores`.
 
     ``ranked``: the ranked matches of each row, None for detectors.
     """
@@ -67,14 +66,14 @@ class FeatureScores:
         return list(dict.fromkeys(row["sequence"] for row in self.rows))
 
     def of(self, name: str, sequences: Several[str]) -> list[int]:
-        """The places of the rows of one feature on some sequences."""
+        """The indices of the rows of one feature on some sequences."""
         return [i for i, r in enumerate(self.rows) if r["feature"] == name and r["sequence"] in sequences]
 
 
 def evaluate_all(
     sequences: Several[Sequence], features: Several[Feature], progress: Callable[[float, float], None]
 ) -> FeatureScores:
-    """The scores of each feature on each sequence; ``progress`` is told how many images are done, of how many."""
+    """The scores of each feature on each sequence; ``progress`` is called with the number of images done, and of all."""
     scores = FeatureScores([], [])
     total = len(features) * sum(1 + len(sequence.others) for sequence in sequences)
     done = 0
@@ -88,7 +87,7 @@ def evaluate_all(
         for feature in features:
             for pair, ranked in evaluate(sequence, feature, step):
                 row = pair.row()
-                # detectors have no homography, which is not the same as not to find it
+                # detectors have no homography, which is not the same as a failed one
                 error = row["homography_error"]
                 row["homography_found"] = error if np.isnan(error) else float(error < HOMOGRAPHY)
                 scores.rows.append(row)
@@ -97,17 +96,13 @@ def evaluate_all(
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """InputError if ``out`` is no folder to write to, or holds such results already."""
-    sweep(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is not a folder")
-    if not overwrite and (there := [name for name in FILES if (out / name).exists()]):
-        raise InputError(f"{out}: has {there[0]} already; choose another folder or give --overwrite")
+    """Raise InputError if ``out`` is not a folder, or contains such results already."""
+    require_free(out, FILES, overwrite=overwrite)
 
 
 def write_scores(scores: FeatureScores, out: Path) -> None:
-    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, all ranked matches, and both pictures."""
-    try:
+    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, all ranked matches, and both plots."""
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "table.md", tables(scores))
         frame = pl.DataFrame(scores.rows).drop("homography_found")
@@ -117,13 +112,11 @@ def write_scores(scores: FeatureScores, out: Path) -> None:
         for name, draw in (("figure3.png", figure3), ("matching.png", recall_curves)):
             with replacing(out / name) as temporary:
                 save(draw(scores), temporary)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
 
 
 def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of a table: each feature, mean over the pairs of ``sequences`` (None: of all), of times the median; a dash
-    where a feature has no such score."""
+    """Header and rows of a table: for each feature the mean over the pairs of ``sequences`` (None: of all), for times the median;
+    a dash where a feature has no such score."""
     chosen = scores.sequences() if sequences is None else sequences
     lines = []
     for name in scores.names():
@@ -133,7 +126,7 @@ def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tup
 
 
 def tables(scores: FeatureScores) -> str:
-    """The summary over all, and for each sequence the repeatability of each pair, as markdown."""
+    """The summary over all, and for each sequence the repeatability of each pair, in Markdown."""
     parts = [
         f"Mean over {len(scores.of(scores.names()[0], scores.sequences()))} pairs of images\n",
         markdown(*summary(scores)),
@@ -151,10 +144,10 @@ def tables(scores: FeatureScores) -> str:
 
 
 def figure3(scores: FeatureScores) -> Any:
-    """Repeatability over the change between the images, a row of panels for each sequence.
+    """Plot repeatability over the change between the images, with a row of panels for each sequence.
 
-    Left the competitors, right the colour features, if they were evaluated, over the range of the competitors. Photographs that
-    were warped alike are averaged.
+    Left the competitors, right the colour features, if evaluated, with the range of the competitors. Photographs with the same
+    warp are averaged.
     """
     groups = _groups(scores)
     others = [name for name in scores.names() if name != OURS]
@@ -179,7 +172,7 @@ def figure3(scores: FeatureScores) -> Any:
 
 
 def recall_curves(scores: FeatureScores) -> Any:
-    """Recall over 1 - precision of all pairs of a group together, the threshold being the ratio of distances."""
+    """Plot recall over 1 - precision for all pairs of a group, with the ratio of distances as threshold."""
     groups = _groups(scores)
     columns = min(_PANELS, len(groups))
     rows = -(-len(groups) // columns)
@@ -210,7 +203,7 @@ def _curve(axis: Axes, ranked: Several[RankedMatches], **style: Any) -> None:
 
 
 def _groups(scores: FeatureScores) -> dict[str, list[str]]:
-    """Sequences to be drawn together, by title: photographs warped by the same amounts, every other one alone."""
+    """Sequences to be plotted together, by title: photographs with the same warps; others alone."""
     groups: dict[tuple[Any, ...], list[str]] = {}
     first = scores.names()[0]
     for sequence in scores.sequences():
@@ -226,14 +219,14 @@ def _groups(scores: FeatureScores) -> dict[str, list[str]]:
 
 
 def _means(scores: FeatureScores, name: str, sequences: Several[str]) -> tuple[list[float], list[float]]:
-    """Amounts of change in rising order, and the mean repeatability at each."""
+    """Amounts of change in ascending order, and the mean repeatability at each."""
     rows = [scores.rows[i] for i in scores.of(name, sequences)]
     amounts = sorted({row["amount"] for row in rows})
     return amounts, [float(np.mean([r["repeatability"] for r in rows if r["amount"] == x])) for x in amounts]
 
 
 def _style(name: str, names: Several[str], *, markers: bool = True) -> dict[str, Any]:
-    # the same look in all panels and both pictures
+    # the same style in all panels and both plots
     i = names.index(name)
     style = {"color": COLOURS[i % len(COLOURS)], "linewidth": 2.0}
     return style | {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 7} if markers else style
@@ -246,13 +239,13 @@ def _label(name: str) -> str:
 def _cell(values: Several[float], key: str, digits: int) -> str:
     if np.isnan(values).all():
         return "-"
-    # the first calls of a process and a busy machine make outliers
+    # first calls of a process and a busy machine cause outliers
     middle = np.median(values) if key == "milliseconds" else np.mean(values)
     return f"{middle:.{digits}f}"
 
 
 def _matches(scores: FeatureScores) -> pl.DataFrame:
-    """Every mutual match: feature, sequence, image, ratio of distances, whether it is right."""
+    """Every mutual match: feature, sequence, image, ratio of distances, and whether it is correct."""
     frames = [
         pl.DataFrame({"ratio": r.ratio, "right": r.right}).select(
             *(pl.lit(row[key]).alias(key) for key in ("feature", "sequence", "image")), "ratio", "right"

@@ -1,4 +1,4 @@
-"""Images of one flat scene with known homographies: folders as those of Oxford, or one photograph warped by known amounts.
+"""Images of one planar scene with known homographies: folders in the Oxford format, or one photograph with known warps.
 
 Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005: ``img1`` to ``imgN`` and the homographies
 ``H1to2p`` to ``H1toNp`` from the first image to each other one.
@@ -17,20 +17,20 @@ from factorgraph_loc.evaluation.features.homography import View, read_homography
 from factorgraph_loc.vision.images import Image, read_image
 from factors.se2 import Array
 
-ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # by how much a photograph is made smaller
+ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # factors by which a photograph is reduced
 ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
-MIN_WARPED = 128  # px a side: a fourth of it must still have features
+MIN_WARPED = 128  # px per side: a quarter of it must still have features
 
 SCALE, ROTATION, VIEWPOINT, OTHER = "scale change", "rotation [degrees]", "viewpoint (tilt)", "image"
-_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # from where on a sequence is about this
+_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # thresholds of the dominant change
 _SUFFIXES = ("", ".txt", ".xml")
 
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """A first image, and others with the homographies (3, 3) [px] that lead to them from the first.
+    """A first image, and others with the homographies (3, 3) [px] from the first to them.
 
-    ``change``: what differs between the images; ``amounts``: how much of it is in each of the others.
+    ``change``: what differs between the images; ``amounts``: its amount in each of the others.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Sequence:
 def find_sequences(paths: Several[Path]) -> list[Sequence]:
     """The sequences of ``paths``: folders of one sequence, folders of such folders, and photographs, which are warped.
 
-    InputError for what is none of these, or is damaged.
+    Raises InputError for anything else, or damaged files.
     """
     found: list[Sequence] = []
     for path in paths:
@@ -64,7 +64,7 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """The sequence in a folder; InputError names the file that is missing or damaged."""
+    """Read the sequence in a folder. Raises InputError for a missing or damaged file."""
     paths = _images(folder)
     if sorted(paths) != list(range(1, len(paths) + 1)) or len(paths) < 2:
         missing = next(k for k in range(1, max(paths, default=0) + 2) if k not in paths)
@@ -83,11 +83,12 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
-    """A photograph made smaller by :data:`ZOOMS`, and turned by :data:`ROTATIONS`.
+    """A photograph reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
 
-    What is made smaller, by means over areas, lies in the middle of the mirrored photograph: a camera farther away sees more of
-    the surroundings, so that the same number of points falls on less of the scene. Of turned images the square is kept that has
-    no border in any of them; the first image is the same square. InputError, naming ``source``, if the photograph is too small.
+    A reduced photograph (area averaging) is placed in the middle of the mirrored original: a camera farther away sees more of the
+    surroundings, so that the same number of points falls on less of the scene. Rotated images are cropped to the square without
+    border in any of them; the first image is the same square. Raises InputError, naming ``source``, if the photograph is too
+    small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
@@ -120,7 +121,7 @@ def _rotated(photograph: Image, name: str) -> Sequence:
     centre, middle = np.array((width - 1.0, height - 1.0)) / 2.0, (side - 1.0) / 2.0
 
     def turned(degrees: float) -> tuple[Image, Array]:
-        """The square turned, and the map from the photograph to it."""
+        """The rotated square, and the map from the photograph to it."""
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         matrix = np.eye(3)
         matrix[:2, :2] = ((c, -s), (s, c))
@@ -138,7 +139,7 @@ def _rotated(photograph: Image, name: str) -> Sequence:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """The files ``imgK.*`` of a folder by K; InputError if there are several of one K."""
+    """The files ``imgK.*`` of a folder by K. Raises InputError for several files with one K."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"img(\d+)\.\w+", path.name)
@@ -151,7 +152,7 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def _change(views: Several[View]) -> tuple[str, tuple[float, ...]]:
-    """What a sequence is about, from the geometry of its pairs; blur and light leave none, then images are counted."""
+    """The dominant change of a sequence, from the geometry of its pairs; blur and light leave none, then images are numbered."""
     zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
     if max(v.tilt for v in views) > _TILTED:
         return VIEWPOINT, tuple(v.tilt for v in views)

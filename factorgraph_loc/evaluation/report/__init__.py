@@ -1,4 +1,4 @@
-"""A page of results: one HTML file that needs nothing else."""
+"""A report of results as one self-contained HTML file."""
 
 from factorgraph_loc.evaluation.report.page import write_report
 from factorgraph_loc.evaluation.report.reading import RunFiles

@@ -1,4 +1,4 @@
-"""What the charts of the page show, as plain values for its script."""
+"""The data of the page's charts, as plain values for its script."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,11 +10,11 @@ from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results
 
 Chart = dict[str, Any]
 Trust = Mapping[str, tuple[float, float, float]]
-_Dot = tuple[float, str]  # a value, and what it is of
+_Dot = tuple[float, str]  # a value, and its label
 
 
 def ratios(results: Results, c: Comparison) -> Chart | None:
-    """Of each variant over the baseline, a dot a log, a mark at the median; None where nothing can be divided."""
+    """Ratios of each variant to the baseline, with a dot per log and a mark at the median; None if there are none."""
     rows: list[dict[str, Any]] = []
     for place, variant in enumerate(results.variants):
         found = c.contrasts.get(variant)
@@ -35,7 +35,7 @@ def ratios(results: Results, c: Comparison) -> Chart | None:
 
 
 def consistency(results: Results, trust: Trust, by_log: Mapping[tuple[str, str], float]) -> Chart | None:
-    """Mean NEES per degree of freedom: a dot a log, the mean over logs, and the band around 1."""
+    """Mean NEES per degree of freedom: a dot per log, the mean over logs, and its 95 % band around 1."""
     rows: list[dict[str, Any]] = []
     for place, variant in enumerate(results.variants):
         if variant in trust:
@@ -49,7 +49,7 @@ def consistency(results: Results, trust: Trust, by_log: Mapping[tuple[str, str],
 
 
 def times(results: Results, metric: Metric) -> Chart | None:
-    """A dot a log, a mark at the median over logs."""
+    """A dot per log, and a mark at the median over logs."""
     rows: list[dict[str, Any]] = []
     for place, variant in enumerate(results.variants):
         by_log = results.scores(metric.key, variant)
@@ -67,8 +67,8 @@ def times(results: Results, metric: Metric) -> Chart | None:
 
 
 def sweep(results: Results, column: str, metric: Metric) -> Chart | None:
-    """A metric over the values of a swept setting: a line a label and choice of the other swept settings, with intervals where logs
-    or seeds are enough. None where the setting's values are no numbers, or there is no score."""
+    """A metric over the values of a swept setting: a line per label and combination of the other swept settings, with intervals
+    where there are enough logs or seeds. None if the setting is not numeric, or there is no score."""
     lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
     variants: dict[str, int] = {}
     for place, variant in enumerate(results.variants):
@@ -118,5 +118,5 @@ def _median(dots: Sequence[_Dot]) -> float:
 
 
 def _short(value: float) -> float:
-    """Five digits are enough to draw."""
+    """A value with five digits, for drawing."""
     return float(f"{value:.5g}")

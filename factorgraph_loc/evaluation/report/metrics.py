@@ -1,4 +1,4 @@
-"""How scores are called, in which unit they are shown, and which is the better."""
+"""Titles and units of scores, and which direction is better."""
 
 import math
 from dataclasses import dataclass
@@ -31,12 +31,12 @@ class Metric:
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     def text(self, value: float, *, sign: bool = False) -> str:
-        """A value as people read it, without the unit."""
+        """A formatted value without the unit."""
         return number(self.factor * value, sign=sign)
 
 
 def metric_of(key: str) -> Metric:
-    """The metric of a key of the scores; of an unknown one nothing is called better."""
+    """The metric of a key of the scores; for an unknown one neither direction is better."""
     kind, _, what = key.partition(".")
     if kind in ("causal", "final", "aligned"):
         return _of_trajectory(key, kind, what)
@@ -77,7 +77,7 @@ _OTHERS = {
 
 
 def number(value: float, *, sign: bool = False) -> str:
-    """Three digits that say something, no exponent; with ``sign`` also a plus. A minus is a true one."""
+    """Three significant digits without exponent, with a plus if ``sign``, and a true minus sign."""
     if not math.isfinite(value):
         return "–"
     if value == 0.0:

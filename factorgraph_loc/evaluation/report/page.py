@@ -1,7 +1,7 @@
-"""One self-contained HTML file of an experiment's results: words, tables, charts, and what it takes to repeat them.
+"""One self-contained HTML file of an experiment's results: text, tables, charts, and what is needed to repeat them.
 
-The page loads nothing: style, script and data are in it, and its policy forbids all else, so that not even a string that slipped
-through unescaped could run. The same results give the same bytes.
+The page loads nothing: style, script and data are included, and its content security policy forbids everything else, so that an
+unescaped string could not run. The same results give the same bytes.
 """
 
 import base64
@@ -28,8 +28,8 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.version import __version__
 
-SHOWN = 8  # variants that are visible at first
-_SWEPT = 3  # metrics that are drawn over a swept setting
+SHOWN = 8  # variants that are visible initially
+_SWEPT = 3  # metrics that are plotted over a swept setting
 
 
 def write_report(
@@ -46,11 +46,11 @@ def write_report(
 ) -> None:
     """Write the page ``out``.
 
-    ``rows``: one a run, with key, log, estimator, seed, status (ok, failed), reason, the scores, and where there are such label,
-    sensors, kind (of a failure) and ``sweep.*``. ``runs``: the files of a run that went well, by its key. ``metrics``: scores to
-    show. ``baseline``: the label that the others are compared with, by default the first. ``experiment``: what was asked for, as
-    plain values. ``damaged``: runs whose results are left out, in words. ``versions``: of what the runs were made with, by default
-    those that the configuration of the first tells.
+    ``rows``: one per run, with key, log, estimator, seed, status (ok, failed), reason, scores, and optionally label, sensors,
+    kind (of a failure) and ``sweep.*``. ``runs``: the files of a successful run, by its key. ``metrics``: scores to show.
+    ``baseline``: the label that the others are compared with, by default the first. ``experiment``: the experiment file as plain
+    values. ``damaged``: descriptions of runs with unusable results. ``versions``: of the software used, by default those in the
+    configuration of the first run.
 
     Raises InputError for no rows, or a baseline that is no label.
     """
@@ -140,11 +140,11 @@ class _Page:
         note = (
             f"RMSEs are pooled as root mean square, the rest is averaged, {over}. Below each figure: its 95 % interval in "
             "brackets, or the range, least … most, where logs or seeds are too few for one. ● best of the column; ○ not "
-            "significantly different from the best. Causal is what the robot knows at the time, final what the whole log tells; "
-            "compare neither with the other."
+            "significantly different from the best. Causal estimates use measurements up to their time, final ones the whole "
+            "log; do not compare one with the other."
         )
         if len(set(results.logs.values())) < len(results.logs):
-            note += " Logs that differ in a swept setting alone count as one log."
+            note += " Logs that differ only in a swept setting count as one log."
         return self._section("results", "Results", _note(note), tables.overview(results, best))
 
     def _differences(self, against: Sequence[Comparison]) -> Html | str:
@@ -187,13 +187,13 @@ class _Page:
         more = f" {left} of {len(self._results.logs)} logs are not drawn, to keep the page small." if left else ""
         note = (
             "Over walls (lines), tags (squares), landmarks (triangles), mapped points (dots) and the reference (broad grey). "
-            "Drag to move; click, then scroll to zoom, or pinch; double-click for all. Of several seeds the one with the median "
-            f"{self._metrics[0].title} is drawn.{more}"
+            "Drag to move; click, then scroll to zoom, or pinch; double-click for all. Of several seeds the one with the "
+            f"median {self._metrics[0].title} is drawn.{more}"
         )
         below = (
             "Below: position error (line) and twice the stated standard deviation in the direction in which it is largest "
-            "(area). A line that often leaves its area is that of an estimator that is too sure of itself. Drag to look at a "
-            "stretch of time; double-click for all. Of each short stretch the least and the largest error are drawn."
+            "(area). A line that is often outside of its area belongs to an overconfident estimator. Drag to select an "
+            "interval; double-click for all. Of each short interval the smallest and the largest error are drawn."
         )
         return self._section(
             "trajectories",
@@ -214,8 +214,8 @@ class _Page:
             for kind in KINDS
         ]
         note = (
-            "The share of times at which the position error is below a value: farther left is better. Of all logs those that "
-            "all estimators shown have, each counted alike."
+            "The fraction of times at which the position error is below a value: farther left is better. Only logs that all "
+            "shown estimators have are used, with equal weights."
         )
         return self._section(
             "distributions",
@@ -243,12 +243,12 @@ class _Page:
         if chart is None:
             return ""
         note = (
-            "The average normalised estimation error squared says whether stated covariances are right: 1 per degree of freedom is "
-            "ideal, above it an estimator is too sure of itself, below it less sure than it could be."
+            "The average normalised estimation error squared (ANEES) tests the stated covariances: 1 per degree of freedom is "
+            "ideal, above it an estimator is overconfident, below it underconfident."
         )
         caption = (
-            "A dot is a log, the bar the mean over logs. Shaded: where that mean lies with 95 % if the covariances are right, "
-            "for as many values as are independent, since errors of successive poses go together."
+            "A dot is a log, the bar the mean over logs. Shaded: the 95 % band of that mean for correct covariances, based on "
+            "the effective number of independent values, since errors of successive poses are correlated."
         )
         return self._section("consistency", "Consistency", _note(note), self._figure(chart, "Causal ANEES", caption))
 
@@ -267,21 +267,21 @@ class _Page:
     def _warnings(self) -> Html | str:
         if not by_text(self._results.rows):
             return ""
-        note = "What the runs say of logs, rigs and settings that may spoil the figures."
+        note = "Warnings of the runs about logs, rigs and settings that may affect the results."
         return self._section("warnings", "Warnings", _note(note), tables.warnings(self._results))
 
     def _failures(self) -> Html | str:
         count = sum(row["status"] != "ok" for row in self._results.rows)
         if not count:
             return ""
-        note = f"{count} of {len(self._results.rows)} runs failed, and are in none of the figures."
+        note = f"{count} of {len(self._results.rows)} runs failed, and are excluded from all figures."
         return self._section("failures", "Failures", _note(note), tables.failures(self._results))
 
     def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: Reading) -> Html:
         parts: list[object] = []
         if experiment:
             asked = tag("pre", tomli_w.dumps(_toml(experiment)))
-            parts.append(tag("details", tag("summary", "What was asked for"), asked))
+            parts.append(tag("details", tag("summary", "Experiment file"), asked))
         if drawn.configs:
             chosen = tag("div", tag("div", class_="controls"), tag("pre"), id="configs")
             parts.append(tag("details", tag("summary", "Effective configuration of a run"), chosen, open=""))
@@ -293,14 +293,14 @@ class _Page:
     def _method(self) -> Html:
         return self._section(
             "method",
-            "How it was counted",
+            "Statistics",
             _note(
-                "Runs are paired by log and seed, and logs are what a statement is made of. With six logs or more intervals are "
-                "a percentile bootstrap that draws logs and, within each, seeds; with one log they are over its seeds, if there "
-                "are six or more, and say something of this log only. Else figures stand side by side, and nothing is tested. "
-                "The test is Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected as of Holm "
+                "Runs are paired by log and seed, and logs are the statistical units. With six logs or more intervals are a "
+                "percentile bootstrap that draws logs and, within each, seeds; with one log they are over its seeds, if there "
+                "are six or more, and hold for this log only. Otherwise figures are listed without a test. The test is "
+                "Wilcoxon's signed-rank test, two-sided, on differences by log; p values are corrected by Holm's method "
                 "within each column; below 0.05 a difference is called significant. The effect is the matched-pairs "
-                "rank-biserial correlation. Shares have Wilson's interval. Trajectories are scored at the stamps of the "
+                "rank-biserial correlation. Proportions have Wilson's interval. Trajectories are scored at the stamps of the "
                 "reference, at most ten a second, without alignment; between estimates they are interpolated. There are "
                 "estimates ten times a second, but none inside gaps of more than a minute (or what tick_gap says) in which no "
                 "sensor measured anything."
@@ -309,18 +309,18 @@ class _Page:
 
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """The metrics of which there is any score; with ``whole`` all of them if there is none."""
+    """The metrics that have any score; with ``whole`` all of them if there is none."""
     found = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return found or ([metric_of(k) for k in keys] if whole else [])
 
 
 def _note(note: str) -> Html:
-    """A paragraph that explains; a number and its percent sign stay together."""
+    """An explanatory paragraph; a number and its percent sign are not separated."""
     return tag("p", note.replace(" %", "\u00a0%"), class_="note")
 
 
 def _toml(content: Any) -> Any:
-    """TOML has no null: left out."""
+    """Omit null values, which TOML lacks."""
     if isinstance(content, Mapping):
         return {str(key): _toml(value) for key, value in content.items() if value is not None}
     if isinstance(content, list | tuple):

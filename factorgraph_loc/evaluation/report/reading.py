@@ -1,4 +1,4 @@
-"""What the page takes from the files of the runs: trajectories, errors, consistency, configurations."""
+"""Data read from the files of the runs for the page: trajectories, errors, consistency, configurations."""
 
 import tomllib
 from collections.abc import Callable, Mapping
@@ -14,15 +14,15 @@ from factorgraph_loc.evaluation.report.tracks import KINDS, Series
 from factors.se2 import Array
 
 POSES = 200_000  # on the page, shared by all trajectories
-FEWEST, MOST = 60, 1200  # of them in one trajectory
-TRACKS = 1000  # runs that are drawn; logs beyond that are left to the tables
+FEWEST, MOST = 60, 1200  # bounds for one trajectory
+TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
 _ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """``read``: the content of a file of a run (``estimates.parquet``, ``config.toml``) by its name; ``scene``: what its log looks
-    like, if that is known."""
+    """``read``: returns the content of a file of a run (``estimates.parquet``, ``config.toml``) by its name; ``scene``: map of
+    the log, if known."""
 
     read: Callable[[str], bytes]
     scene: Scene | None = None
@@ -30,12 +30,12 @@ class RunFiles:
 
 @dataclass
 class Reading:
-    """What was read.
+    """The data read from all runs.
 
-    ``tracks``: of each log in ``logs``, packed, as elements of the page. ``errors``: by kind, log and variant, quantiles of the
-    position error [m]. ``nees``: of a variant on a log, mean of the causal poses per degree of freedom; ``trust``: of a variant the
-    mean over logs, and the band in which it lies where covariances are right. ``configs``: ``text`` of the configuration of a
-    ``run``; ``versions``: of what the first was made with.
+    ``tracks``: packed trajectories of each log in ``logs``, as elements of the page. ``errors``: by kind, log and variant,
+    quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses per degree of freedom;
+    ``trust``: by variant, the mean over logs and its 95 % band for correct covariances. ``configs``: ``text`` of the
+    configuration of a ``run``; ``versions``: of the software used by the first run.
     """
 
     tracks: list[Html] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Reading:
 
 
 def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> Reading:
-    """Read the files of all runs that went well; of those of several seeds that with the median of ``metric`` is drawn."""
+    """Read the files of all successful runs; of several seeds the trajectory with the median ``metric`` is drawn."""
     found = Reading()
     chosen = {
         (variant, log): row

@@ -1,4 +1,4 @@
-"""The rows of an experiment, by what was run (a variant: label, sensors, swept settings) and on which log."""
+"""The rows of an experiment by variant (label, sensors, swept settings) and log."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,15 +13,15 @@ from factorgraph_loc.model.scoring import RULE
 
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
-SCORED = 10  # poses that a log's reference must tell of at least: with fewer, its scores say nothing
-_SCORES = ("causal.", "final.", "aligned.")  # what errors against the reference begin with
+SCORED = 10  # least number of scored poses
+_SCORES = ("causal.", "final.", "aligned.")  # prefixes of errors with respect to the reference
 
 Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What is compared: a ``label``, and what sets it apart from others of that label; ``swept``: its settings by dotted name."""
+    """What is compared: a ``label``, its difference from others of that label; ``swept``: its settings by dotted name."""
 
     name: str
     label: str
@@ -30,8 +30,10 @@ class Variant:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of one metric. ``pooled``: of each variant, None where it has none; ``best``: the variant with the best of those that have
-    all logs; ``contrasts``: with ``reference``, a variant, of the others; ``p``: corrected for their number."""
+    """Comparison of the variants by one metric.
+
+    ``pooled``: by variant, None without scores; ``best``: the best of the variants that have all logs; ``contrasts``: of the
+    others with ``reference``, a variant; ``p``: p values corrected for their number."""
 
     metric: Metric
     pooled: dict[str, Pooled]
@@ -42,23 +44,23 @@ class Comparison:
 
     @property
     def can_tell(self) -> bool:
-        """Whether any difference could become significant: with few logs and many comparisons none can."""
+        """Whether any difference could be significant, which needs enough logs for the number of comparisons."""
         tested = [c.count for name, c in self.contrasts.items() if self.p[name] is not None]
         return bool(tested) and least_p(max(tested)) * len(tested) < SIGNIFICANT
 
     def is_significant(self, variant: str) -> bool:
-        """Whether a variant differs from the reference."""
+        """Whether a variant differs significantly from the reference."""
         p = self.p.get(variant)
         return p is not None and p < SIGNIFICANT
 
 
 class Results:
-    """``variants`` by name, in the order of the rows; ``logs``: the names of the logs by what they are called here; ``rows``: all
-    of them, as dictionaries.
+    """``variants`` by name, in the order of the rows; ``logs``: names of the logs by their label on the page; ``rows``: all of
+    them, as dictionaries.
 
-    A simulated log is shown as another one for each value of a setting of the simulation that is swept; intervals and tests count
-    these as one. ``outdated``: the runs that were not scored by the rule of this version; beside runs that were, they have no
-    errors, for they cannot be compared.
+    For each value of a swept setting of the simulation, a simulated log is listed separately; intervals and tests count these as
+    one. ``outdated``: the runs that were scored by another version's rule; if mixed with current ones, their errors are ignored
+    as they cannot be compared.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
@@ -87,18 +89,18 @@ class Results:
         return [row for log in self.logs for row in self.runs(variant, log)]
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
-        """The scores of a variant by log and seed, None where a run failed or has none."""
+        """The scores of a variant by log and seed, None for failed runs and missing scores."""
         found = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
         return {log: seeds for log, seeds in found.items() if seeds}
 
     def representative(self, variant: str, log: str, metric: str) -> Row | None:
-        """The run that stands for all seeds: that with the median score, or the first that went well."""
+        """The run that represents all seeds: that with the median score, or the first successful one."""
         well = [row for row in self.runs(variant, log) if row["status"] == "ok"]
         ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
 
     def compare(self, metric: Metric, reference: str | None = None) -> Comparison:
-        """All variants with a reference, by default with the best, then without intervals of the differences."""
+        """Compare all variants with a reference, by default with the best and without intervals of the differences."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
         found = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
         best = _best(metric, scores, found)
@@ -113,7 +115,7 @@ class Results:
         return Comparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
-        """Logs of which too little is known to score them."""
+        """Logs with too short a reference to be scored."""
         kinds = [f"{kind}.scored" for kind in ("causal", "final")]
         return [
             log
@@ -156,9 +158,9 @@ class Results:
 
 
 def score(row: Row, metric: str) -> float | None:
-    """The score of a run; None where it failed, has none, or was scored at too few poses to say anything.
+    """The score of a run; None if it failed, has none, or was scored at too few poses.
 
-    Update times of an estimator that waits for the end of the log mean nothing.
+    Update times of offline estimators are ignored.
     """
     kind = metric.partition(".")[0]
     if metric.startswith("timing.update") and row.get("time_to_localized") is None:
@@ -183,7 +185,7 @@ def _run_name(row: Row) -> str:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], found: Mapping[str, Pooled]) -> str | None:
-    """Of the variants with a score of each log that any has."""
+    """The best variant among those with a score of each log that any variant has."""
     if metric.better is None or not found:
         return None
     complete = {

@@ -1,4 +1,4 @@
-"""What a trajectory is drawn over: the map of a log and its reference, small enough to be kept beside results."""
+"""The background of trajectory plots: map and reference of a log, reduced in size for storage beside results."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.marks import Marks, marks
 from factors.se2 import Array
 
-_POSES = 1500  # of the reference, in all
+_POSES = 1500  # of the reference, in total
 _POINTS = 1500  # of a map of points
 
 
 @dataclass(frozen=True)
 class Scene:
-    """In the world's frame [m]: ``walls`` (W, 4) as x1, y1, x2, y2; ``layers`` of the map (N, 2), such as landmarks, tags and
-    points; ``reference``: pieces (N, 2) without a long gap. ``t0_ns``: the log's start, absolute."""
+    """Map and reference in the world frame [m].
+
+    ``walls`` (W, 4) as x1, y1, x2, y2; ``layers`` of the map (N, 2), such as landmarks, tags and points; ``reference``: pieces
+    (N, 2) between long gaps. ``t0_ns``: the log's start, absolute."""
 
     walls: Array
     layers: Mapping[str, Array]
@@ -33,7 +35,7 @@ class Scene:
 
     @classmethod
     def of(cls, log: Log) -> Scene:
-        """The scene of a log; things of the map are where estimators take them to be."""
+        """The scene of a log, with objects where estimators assume them."""
         return cls(
             walls=np.array(log.world.walls, dtype=float).reshape(-1, 4),
             layers={one.layer: _thinned(one) for one in marks(log)},
@@ -42,7 +44,7 @@ class Scene:
         )
 
     def content(self) -> dict[str, Any]:
-        """As plain values, in millimetres."""
+        """The scene as plain values, in millimetres."""
         return {
             "walls": _millimetres(self.walls),
             **{name: _millimetres(places) for name, places in self.layers.items()},
@@ -50,12 +52,12 @@ class Scene:
         }
 
     def write(self, path: Path) -> None:
-        """Write a JSON file at once or not at all."""
+        """Write a JSON file atomically."""
         write_text(path, json.dumps(self.content() | {"t0_ns": self.t0_ns}, separators=(",", ":")) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> Scene:
-        """Read what :meth:`write` wrote; OSError or ValueError if it is not there or damaged."""
+        """Read the file of :meth:`write`. Raises OSError or ValueError if it is missing or damaged."""
         found = _SceneFile.model_validate_json(path.read_bytes())
         return cls(
             walls=_metres(found.walls, 4),
@@ -69,7 +71,7 @@ _Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 class _SceneFile(BaseModel, extra="allow"):
-    """What is kept: coordinates one after the other [mm], also of each layer of the map."""
+    """The stored file: flattened coordinates [mm], also of each layer of the map."""
 
     __pydantic_extra__: dict[str, list[_Whole]]
     walls: list[_Whole]

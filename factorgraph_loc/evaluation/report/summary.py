@@ -1,4 +1,4 @@
-"""What came out, in words that the tables and charts of the page can be checked against."""
+"""A summary of the results in words, which tables and charts support."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,7 +7,7 @@ from factorgraph_loc.evaluation.report.results import SCORED, Comparison, Result
 from factorgraph_loc.evaluation.report.tables import p_value, uncertainty
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
 
-_SPOKEN = 2  # metrics of which the best is told
+_SPOKEN = 2  # metrics whose best variant is named
 
 
 def summary(
@@ -16,13 +16,15 @@ def summary(
     trust: Mapping[str, tuple[float, float, float]],
     damaged: Sequence[str] = (),
 ) -> Html:
-    """``against_best``: comparisons with the best of each metric. ``trust``: of each variant the mean NEES per degree of freedom of
-    its causal poses, and the band in which it lies where covariances are right. ``damaged``: runs that are left out."""
+    """The summary as paragraphs.
+
+    ``against_best``: comparisons with the best variant of each metric. ``trust``: of each variant the mean NEES per degree of
+    freedom of its causal poses, and its 95 % band for correct covariances. ``damaged``: runs that are excluded."""
     paragraphs = [_extent(results)]
     paragraphs += [_best(c) for c in [c for c in against_best if c.best is not None][:_SPOKEN]]
     paragraphs += _trust(trust)
     if damaged:
-        left_out = f"{_count(len(damaged), 'run')} {_is(damaged)} damaged, and left out: "
+        left_out = f"{_count(len(damaged), 'run')} {_is(damaged)} damaged, and excluded: "
         paragraphs.append(join([left_out, _list(damaged), "; fgloc experiment run --verify makes them again."]))
     paragraphs += _cautions(results, against_best)
     return join(tag("p", paragraph) for paragraph in paragraphs)
@@ -31,7 +33,7 @@ def summary(
 def _extent(results: Results) -> Html:
     failed = sum(row["status"] != "ok" for row in results.rows)
     seeds = {row["seed"] for row in results.rows}
-    outcome = "All went well." if not failed else tag("strong", f"{failed} of them failed.")
+    outcome = "All succeeded." if not failed else tag("strong", f"{failed} of them failed.")
     several = f" and up to {len(seeds)} seeds each" if len(seeds) > 1 else ""
     return join(
         (
@@ -56,7 +58,7 @@ def _best(c: Comparison) -> Html:
     tied = [v for v in c.contrasts if c.can_tell and c.p[v] is not None and not c.is_significant(v)]
     worse = [v for v in c.contrasts if c.is_significant(v)]
     if tied:
-        parts += ["It cannot be told apart from that of ", _list(tied), ". "]
+        parts += ["It is not significantly different from that of ", _list(tied), ". "]
     if worse:
         told = [
             join(
@@ -80,14 +82,12 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
     right = [v for v, (mean, low, high) in trust.items() if low <= mean <= high]
     told: list[Html] = []
     if sure:
-        told.append(join([_list(sure), f" {_is(sure)} surer than the causal errors allow"]))
+        told.append(join([_list(sure), f" {_is(sure)} overconfident"]))
     if timid:
-        told.append(
-            join([_list(timid), f" {_is(timid)} less sure than {'it' if len(timid) == 1 else 'they'} could be"])
-        )
+        told.append(join([_list(timid), f" {_is(timid)} underconfident"]))
     if right:
-        told.append(join(["the stated covariances of ", _list(right), " fit the errors"]))
-    return [join(["Trust: ", join(told, "; "), "."])] if told else []
+        told.append(join(["the stated covariances of ", _list(right), " are consistent with the errors"]))
+    return [join(["Consistency of causal estimates: ", join(told, "; "), "."])] if told else []
 
 
 def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]:
@@ -127,7 +127,7 @@ def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]
             )
         )
     if all(score(row, c.metric.key) is None for row in results.rows for c in comparisons):
-        told.append(join(["No run has any of the scores that were asked for."]))
+        told.append(join(["No run has any of the requested scores."]))
     return told
 
 
@@ -140,7 +140,7 @@ def _is(names: Sequence[str]) -> str:
 
 
 def _list(names: Sequence[str]) -> Html:
-    """**a**, **a** and **b**, **a**, **b** and **c**; of many the first, and how many more."""
+    """**a**, **a** and **b**, **a**, **b** and **c**; of many the first ones, and the number of the rest."""
     return _and([tag("strong", name) for name in names])
 
 

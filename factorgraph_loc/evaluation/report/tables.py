@@ -1,4 +1,4 @@
-"""The tables of the page. Nothing stands in them without what says how sure it is: an interval, a range, or a count."""
+"""The tables of the page; each figure comes with an interval, a range, or a count."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ def name(results: Results, variant: str) -> Html:
 
 
 def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
-    """All logs together: a row a variant, a column a metric, the best of each marked, and how many runs went well."""
-    # that a place was found says something where it had to be looked for
+    """All logs together: a row per variant, a column per metric, the best of each marked, and the number of successful runs."""
+    # the time to localization is of interest for unknown starts only
     is_sought = any(row.get("time_to_localized") for row in results.rows)
     rows = []
     for variant in results.variants:
@@ -41,12 +41,12 @@ def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
             cells.append(_share([row.get("time_to_localized") is not None for row in runs]))
         cells += [_poses(runs), _share([row["status"] == "ok" for row in runs])]
         rows.append([name(results, variant), *cells])
-    shares = ["localized before the end"] * is_sought + ["poses scored in a run", "runs that went well"]
+    shares = ["localized before the end"] * is_sought + ["poses scored in a run", "successful runs"]
     return table(["", *(c.metric.heading for c in comparisons), *shares], rows, class_="figures")
 
 
 def differences(results: Results, comparisons: Sequence[Comparison]) -> Html:
-    """Of each variant from the baseline: difference with interval, corrected p, effect; grey where it may be chance."""
+    """Differences of each variant from the baseline with interval, corrected p, and effect; grey if not significant."""
     baseline = comparisons[0].reference
     rows = []
     for variant in results.variants:
@@ -56,7 +56,7 @@ def differences(results: Results, comparisons: Sequence[Comparison]) -> Html:
 
 
 def by_log(results: Results, metric: Metric) -> Html:
-    """A row a log, a column a variant; the best of each row marked."""
+    """A row per log, a column per variant; the best of each row marked."""
     rows = []
     for log in results.logs:
         found = {v: _known(results.runs(v, log), metric) for v in results.variants}
@@ -82,7 +82,7 @@ def timing(results: Results, metrics: Sequence[Metric]) -> Html:
 
 
 def failures(results: Results) -> Html:
-    """Runs that failed, those of one reason together."""
+    """Failed runs, grouped by reason."""
     failed = [row for row in results.rows if row["status"] != "ok"]
     groups = Counter((label_of(row), str(row.get("kind") or "error"), str(row.get("reason") or "")) for row in failed)
     rows = []
@@ -97,7 +97,7 @@ def failures(results: Results) -> Html:
 
 
 def warnings(results: Results) -> Html:
-    """What is doubtful, and of which runs."""
+    """Warnings, and the runs concerned."""
     rows = []
     for text, concerned in by_text(results.rows).items():
         where = dict.fromkeys(f"{row['log']}, {label_of(row)}" for row in concerned)
@@ -113,7 +113,7 @@ def uncertainty(metric: Metric, figure: Pooled) -> str:
 
 
 def p_value(p: float | None) -> str:
-    """A p value as people read it."""
+    """A formatted p value."""
     if p is None:
         return _NONE
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
@@ -168,7 +168,7 @@ def _first(names: Sequence[str]) -> str:
 
 
 def _poses(runs: Sequence[Row]) -> Html:
-    """How many poses were scored, least to most over the runs."""
+    """Number of scored poses, as a range over the runs."""
     return tag("td", counted(runs) or _NONE)
 
 

@@ -1,4 +1,4 @@
-"""Trajectories and errors of runs, thinned out and packed as small integers, so that hundreds fit on a page."""
+"""Trajectories and errors of runs, decimated and packed as small integers to limit the size of the page."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from factorgraph_loc.evaluation.inference import independent_count
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
-LEVELS = np.linspace(0.0, 1.0, 51)  # of the distribution of errors that is shown
+LEVELS = np.linspace(0.0, 1.0, 51)  # of the plotted distribution of errors
 _COLUMNS = (
     "kind",
     "t_ns",
@@ -29,7 +29,7 @@ _COLUMNS = (
     "nees",
     "status",
 )
-_LARGEST = 30000  # of packed values, so that they have four digits at least and five at most
+_LARGEST = 30000  # largest packed value, for four to five digits
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Series:
     """One kind of trajectory of a run, N poses; NaN where unknown.
 
     ``t`` (N,) [s from the log's start]; ``x``, ``y`` [m]; ``error`` [m] and ``sigma`` [m]: twice the standard deviation in the
-    direction in which it is largest; ``heading_error`` and ``heading_sigma`` (twice) [rad]; ``nees`` and its ``dof``.
+    least certain direction; ``heading_error`` and ``heading_sigma`` (twice) [rad]; ``nees`` and its ``dof``.
     """
 
     t: Array
@@ -58,7 +58,7 @@ class Series:
 def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
     """The trajectories of ``estimates.parquet`` by kind: the causal one from the first localized estimate on, if there is any.
 
-    Times are from ``t0_ns`` on, by default from the first tick.
+    Times are relative to ``t0_ns``, by default to the first tick.
     """
     table = parse_estimates(estimates, NAME, _COLUMNS)
     columns = {name: _numbers(table[name]) for name in _COLUMNS if name not in ("kind", "t_ns", "status")}
@@ -75,7 +75,7 @@ def read_errors(estimates: bytes) -> dict[str, Array]:
 
 
 def _kinds(table: pl.DataFrame) -> dict[str, slice]:
-    """The rows of each kind, which stand together."""
+    """The rows of each kind, which are contiguous."""
     kind = table["kind"].to_numpy()
     found = {}
     for name in KINDS:
@@ -111,7 +111,7 @@ def _series(t: Array, columns: Mapping[str, Array]) -> Series:
 
 
 def pack(series: Series, count: int) -> dict[str, Any]:
-    """About ``count`` poses: of each stretch of time that with the least and that with the largest position error."""
+    """About ``count`` poses: of each interval of time those with the smallest and the largest position error."""
     keep = _thin(series.error, count)
     return {
         "t": _pack(series.t[keep], deltas=True),
@@ -125,13 +125,13 @@ def pack(series: Series, count: int) -> dict[str, Any]:
 
 
 def quantiles(errors: Sequence[Array]) -> list[float]:
-    """Of the errors of several runs, together, at ``LEVELS``, four digits each."""
+    """Quantiles of the pooled errors of several runs at ``LEVELS``, with four digits."""
     known = np.concatenate(errors) if errors else np.empty(0)
     return [float(f"{q:.4g}") for q in np.quantile(known, LEVELS)] if len(known) else []
 
 
 def consistency(series: Series) -> tuple[float, float, int] | None:
-    """Mean NEES per degree of freedom, as how many independent values it counts, and the degrees of freedom; None without any."""
+    """Mean NEES per degree of freedom, its effective number of independent values, and the degrees of freedom; None without any."""
     nees = _known(series.nees)
     return (float(np.mean(nees)) / series.dof, independent_count(nees), series.dof) if len(nees) > 1 else None
 
@@ -141,7 +141,7 @@ def _known(values: Array) -> Array:
 
 
 def _thin(error: Array, count: int) -> NDArray[np.int64]:
-    """About ``count`` places of N, the first and the last among them; where no error is known evenly spread ones."""
+    """About ``count`` indices of N, including the first and the last; evenly spread where no error is known."""
     if len(error) <= count:
         return np.arange(len(error))
     size = -(-2 * len(error) // count)
@@ -154,7 +154,7 @@ def _thin(error: Array, count: int) -> NDArray[np.int64]:
 
 
 def _pack(values: Array, *, deltas: bool = False) -> dict[str, Any]:
-    """Integers ``v`` in units of ``u``, a power of ten, null where unknown; with ``deltas`` each less the one before."""
+    """Integers ``v`` in units of ``u``, a power of ten, null where unknown; with ``deltas`` as differences."""
     known = _known(values)
     largest = float(np.max(np.abs(known))) if len(known) else 0.0
     unit = 10.0 ** math.ceil(math.log10(largest / _LARGEST)) if largest > 0.0 else 1.0
