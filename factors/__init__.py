@@ -14,5 +14,6 @@ __all__ = [
     "rfid",
     "rts_kernels",
     "se2",
+    "se2_kernels",
     "update",
 ]

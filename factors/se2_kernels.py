@@ -3,6 +3,9 @@
 import math
 
 import numba
+import numpy as np
+
+from factors.se2 import Array
 
 SMALL = 1e-4  # rad; smaller angles use series, against cancellation
 
@@ -32,3 +35,25 @@ def log(x: float, y: float, heading: float) -> tuple[float, float, float]:
     p, q = arc(angle)
     scale = 1.0 / (p * p + q * q)
     return scale * (p * x + q * y), scale * (p * y - q * x), angle
+
+
+@numba.njit(cache=True)
+def moved(pose: Array, twist: Array) -> Array:
+    """The pose (3,) moved by a twist in its own frame, of which the first three components are read."""
+    x, y, turned = exp(twist[0], twist[1], twist[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)))
+
+
+@numba.njit(cache=True)
+def body_to_world(pose: Array, covariance: Array) -> Array:
+    """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    out = np.empty((3, 3))
+    a, b, d, e = covariance[0, 0], covariance[0, 1], covariance[1, 0], covariance[1, 1]
+    p, q, r, t = c * a - s * d, c * b - s * e, s * a + c * d, s * b + c * e
+    out[0, 0], out[0, 1], out[1, 0], out[1, 1] = p * c - q * s, p * s + q * c, r * c - t * s, r * s + t * c
+    out[0, 2], out[1, 2] = c * covariance[0, 2] - s * covariance[1, 2], s * covariance[0, 2] + c * covariance[1, 2]
+    out[2, 0], out[2, 1] = covariance[2, 0] * c - covariance[2, 1] * s, covariance[2, 0] * s + covariance[2, 1] * c
+    out[2, 2] = covariance[2, 2]
+    return out

@@ -15,6 +15,8 @@ import numpy as np
 from factors import positive, se2
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
+from factors.landmarks import update_kernels as landmark_kernels
+from factors.landmarks.factor import BearingRangeFactor
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
@@ -84,6 +86,28 @@ def linearized_update(
         return residual, block
 
     return update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged)
+
+
+def landmark_update(
+    factor: BearingRangeFactor,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    first: int,
+    iterations: int,
+    converged: float = CONVERGED,
+) -> Correction | None:
+    """:func:`update_state` by landmarks of an exact map that were seen at the pose, compiled; None for others, and where the
+    information form has not the digits. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
+    found = factor.packed()
+    if found is None:
+        return None
+    model, indices = found
+    seen = factor.points, factor.ranges, factor.bearings
+    there, delta, after, residual, nis, dof = landmark_kernels.updated(
+        model, *seen, pose, covariance, constants, indices, first, iterations, converged, GATE
+    )
+    return Correction(delta, after, residual, nis, dof) if there else None
 
 
 def update_state(

@@ -25,7 +25,7 @@ from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.measurement import Measurement, Rows, Tick
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
@@ -201,6 +201,7 @@ class _Loop:
         self._progress = progress
         first, self._last = _span(log, sensors)
         self._start = first if prior is None else prior.t
+        self._initialized = prior is None
         self._reported = 0.0
         self._update_t: list[float] = []
         self._update_s: list[float] = []
@@ -210,24 +211,19 @@ class _Loop:
     def run(self) -> None:
         """Process all measurements and ticks."""
         started = perf_counter()
-        initialized = self._prior is None
         for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
-            if not initialized and t > self._start:
-                self._initialize()
-                initialized = True
-            for tick in self._ticks.before(t):
-                self._tick(tick)
             if is_motion:
                 for m in group:
-                    self._guard.process(self._estimator, m)
-            elif t < self._start:
+                    self._move(m)
+                continue
+            self._reach(t)
+            if t < self._start:
                 self._estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
             else:
-                if not initialized:
+                if not self._initialized:
                     self._initialize()
-                    initialized = True
                 self._update(t, group)
-        if not initialized:
+        if not self._initialized:
             self._initialize()
         for tick in self._ticks.rest():
             self._tick(tick)
@@ -248,10 +244,34 @@ class _Loop:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        return self._log.measurements(self._sensors)
+        joined = getattr(self._estimator, "takes_rows", False)
+        return self._log.steps(self._sensors) if joined else self._log.measurements(self._sensors)
+
+    def _reach(self, t: float) -> None:
+        """What comes before a measurement at ``t``: the start, and ticks."""
+        if not self._initialized and t > self._start:
+            self._initialize()
+        for tick in self._ticks.before(t):
+            self._tick(tick)
+
+    def _move(self, m: Measurement) -> None:
+        """Take a row of motion; or some, cut where a tick is due."""
+        if not isinstance(m, Rows):
+            self._reach(m.t)
+            self._guard.process(self._estimator, m)
+            return
+        first, count = 0, m.count
+        while first < count:
+            self._reach(float(m.times[first]))
+            last = max(first + 1, int(m.times.searchsorted(self._ticks.due, "right")))
+            part = m.part(first, last)
+            self._ticks.before(part.t)  # none, but it has come that far
+            self._guard.process(self._estimator, part)
+            first = last
 
     def _initialize(self) -> None:
         assert self._prior is not None
+        self._initialized = True
         with self._guard.telling(f"the start at {self._prior.t:.3f} s"):
             self._estimator.initialize(self._prior)
 

@@ -9,8 +9,7 @@ the filter cannot lock itself out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -20,7 +19,7 @@ from factorgraph_loc.fusion.heading_search import HeadingSearch
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
 from factorgraph_loc.model.measurement import Measurement
@@ -28,10 +27,11 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
-from factors import positive, rts_kernels, se2
+from factors import positive, rts_kernels, se2, se2_kernels
 from factors.motion import Increment
 from factors.se2 import Array
 
+NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
 
@@ -48,8 +48,7 @@ class EkfSettings(FilterSettings):
     landmarks: MapUse = "known"
 
 
-@dataclass(frozen=True)
-class _State:
+class _State(NamedTuple):
     """``pose`` (3,); ``rest`` (R,): the blocks of the ``layout``; ``covariance`` (3+R, 3+R) of the error state."""
 
     pose: Array
@@ -58,14 +57,13 @@ class _State:
     layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        pose = se2.compose(self.pose, se2.exp(delta[:POSE]))
-        return _State(pose, self.rest + delta[POSE:], covariance, self.layout)
+        return _State(se2_kernels.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
         """The first ``size`` components of the error state: without blocks that came later."""
         if size == len(self.covariance):
             return self
-        return replace(self, rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
+        return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def with_block(self, new: NewVariable) -> _State:
         """The state with one more block."""
@@ -79,8 +77,7 @@ class _State:
         return _State(self.pose, rest, covariance, self.layout.plus(new.name, len(new.mean)))
 
 
-@dataclass(frozen=True)
-class _Step:
+class _Step(NamedTuple):
     """A prediction: the pose that it led to, the first rows (3, S) of its transition, and the covariance (3, 3) that it added."""
 
     pose: Array
@@ -92,8 +89,7 @@ class _Step:
         return np.asarray(rts_kernels.predicted(before, self.transition, self.noise))
 
 
-@dataclass(frozen=True)
-class _Record:
+class _Record(NamedTuple):
     t: float
     step: _Step  # from the record before
     updated: _State
@@ -236,14 +232,11 @@ class Ekf(Filter):
 
     def _predict(self, increment: Increment) -> None:
         s = self._state
-        delta = increment.delta
-        transition = np.zeros((POSE, len(s.covariance)))
-        part = s.layout.columns.get(MOTION)
-        if part is not None:
-            delta, transition[:, part] = self._motion.changed(increment, s.rest[part.start - POSE : part.stop - POSE])
-        transition[:, :POSE] = se2.adjoint(se2.inverse(delta))
-        self._step = _Step(se2.compose(s.pose, delta), transition, increment.covariance)
-        self._state = _State(self._step.pose, s.rest, self._step.covariance(s.covariance), s.layout)
+        part = s.layout.columns.get(MOTION, NOWHERE)
+        constants = s.rest[part.start - POSE : part.stop - POSE]
+        pose, transition, covariance = self._motion.predicted(increment, s.pose, s.covariance, constants, part.start)
+        self._step = _Step(pose, transition, increment.covariance)
+        self._state = _State(pose, s.rest, covariance, s.layout)
 
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()
@@ -305,13 +298,12 @@ class Ekf(Filter):
         s, body = self._state, se2.world_to_body(found.pose, found.covariance)
         covariance = s.covariance.copy()
         covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
-        self._state = replace(s, pose=np.array(found.pose), covariance=covariance)
+        self._state = s._replace(pose=np.array(found.pose), covariance=covariance)
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        estimate = world_estimate(self._t, self._state.pose, self._state.covariance[:POSE, :POSE])
-        silent = any(sensor.silent for sensor in self._sensors.values())
-        return replace(estimate, status="ambiguous") if silent else estimate
+        status: Status = "ambiguous" if any(sensor.silent for sensor in self._sensors.values()) else "localized"
+        return world_estimate(self._t, self._state.pose, self._state.covariance, status)
 
     def _record(self) -> _Record:
         step, self._step = self._step or self._standstill(), None

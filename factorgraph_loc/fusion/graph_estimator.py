@@ -66,6 +66,7 @@ class GraphEstimator(ABC):
 
     deterministic = True
     modalities = EVERY
+    takes_rows = True
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
     def __init__(self, setup: Setup, settings: GraphSettings) -> None:

@@ -53,6 +53,7 @@ class Switching:
     """The switch; see the module."""
 
     deterministic = False
+    takes_rows = True
     modalities = EVERY
 
     def __init__(self, setup: Setup, settings: SwitchingSettings) -> None:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion.base import EVERY
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, gaussian_belief
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics, Written
 from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -22,7 +22,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.binding import bound_motion
-from factors import se2
+from factors import se2, se2_kernels
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
@@ -56,6 +56,7 @@ class Filter(ABC):
 
     deterministic = True
     supports_unknown_start = False
+    takes_rows = True  # of odometry, as one measurement
     modalities: Container[str] = EVERY  # of measurements that may update it; others are counted as ignored
 
     def __init__(self, setup: Setup, settings: FilterSettings, diagnostics: Diagnostics | None = None) -> None:
@@ -188,8 +189,8 @@ class Filter(ABC):
         if known is not None and known[0] is self._state and known[1]._t == t:
             self._catch_up(known[1])
             return
-        odometry = self._motion.state(t)
-        self._predict(self._motion.relative(self._odometry, odometry))
+        odometry, increment = self._motion.travelled(self._odometry, t)
+        self._predict(increment)
         self._t, self._odometry = t, odometry
 
     def _catch_up(self, ahead: Filter) -> None:
@@ -257,9 +258,9 @@ def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: A
     return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
 
 
-def world_estimate(t: float, pose: Array, body_covariance: Array) -> PoseEstimate:
-    """A localized estimate from a body-frame covariance."""
-    return PoseEstimate(t, pose, se2.body_to_world(pose, body_covariance), "localized")
+def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "localized") -> PoseEstimate:
+    """An estimate from the covariance (S, S) of an error state that begins with the pose's body-frame perturbation."""
+    return PoseEstimate(t, pose, se2_kernels.body_to_world(pose, covariance), status)
 
 
 def _twin(rng: np.random.Generator) -> np.random.Generator:

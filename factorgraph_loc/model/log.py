@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream, joined, selected
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import well_formed
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,54 @@ class Log:
         A late measurement keeps its timestamp and follows those that arrived before it. Equal times are ordered by stream rank.
         """
 
+        return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
+
+    def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
+        """The same, but that rows which arrive one after the other, each newer than the last, are one measurement where their
+        stream ``joins`` them: :class:`~factorgraph_loc.model.measurement.Rows`."""
+        order = self._in_order(sensors)
+        joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
+        if joined is None:
+            yield from self.measurements(sensors)
+            return
+        rows = self.streams[order[joined]].rows(self.rig.time_offset(order[joined]))
+        arrived = np.maximum.accumulate(rows.times)
+        late = np.flatnonzero(rows.times < arrived)
+        first = 0
+        for t, rank, _, m in heapq.merge(*self._arrivals(order, without=joined)):
+            last = int(arrived.searchsorted(t, "right" if joined < rank else "left"))
+            yield from _pieces(rows, late, first, last)
+            first = last
+            yield m
+        yield from _pieces(rows, late, first, len(arrived))
+
+    def _in_order(self, sensors: Sequence[str]) -> list[str]:
+        """The streams of ``sensors``, of which those that come first at equal times stand first."""
+        return sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
+
+    def _arrivals(
+        self, order: Sequence[str], without: int | None = None
+    ) -> list[Iterator[tuple[float, int, int, Measurement]]]:
+        """Of each stream, but for one, its measurements, each with when it arrived and its place among those of that time."""
+
         def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
             latest = -np.inf
             for i, m in enumerate(self.streams[name].measurements(self.rig.time_offset(name))):
                 latest = max(latest, m.t)
                 yield latest, rank, i, m
 
-        order = sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
-        for _, _, _, m in heapq.merge(*(arrivals(rank, name) for rank, name in enumerate(order))):
-            yield m
+        return [arrivals(rank, name) for rank, name in enumerate(order) if rank != without]
+
+
+def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
+    """The rows from ``first`` to before ``last``, cut before and after those that are ``late`` (L,)."""
+    for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist():
+        if first < i:
+            yield rows.part(first, i)
+        yield rows.part(i, i + 1)
+        first = i + 1
+    if first < last:
+        yield rows.part(first, last)
 
 
 def cut(log: Log, start: float, end: float) -> Log:

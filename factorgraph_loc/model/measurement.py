@@ -1,7 +1,10 @@
 """The interface of measurements: frozen values with timestamps in seconds from the start of the log, in SI units."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
+
+from factors.se2 import Array
 
 
 class Measurement(Protocol):
@@ -32,3 +35,41 @@ class Tick:
     count: ClassVar[int] = 0
     is_motion: ClassVar[bool] = False
     t: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Measurements of one ``kind`` that follow one another in time, as one: their ``times`` (N,) [s], and their ``values``, an
+    array (N,) of each field. As a measurement it has the time of the last."""
+
+    kind: type[Any]
+    times: Array
+    values: tuple[Array, ...]
+
+    @property
+    def t(self) -> float:
+        return float(self.times[-1])
+
+    @property
+    def sensor(self) -> str:
+        return str(self.kind.sensor)
+
+    @property
+    def modality(self) -> str:
+        return str(self.kind.modality)
+
+    @property
+    def count(self) -> int:
+        return len(self.times)
+
+    @property
+    def is_motion(self) -> bool:
+        return bool(self.kind.is_motion)
+
+    def part(self, first: int, last: int) -> "Rows":
+        """Those from ``first`` to before ``last``."""
+        return Rows(self.kind, self.times[first:last], tuple([values[first:last] for values in self.values]))
+
+    def singly(self) -> Iterator[Measurement]:
+        """Each as a measurement of its own."""
+        return map(self.kind, self.times.tolist(), *(values.tolist() for values in self.values))

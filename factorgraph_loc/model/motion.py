@@ -22,7 +22,8 @@ class Motion(Protocol):
     horizon: float
 
     def add(self, m: Any) -> None:
-        """Add a row. An unused row is counted as ignored, one older than the kept rows as late."""
+        """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Unused rows are counted as ignored, those older than the
+        kept rows as late."""
 
     def keep(self, horizon: float) -> None:
         """Keep the rows of the last ``horizon`` seconds."""
@@ -33,8 +34,18 @@ class Motion(Protocol):
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """The relative motion between two states, with its covariance."""
 
+    def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
+        """The state at ``t``, and the relative motion from ``start`` to it."""
+
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
+
+    def predicted(
+        self, increment: Increment, pose: Array, covariance: Array, constants: Array, first: int
+    ) -> tuple[Array, Array, Array]:
+        """Predict a Gaussian by an increment: the pose (3,), the first rows (3, S) of the transition (the other rows are those of
+        the identity), and the covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at
+        ``first``."""
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment corrected for ``constants`` (P,)."""

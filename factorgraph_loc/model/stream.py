@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Rows
 from factors.se2 import Array
 
 SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
@@ -21,16 +21,22 @@ class Stream:
 
     Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
     timestamps: 0 for wheel odometry, 1 for other motion. ``kind``: class of the measurements, constructed from a timestamp and
-    the columns.
+    the columns. ``joins``: whether consecutive rows, of numbers, can be one measurement
+    (:class:`~factorgraph_loc.model.measurement.Rows`).
     """
 
     rank: ClassVar[int] = SEEN
+    joins: ClassVar[bool] = False
     kind: ClassVar[type[Any]]
     t: Array
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """One measurement per row; ``offset`` [s] is added to the timestamps."""
         return map(self.kind, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
+
+    def rows(self, offset: float) -> Rows:
+        """All rows as one measurement, if the stream ``joins``."""
+        return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     def _columns(self) -> Iterator[Any]:
         return (getattr(self, field.name) for field in fields(self)[1:])

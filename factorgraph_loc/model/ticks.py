@@ -36,6 +36,11 @@ class Ticks:
         """Time since the start, without gaps."""
         return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
 
+    @property
+    def due(self) -> float:
+        """When the next tick is."""
+        return self._start + self._next / RATE
+
     def before(self, t: float) -> Iterable[float]:
         """The ticks before the next measurement, which is at ``t``."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:

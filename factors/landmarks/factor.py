@@ -17,13 +17,14 @@ from factors.landmarks.model import (
     BearingRangeModel,
     located,
     log_likelihood,
+    packed,
     recalibrated,
     robust_loss,
     robust_weight,
     whitened_all,
 )
 from factors.landmarks.stack import BearingRangeStack
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
@@ -164,6 +165,13 @@ class BearingRangeFactor:
             offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
         points = self.points if point is None else point[None]
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+
+    def packed(self) -> tuple[Array, Integers] | None:
+        """Model (11,) and places (P,) of the estimated constants, as compiled code takes them; None where the landmarks were not
+        seen at the pose's time, or are not exactly where they stand."""
+        if self.offset is not None or self.point_covariances is not None or self.free or self.twist is not None:
+            return None
+        return packed(self.model), np.array(self.estimated, dtype=np.int64)
 
     def dof(self) -> int:
         """Number of measured ranges and bearings."""

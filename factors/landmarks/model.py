@@ -19,6 +19,8 @@ from factors.se2 import Array
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
+# indices in the result of packed(), after the constants that PARAMETERS change
+TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
 
@@ -41,6 +43,14 @@ class BearingRangeModel:
     bearing_bias: float = 0.0
     bearing_sigma: float = 0.05
     robust: float = 4.0
+
+
+def packed(model: BearingRangeModel) -> Array:
+    """A model as an array (11,) for compiled code."""
+    m = model
+    constants = (m.mounting[0], m.mounting[1], m.bearing_bias, m.range_scale, m.depth_axis)
+    noise = (m.range_sigma, m.range_sigma_relative, m.bearing_sigma)
+    return np.array((*constants, m.mounting[2], *noise, float(m.depth), m.robust))
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry.kernels import relative
+from factors.odometry.kernels import State, relative
 from factors.odometry.model import OdometryModel, composed
 from factors.se2 import Array
 
@@ -29,10 +29,8 @@ _KNOT, _STATE = 16, 8
 # m/s and rad/s, relative to the biases: wheels below are at rest; a gyro below agrees that the robot does not turn
 _REST, _GYRO_REST = 1e-3, 0.02
 
-# scales and biases; cosine and sine of the direction; lag and hold; the gyro's bias, and whether it is used
-_Constants = tuple[
-    tuple[float, float, float, float, float, float], tuple[float, float], tuple[float, float], tuple[float, bool]
-]
+# indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
+_COS, _SIN, _LAG, _HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
 
 _arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
 
@@ -53,13 +51,17 @@ class OdometryChain:
         self._count = 0
         self._forgotten = False
         m = model
-        self._constants = (
-            (m.scale_distance, m.scale_rotation, m.speed_bias, m.heading_rate_bias, m.heading_drift, m.turn_slowdown),
-            (math.cos(m.direction), math.sin(m.direction)),
-            (m.lag, m.max_hold),
-            (m.gyro_bias, use_gyro),
+        scales = (
+            m.scale_distance,
+            m.scale_rotation,
+            m.speed_bias,
+            m.heading_rate_bias,
+            m.heading_drift,
+            m.turn_slowdown,
         )
-        self._noise = np.array(m.noise())  # an array, because a tuple is slower to pass to compiled code
+        direction = math.cos(m.direction), math.sin(m.direction)
+        self._constants = np.array((*scales, *direction, m.lag, m.max_hold, m.gyro_bias, use_gyro), dtype=float)
+        self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
@@ -81,9 +83,17 @@ class OdometryChain:
         """A row of a gyro [rad/s], held from ``t`` until the next; it replaces the rotation of the wheels."""
         return self._insert(t, _GYRO, w, 0.0, 0.0)
 
-    def add_velocities(self, t: Array, v: Array, w: Array) -> None:
-        """Add rows (N,), in order of time and after all others."""
-        self._extend(t + self.model.delay, _VELOCITY, np.column_stack((v, w, np.zeros(len(t)))))
+    def add_velocities(self, t: Array, v: Array, w: Array) -> int:
+        """Add rows (N,), in order of time; returns how many were kept."""
+        n, delay = self._count, self.model.delay
+        if not len(t):
+            return 0
+        if n and t[0] + delay < self._knots[n - 1, _T]:
+            return sum(map(self.add_velocity, t.tolist(), v.tolist(), w.tolist()))
+        self._reserve(len(t))
+        self._count = _append(self._rows, self._knots, n, t, v, w, delay, self._constants)
+        self._forget()
+        return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
         """Add rows (N,), in order of time and after all others; rows with equal timestamps are composed."""
@@ -92,18 +102,24 @@ class OdometryChain:
 
     def state(self, t: float) -> ChainState:
         """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant."""
-        return ChainState(*_state(self._knots, self._count, t, self._constants[2]))
+        return ChainState(*_state(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:
         """The states (M, 8) at times (M,): t, x, y, heading, path, turn, unknown, still, as in :class:`ChainState`."""
         out = np.empty((len(t), _STATE))
-        _states(self._knots, self._count, np.asarray(t, dtype=float), self._constants[2], out)
+        _states(self._knots, self._count, np.asarray(t, dtype=float), self._constants, out)
         return out
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """The motion from ``start`` to ``end``. ``start`` may be an earlier result of :meth:`state`; the motion then includes
         corrections by later rows."""
-        return Increment(*relative(self._noise, start, end))
+        return Increment(*relative(self._noise, tuple(start), tuple(end)))
+
+    def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
+        """The state at ``t`` and the motion from ``start`` to there: :meth:`state` and :meth:`relative` in one call."""
+        known = self._knots, self._count, self._constants, self._noise
+        end, delta, covariance, duration, still = _travelled(*known, tuple(start), t)
+        return ChainState(*end), Increment(delta, covariance, duration, still)
 
     def _insert(self, *row: float) -> bool:
         t = row[0]
@@ -151,11 +167,22 @@ class OdometryChain:
 
 
 @numba.njit(cache=True)
-def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: _Constants) -> None:
+def _append(rows: Array, knots: Array, count: int, t: Array, v: Array, w: Array, delay: float, constants: Array) -> int:
+    """Append rows of velocities and their knots to the ``count`` existing ones; returns the new count."""
+    for i in range(len(t)):
+        row = rows[count + i]
+        row[0], row[1], row[2], row[3], row[4] = t[i] + delay, _VELOCITY, v[i], w[i], 0.0
+    _integrate(rows, knots, count, count + len(t), constants)
+    return count + len(t)
+
+
+@numba.njit(cache=True)
+def _integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
     """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
-    scales, (c, s), (lag, hold), gyro = constants
-    scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, turn_slowdown = scales
-    gyro_bias, use_gyro = gyro
+    scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
+    heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
+    c, s, lag, hold = constants[_COS], constants[_SIN], constants[_LAG], constants[_HOLD]
+    gyro_bias, use_gyro = constants[_GYRO_BIAS], constants[_USES_GYRO] > 0.0
     for i in range(begin, end):
         t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
         knot = knots[i]
@@ -204,11 +231,12 @@ def _take_gyro(knot: Array, t: float, turn: float) -> None:
 
 
 @numba.njit(cache=True)
-def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: _Constants) -> None:
+def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     """Compute the knot of an increment in row ``i``, and again those of the gyro since the previous increment: the robot moves by
     the increment and rotates by the gyro."""
-    scales, (c, s), (_, hold), (gyro_bias, _) = constants
-    scale_distance, scale_rotation, speed_bias, heading_rate_bias, heading_drift, _ = scales
+    scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
+    heading_rate_bias, heading_drift = constants[3], constants[4]
+    c, s, hold, gyro_bias = constants[_COS], constants[_SIN], constants[_HOLD], constants[_GYRO_BIAS]
     t, a, b, phi = rows[i, 0], rows[i, 2], rows[i, 3], rows[i, 4]
     first = i - 1
     while first >= 0 and rows[first, 1] != _INCREMENT:
@@ -272,9 +300,7 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
 
 
 @numba.njit(cache=True)
-def _state(
-    knots: Array, count: int, t: float, settling: tuple[float, float]
-) -> tuple[float, float, float, float, float, float, float, float]:
+def _state(knots: Array, count: int, t: float, constants: Array) -> State:
     """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
@@ -283,12 +309,20 @@ def _state(
         k = knots[0]
         return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[_T] - t), k[_STILL]
     k = np.empty(_KNOT)
-    lag, hold = settling
-    _move(knots[i], t - knots[i, _T], lag, hold, k)
+    _move(knots[i], t - knots[i, _T], constants[_LAG], constants[_HOLD], k)
     return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN], k[_STILL]
 
 
 @numba.njit(cache=True)
-def _states(knots: Array, count: int, times: Array, settling: tuple[float, float], out: Array) -> None:
+def _travelled(
+    knots: Array, count: int, constants: Array, noise: Array, start: State, t: float
+) -> tuple[State, Array, Array, float, float]:
+    end = _state(knots, count, t, constants)
+    delta, covariance, duration, still = relative(noise, start, end)
+    return end, delta, covariance, duration, still
+
+
+@numba.njit(cache=True)
+def _states(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
     for j in range(len(times)):
-        out[j, :] = _state(knots, count, times[j], settling)
+        out[j, :] = _state(knots, count, times[j], constants)

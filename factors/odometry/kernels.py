@@ -15,7 +15,7 @@ ROUNDING, FAR = 1e-12, 1e4  # m^2
 # direction of travel; variances per distance, rotation and time of longitudinal, lateral and heading error; variances per time
 # without odometry of position and heading; minimum variances, and minimum variances per time
 Noise = tuple[float, ...]
-State = tuple[float, float, float, float, float, float, float, float]
+State = tuple[float, ...]  # of a chain: t, x, y, heading, path, turn, unknown, still
 
 
 @numba.njit(cache=True)
@@ -65,6 +65,49 @@ def carried(covariance: Array, delta: Array, noise: Array) -> Array:
             out[i, j] = a * q[0] + b * q[1] + d * q[2] + noise[i, j]
     _widen(out)
     return out
+
+
+@numba.njit(cache=True)
+def predicted(
+    delta: Array,
+    noise: Array,
+    moving: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+    first: int,
+) -> tuple[Array, Array, Array]:
+    """The pose (3,), the first rows (3, S) of the transition, of which the others are those of the identity, and the covariance
+    (S, S) after a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed ``constants`` (P,),
+    whose places are ``indices`` (P,) and whose columns in the error state begin at ``first``."""
+    size, count = len(covariance), len(constants)
+    transition, after = np.zeros((3, size)), covariance.copy()
+    columns = np.arange(3 + count)  # where the transition is not zero
+    columns[3:] += first - 3
+    x, y, turned = delta[0], delta[1], delta[2]
+    if count:
+        changed_delta, by_changes = recalibrate(np.array(log(x, y, turned)), moving, _full(constants, indices))
+        x, y, turned = changed_delta[0], changed_delta[1], changed_delta[2]
+        transition[:, first : first + count] = by_changes[:, indices]
+    # the adjoint of the inverse of the motion
+    c, s = math.cos(turned), math.sin(turned)
+    transition[0, 0], transition[0, 1], transition[0, 2] = c, s, s * x - c * y
+    transition[1, 0], transition[1, 1], transition[1, 2] = -s, c, c * x + s * y
+    transition[2, 2] = 1.0
+    moved = np.zeros((3, size))
+    for i in range(3):
+        for k in columns:
+            for j in range(size):
+                moved[i, j] += transition[i, k] * covariance[k, j]
+    after[:3], after[:, :3] = moved, moved.T
+    for i in range(3):
+        for j in range(3):
+            after[i, j] = noise[i, j]
+            for k in columns:
+                after[i, j] += moved[i, k] * transition[j, k]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned))), transition, after
 
 
 @numba.njit(cache=True, inline="always")

@@ -11,6 +11,7 @@ import pytest
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.prior import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.fusion.registry import estimator_type
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -46,6 +47,29 @@ def test_an_update_is_one_stamp(log, fake):
     assert all(calls[i - 1] == ("estimate", t) for i, (kind, t) in enumerate(calls) if kind == "Tick")
     assert result.timings.real_time_factor == pytest.approx(2.0 / result.timings.causal_seconds)
     assert result.timings.peak_memory_mb > 10.0
+
+
+@pytest.mark.parametrize("start", [None, 0.72])
+@pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
+def test_rows_of_odometry_may_come_at_once(log, name, start, monkeypatch):
+    if start is not None:
+        log = replace(log, start=StartPose(start, np.array((start, 0.0, 0.0)), np.full(3, 0.1)))
+    estimator = estimator_type(name)
+    whole = run(log, RunConfig(name))
+    counts = []
+    taken = estimator.process
+    monkeypatch.setattr(estimator, "process", lambda self, m: (counts.append(m.is_motion * m.count), taken(self, m)))
+    run(log, RunConfig(name))
+    assert max(counts) > 1
+    monkeypatch.setattr(estimator, "takes_rows", False)
+    counts.clear()
+    singly = run(log, RunConfig(name))
+    assert max(counts) == 1
+    assert whole.status == singly.status
+    for one, other in ((whole, singly), (whole.final, singly.final)):
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.poses, other.poses)
+        np.testing.assert_array_equal(one.covariances, other.covariances)
 
 
 def test_what_is_older_than_the_prior(log, fake):

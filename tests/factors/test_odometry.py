@@ -126,6 +126,32 @@ def test_what_later_rows_correct_is_in_the_next_increment():
     assert chain.relative(ahead, chain.state(0.2)).delta[0] == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_rows_at_once_are_those_one_by_one(late):
+    rows = np.random.default_rng(0).uniform(0.1, 1.0, (60, 3))
+    rows[:, 0] = np.cumsum(0.1 * rows[:, 0])
+    if late:
+        rows = np.concatenate((rows[:20], rows[40:], rows[20:40]))
+    one, other = (OdometryChain(OdometryModel(lag=0.1, delay=0.05), horizon=1.0) for _ in range(2))
+    for i in range(0, 60, 20):
+        kept = sum(one.add_velocity(*row) for row in rows[i : i + 20].tolist())
+        assert other.add_velocities(*np.ascontiguousarray(rows[i : i + 20].T)) == kept
+        t = float(rows[: i + 20, 0].max())
+        assert one.state(t) == other.state(t)
+    assert other.add_velocities(*np.empty((3, 0))) == 0
+
+
+def test_a_way_in_one_call_is_state_and_motion():
+    chain = velocities(OdometryModel(along=Growth(0.1, 0.2, 0.3)), [(0.0, 0.5, 0.1), (0.3, 0.4, -0.2), (1.0, 0.3, 0.3)])
+    start = chain.state(0.2)
+    end, motion = chain.travelled(start, 1.7)
+    expected = chain.relative(start, chain.state(1.7))
+    assert end == chain.state(1.7)
+    np.testing.assert_array_equal(motion.delta, expected.delta)
+    np.testing.assert_array_equal(motion.covariance, expected.covariance)
+    assert (motion.duration, motion.still) == (expected.duration, expected.still)
+
+
 def test_old_rows_are_forgotten_and_recent_ones_kept():
     chain = velocities(OdometryModel(), [(0.01 * i, 1.0, 0.0) for i in range(5000)], horizon=5.0)
     assert not chain.add_velocity(30.0, 1.0, 0.0)

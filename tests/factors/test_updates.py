@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.sensors.base import ResidualObservation, Term
 from factors import se2
 from factors import update as robust_update_module
 from factors.camera.factor import ReprojectionFactor
@@ -17,7 +18,7 @@ from factors.rfid import update as rfid_update
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
-from factors.update import linearized_update, robust_update
+from factors.update import landmark_update, linearized_update, robust_update
 
 CLOSE = 1e-8  # standard deviations
 
@@ -75,6 +76,42 @@ def test_by_pixels(rng, iterations, size, tempering):
         close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))
         np.testing.assert_allclose(found.residual, expected.residual, atol=1e-9)
         assert (found.nis, found.dof) == (pytest.approx(expected.nis), expected.dof)
+
+
+@pytest.mark.parametrize("places", [(), (0, 3), (0, 1, 2, 3, 4)])
+@pytest.mark.parametrize("depth", [False, True])
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_by_landmarks(rng, iterations, depth, places):
+    model = BearingRangeModel((0.1, -0.05, 0.2), 1.02, depth, 0.03, 0.05, 0.02, 0.01, 0.03)
+    names, first = ("constants",) * bool(places), 5
+    for count in (1, 2, 6):
+        pose, constants = rng.standard_normal(3), 0.01 * rng.standard_normal(len(places))
+        points = se2.transform_from(pose, rng.uniform((1.0, -2.0), (6.0, 2.0), (count, 2)))
+        ranges, bearings = predict_landmarks(model, pose, points) + 0.03 * rng.standard_normal((2, count))
+        ranges[0] += 3.0
+        bearings[-1] = np.nan
+        factor = BearingRangeFactor(model, points, ranges, bearings, estimated=places)
+        start, covariance = (
+            se2.compose(pose, se2.exp(0.05 * rng.standard_normal(3))),
+            spread(rng, 6 + len(places), 0.05),
+        )
+        found = landmark_update(factor, start, covariance, constants, first, iterations)
+        held = {"constants": constants}, {"constants": slice(first, first + len(places))}
+        seen = ResidualObservation(0.0, (Term(factor, names, 2 * count),))
+        expected = seen.correct(start, covariance, *held, iterations)
+        sigmas = np.sqrt(np.diag(expected.covariance))
+        close(found.delta, expected.delta, sigmas)
+        close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))
+        np.testing.assert_allclose(found.residual, expected.residual, atol=1e-9)
+        assert (found.nis, found.dof) == (pytest.approx(expected.nis), expected.dof)
+
+
+def test_landmarks_that_compiled_code_leaves_to_others():
+    factor = BearingRangeFactor(BearingRangeModel(), np.ones((1, 2)), np.ones(1), np.zeros(1))
+    singular = np.ones((3, 3)), np.zeros(0), 3, 1
+    assert landmark_update(factor, np.zeros(3), *singular) is None
+    soon = replace(factor, offset=np.array((0.1, 0.0, 0.0)))
+    assert landmark_update(soon, np.zeros(3), np.eye(3), np.zeros(0), 3, 1) is None
 
 
 @pytest.mark.parametrize("iterations", [1, 4])

@@ -10,6 +10,7 @@ from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, StartPose, cut, join
+from factorgraph_loc.model.measurement import Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -84,6 +85,22 @@ def test_a_late_measurement_keeps_its_stamp_and_its_place():
     late = sightings((1.5, "A", 2, 0), (0.5, "A", 3, 0))
     log = make_log(bearing_range=late, odometry=ODOMETRY)
     assert [m.t for m in log.measurements(("odometry", "bearing_range"))] == [0.0, 1.0, 1.5, 0.5, 2.0]
+
+
+def test_rows_of_odometry_that_follow_one_another_are_one_step():
+    late = VelocityStream(column(0, 1, 2, 1.5, 3, 4, 5), column(1, 2, 3, 4, 5, 6, 7), column(0, 0, 0, 0, 1, 1, 1))
+    seen = sightings((1, "A", 2, 0), (3.5, "B", 2, 0), (4, "B", 2, 0))
+    turned = YawRateStream(column(0.5, 3.5), column(0.1, 0.2))
+    for streams, steps in (
+        ({"odometry": late, "bearing_range": seen}, [2, 1, 1, 1, 1, 1, 1, 1, 1]),
+        ({"odometry": late, "imu": turned}, [1, 1, 2, 1, 1, 1, 2]),
+        ({"imu": turned}, [1, 1]),
+    ):
+        log = make_log(**streams)
+        found = list(log.steps(tuple(streams)))
+        assert [m.count for m in found] == steps
+        singly = [one for m in found for one in (m.singly() if isinstance(m, Rows) else [m])]
+        assert list(map(str, singly)) == list(map(str, log.measurements(tuple(streams))))
 
 
 def test_span():

@@ -26,10 +26,11 @@ from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET
 from factors.motion import ChainState
 from factors.se2 import Array
-from factors.update import Correction
+from factors.update import Correction, landmark_update
 
 GOING_BACK = 5.0  # s that an estimator may go back in time
 SURVEYED_ITERATIONS = 4
+SMALL = 40  # size of error states whose matrices are inverted by compiled code
 SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
 
 
@@ -48,6 +49,23 @@ class LandmarkObservation(ResidualObservation):
     def measured(self) -> BearingRangeFactor:
         """All landmarks as one factor."""
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
+
+    def correct(
+        self,
+        pose: Array,
+        covariance: Array,
+        values: Mapping[str, Array],
+        columns: Mapping[str, slice],
+        iterations: int = 1,
+    ) -> Correction:
+        term = self.terms[0]
+        if len(self.terms) == 1 and len(covariance) <= SMALL:
+            held, first = (values[term.blocks[0]], columns[term.blocks[0]].start) if term.blocks else (np.zeros(0), 3)
+            factor = cast(BearingRangeFactor, term.factor)
+            found = landmark_update(factor, pose, covariance, held, first, iterations, self.settled)
+            if found is not None:
+                return found
+        return super().correct(pose, covariance, values, columns, iterations)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
         total = np.zeros(len(poses))

@@ -12,7 +12,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import BearingRangeModel, sigmas
+from factors.landmarks.model import BearingRangeModel, packed
+from factors.landmarks.update_kernels import innovations
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import Correction
@@ -63,18 +64,19 @@ class KnownLandmarks:
             self._diagnostics.ignore("bearing_range", len(m.landmarks))
             return None
         known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
-        rows = [i for i in known if not (np.isnan(m.range[i]) and np.isnan(m.bearing[i]))]
+        told = _told(m)
+        rows = [i for i in known if told[i]]
         if len(known) < len(m.landmarks) and not self._maps_others:
             self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
         if len(rows) < len(known):
             self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
-        if self._carries:
+        if self._carries and self._surveys:
             rows = [i for i in rows if m.landmarks[i] not in self._surveys]
         if not rows:
             return None
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
         factor = self._factor(self._model, m, rows, points, offset, twist)
-        if any(m.landmarks[i] in self._surveys for i in rows):
+        if self._surveys and any(m.landmarks[i] in self._surveys for i in rows):
             spreads = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
             factor = replace(factor, point_covariances=spreads)
         return factor
@@ -85,7 +87,7 @@ class KnownLandmarks:
         """The landmarks with an inexact survey by name, each with a factor on the pose and its position."""
         if self._model is None or not self._carries or not self._surveys:
             return []
-        told = ~(np.isnan(m.range) & np.isnan(m.bearing))
+        told = _told(m)
         rows = [i for i, name in enumerate(m.landmarks) if name in self._surveys and told[i]]
         free = [self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist) for i in rows]
         return [(m.landmarks[i], replace(factor, free=True)) for i, factor in zip(rows, free, strict=True)]
@@ -120,11 +122,12 @@ class KnownLandmarks:
         offset: Increment | None,
         twist: Array | None,
     ) -> BearingRangeFactor:
+        everything = len(rows) == len(m.landmarks)
         return BearingRangeFactor(
             model,
             points,
-            m.range[rows],
-            m.bearing[rows],
+            m.range if everything else m.range[rows],
+            m.bearing if everything else m.bearing[rows],
             None if offset is None else offset.delta,
             None if offset is None else offset.covariance,
             estimated=self._estimated,
@@ -145,10 +148,14 @@ class KnownLandmarks:
     def report(self, t: float, factor: BearingRangeFactor, update: Correction) -> None:
         """Record the innovation of an update at time ``t``."""
         self._diagnostics.innovation("bearing_range", t, update.nis, update.dof)
-        errors = -update.residual * sigmas(factor.model, factor.ranges)
-        for i, (name, measured) in enumerate((("range", factor.ranges), ("bearing", factor.bearings))):
-            found = errors[~np.isnan(measured), i].tolist()
-            self._diagnostics.add_residuals(f"bearing_range.{name}", found)
+        ranges, bearings = innovations(packed(factor.model), update.residual, factor.ranges, factor.bearings)
+        self._diagnostics.add_residuals("bearing_range.range", ranges.tolist())
+        self._diagnostics.add_residuals("bearing_range.bearing", bearings.tolist())
+
+
+def _told(m: BearingRange) -> list[bool]:
+    """Of each landmark whether its range or its bearing was measured."""
+    return [r == r or b == b for r, b in zip(m.range.tolist(), m.bearing.tolist(), strict=True)]  # noqa: PLR0124 - not NaN
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.variable import NOTHING
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
@@ -52,8 +52,11 @@ class Motion:
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
     def add(self, m: Measurement) -> None:
-        """Add a row. A row of an unused sensor is counted as ignored, one older than the kept rows as late."""
+        """Add a row or several. Rows of an unused sensor are counted as ignored, those older than the kept rows as late."""
+        kept: int
         match m:
+            case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
+                kept = self._chain.add_velocities(m.times, *m.values)
             case YawRate() if self._use_gyro:
                 kept = self._chain.add_yaw_rate(m.t, m.w)
             case VelocityOdometry() if self._use_wheels:
@@ -61,10 +64,10 @@ class Motion:
             case IncrementOdometry() if self._use_wheels:
                 kept = self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
             case _:
-                self._diagnostics.ignore(UNUSED.get(m.sensor, m.sensor))
+                self._diagnostics.ignore(UNUSED.get(m.sensor, m.sensor), m.count)
                 return
-        if not kept:
-            self._diagnostics.drop_late("odometry")
+        if kept < m.count:
+            self._diagnostics.drop_late("odometry", m.count - kept)
 
     def state(self, t: float) -> ChainState:
         return self._chain.state(t)
@@ -72,10 +75,21 @@ class Motion:
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         return self._chain.relative(start, end)
 
+    def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
+        return self._chain.travelled(start, t)
+
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
+
+    def predicted(
+        self, increment: Increment, pose: Array, covariance: Array, constants: Array, first: int
+    ) -> tuple[Array, Array, Array]:
+        """Predict a Gaussian by an increment; see :meth:`factorgraph_loc.model.motion.Motion.predicted`."""
+        motion = increment.delta, increment.covariance, increment.moving
+        pose, transition, after = kernels.predicted(*motion, pose, covariance, constants, self._indices, first)
+        return pose, transition, after
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment corrected for ``constants`` (P,)."""

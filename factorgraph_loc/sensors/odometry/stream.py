@@ -18,6 +18,7 @@ class VelocityStream(Stream):
 
     rank: ClassVar[int] = 0
     kind: ClassVar[type[Any]] = VelocityOdometry
+    joins: ClassVar[bool] = True
     v: Array
     w: Array
 

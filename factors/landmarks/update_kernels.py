@@ -1,0 +1,181 @@
+"""The Kalman update by landmarks of a map that is exact, compiled: that of :func:`factors.update.update_state`, by information.
+
+A filter makes a dozen small matrices of each look, and NumPy takes longer for each than its arithmetic does.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from factors.landmarks.model import BEARING_SIGMA, DEPTH, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST, TURN, whitened_into
+from factors.positive_kernels import inverse, root
+from factors.se2 import Array, Integers
+from factors.se2_kernels import exp
+
+_CONSTANTS = len(PARAMETERS)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def updated(
+    model: Array,
+    points: Array,
+    ranges: Array,
+    bearings: Array,
+    pose: Array,
+    covariance: Array,
+    values: Array,
+    indices: Integers,
+    first: int,
+    iterations: int,
+    converged: float,
+    gate: float,
+) -> tuple[bool, Array, Array, Array, float, int]:
+    """Whether there is an update; the correction (S,) and covariance (S, S) after it; the whitened residuals (K, 2) before it,
+    their normalised square, and how many numbers were measured.
+
+    ``model``: of :func:`~factors.landmarks.model.packed`. ``values`` (P,): of the sensor's constants that are estimated;
+    ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`, that of the time offset not among them;
+    ``first``: of their columns in the error state. ``gate``: beyond which a landmark's noise is widened.
+    """
+    seen = points, ranges, bearings
+    count, size = len(points), len(covariance)
+    columns = np.empty(3 + len(values), np.int64)
+    for j in range(len(columns)):
+        columns[j] = j if j < 3 else first + j - 3
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, len(columns)))
+    measured = _linearized(model, seen, pose, values, indices, residual, jacobian)
+    before, weights = np.zeros(size), np.ones(count)
+    prior, there = inverse(covariance)
+    if not there:
+        return False, before, covariance, residual, 0.0, measured
+    there, delta, after, pull = _solved(prior, residual, jacobian, columns, weights, before)
+    if not there:
+        return False, before, covariance, residual, 0.0, measured
+    nis, widest = 0.0, 1.0
+    for k in range(count):
+        nis += residual[k, 0] ** 2 + residual[k, 1] ** 2
+        widening = max(1.0, _normalised(residual[k], jacobian[k], columns, covariance) / gate)
+        widest = max(widest, widening)
+        weights[k] = 1.0 / (widening * widening)
+    for i in range(len(columns)):
+        for j in range(len(columns)):
+            nis -= pull[i] * after[columns[i], columns[j]] * pull[j]
+    if widest > 1.0:
+        there, delta, after, _ = _solved(prior, residual, jacobian, columns, weights, before)
+    now, moved = residual.copy(), pose.copy()
+    for _ in range(iterations - 1):
+        if not there or np.abs(delta - before).max() < converged:
+            break
+        before = delta
+        dx, dy, turned = exp(delta[0], delta[1], delta[2])
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        moved[0], moved[1], moved[2] = pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, pose[2] + turned
+        _linearized(model, seen, moved, values + delta[columns[3:]], indices, now, jacobian)
+        for k in range(count):
+            weights[k] = (1.0 + (now[k, 0] ** 2 + now[k, 1] ** 2) / model[ROBUST] ** 2) ** -2
+        there, delta, after, _ = _solved(prior, now, jacobian, columns, weights, before)
+    there = there and bool(np.all(np.isfinite(delta))) and root(after)[1]
+    return there, delta, after, residual, max(0.0, nis), measured
+
+
+@numba.njit(cache=True, error_model="numpy")
+def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
+    """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
+    by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
+    r = b = 0
+    for k in range(len(ranges)):
+        if not math.isnan(ranges[k]):
+            by_range[r] = -residual[k, 0] * math.hypot(model[RANGE_SIGMA], model[RELATIVE] * ranges[k])
+            r += 1
+        if not math.isnan(bearings[k]):
+            by_bearing[b] = -residual[k, 1] * model[BEARING_SIGMA]
+            b += 1
+    return by_range[:r], by_bearing[:b]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _linearized(
+    model: Array,
+    seen: tuple[Array, Array, Array],
+    pose: Array,
+    values: Array,
+    indices: Integers,
+    residual: Array,
+    jacobian: Array,
+) -> int:
+    """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P); how many were measured."""
+    points, ranges, bearings = seen
+    count = len(points)
+    changes = np.zeros(_CONSTANTS)
+    for j in range(len(values)):
+        changes[indices[j]] = values[j]
+    scale = model[3] * (1.0 + changes[3])
+    by_pose, by_point, by_sensor = np.zeros((count, 2, 3)), np.zeros((count, 2, 2)), np.zeros((count, 2, _CONSTANTS))
+    whitened_into(
+        pose,
+        (model[0] + changes[0], model[1] + changes[1], model[TURN]),
+        (scale, model[RANGE_SIGMA], model[RELATIVE], model[2] + changes[2], model[BEARING_SIGMA]),
+        model[DEPTH] > 0.0,
+        model[4] + changes[4],
+        points,
+        ranges,
+        bearings,
+        residual,
+        by_pose,
+        by_point,
+        by_sensor,
+    )
+    measured = 0
+    for k in range(count):
+        measured += (not math.isnan(ranges[k])) + (not math.isnan(bearings[k]))
+        for i in range(2):
+            for j in range(3):
+                jacobian[k, i, j] = by_pose[k, i, j]
+            for j in range(len(values)):
+                jacobian[k, i, 3 + j] = by_sensor[k, i, indices[j]]
+    return measured
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _solved(
+    prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
+) -> tuple[bool, Array, Array, Array]:
+    """Whether there is one, then the correction (S,), the covariance (S, S) after it, and the weighted residuals (D,) through their
+    Jacobian; linearised at the correction ``at`` (S,), from the information ``prior`` (S, S)."""
+    size, wide = len(prior), len(columns)
+    information, pull = prior.copy(), np.zeros(wide)
+    for k in range(len(residual)):
+        for i in range(2):
+            row = jacobian[k, i]
+            wanted = -residual[k, i]
+            for a in range(wide):
+                wanted += row[a] * at[columns[a]]
+            for a in range(wide):
+                weighted = weights[k] * row[a]
+                pull[a] += weighted * wanted
+                for b in range(wide):
+                    information[columns[a], columns[b]] += weighted * row[b]
+    after, there = inverse(information)
+    delta = np.zeros(size)
+    if there:
+        for i in range(size):
+            for a in range(wide):
+                delta[i] += after[i, columns[a]] * pull[a]
+    return there, delta, after, pull
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> float:
+    """Normalised innovation squared of one landmark by itself: residual (2,) and Jacobian (2, D)."""
+    a, b, c = 1.0, 0.0, 1.0
+    for i in range(len(columns)):
+        for j in range(len(columns)):
+            spread = covariance[columns[i], columns[j]]
+            a += jacobian[0, i] * spread * jacobian[0, j]
+            b += jacobian[0, i] * spread * jacobian[1, j]
+            c += jacobian[1, i] * spread * jacobian[1, j]
+    x, y = residual[0], residual[1]
+    # rounding may take all of the difference, which is never less than that
+    determinant = max(a * c - b * b, 0.5 * (a + c))
+    return float((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)
