@@ -1,11 +1,12 @@
 """What a graph estimator is made of: its settings, keyframes, what a measurement adds, and the trajectory between keyframes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator
 
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion.variables import Node, Values, pose_key
@@ -33,14 +34,22 @@ class GraphSettings(FileModel):
     visual_odometry: bool = False
 
 
+def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
+    return math.inf if value in ("all", math.inf) else bounded(value)
+
+
+def _written(lag: float | None) -> float | str | None:
+    return "all" if lag == math.inf else lag
+
+
 class SmootherSettings(GraphSettings):
     """``lag`` [s]: length of a window, behind which poses are final. By default causal estimates come from a window of 10 s and
-    the final trajectory from the whole problem, solved at the end; ``all`` keeps the full history solved all the time, as is
-    always done where landmarks or points are estimated. ``relinearize_*``: how far a variable may move (m and rad; for the
-    odometry's constants in their units) before its factors are linearised anew, and after how many updates that is checked.
-    ``smooth`` off: the final trajectory repeats the causal one."""
+    the final trajectory from the whole problem, solved at the end; ``all`` (infinity in Python) keeps the full history solved all
+    the time, as is always done where landmarks or points are estimated. ``relinearize_*``: how far a variable may move (m and rad;
+    for the odometry's constants in their units) before its factors are linearised anew, and after how many updates that is
+    checked. ``smooth`` off: the final trajectory repeats the causal one."""
 
-    lag: Annotated[float, Field(ge=0.1, le=3600.0)] | Literal["all"] | None = None
+    lag: Annotated[float | None, Field(ge=0.1, le=3600.0), WrapValidator(_lag), PlainSerializer(_written)] = None
     relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
     smooth: bool = True

@@ -50,8 +50,8 @@ class Incremental:
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
         self._maps = any(mapper.estimates for mapper in graph.mappers)
         # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
-        self._is_whole = settings.lag is None or settings.lag == "all"
-        self._lag = None if isinstance(settings.lag, str) else settings.lag
+        self._is_whole = settings.lag is None or settings.lag == math.inf
+        self._lag = None if settings.lag == math.inf else settings.lag
         if settings.lag is None and not (self._waits or self._maps):
             self._lag = LAG
         # how long observations may wait for the solver
