@@ -10,7 +10,7 @@ import numpy as np
 
 from factors.se2 import Array
 
-# of a start that is told as a pose alone
+# of a start given as a pose only
 POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
 

@@ -34,7 +34,7 @@ class Prepared:
 
 
 def lacking_section(rig: Rig, sensor: str) -> str:
-    """The section without which a sensor tells nothing, if the rig lacks it."""
+    """The section that a sensor requires, if the rig lacks it, else ""."""
     channel = channels().get(sensor)
     if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
         return ""

@@ -87,7 +87,7 @@ def mounting(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a camera whose optical axes stand in the robot's frame as ``rotation`` (3, 3): the inverse of
+    """Roll, pitch and yaw of a camera whose optical axes are ``rotation`` (3, 3) in the robot frame: the inverse of
     :func:`mounting`."""
     turned = rotation @ FORWARD.T
     yaw = math.atan2(turned[1, 0], turned[0, 0])

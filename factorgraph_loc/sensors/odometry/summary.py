@@ -120,7 +120,7 @@ def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
         lines.append(f"the odometry turns {1.0 / size:.0f} times as much as {name}: is it in degrees?")
     if found.shift:
-        # what is stamped too late gets a negative offset, and the odometry is too early where the other is too late
+        # a late timestamp needs a negative offset; the odometry is early if the other one is late
         offset = -found.shift if sensor == "imu" else found.shift
         lines.append(clock_shift.line(name, found.shift, "the odometry", sensor, offset))
     return lines

@@ -37,7 +37,7 @@ class Silence:
 class ScanMonitor:
     """Detects that scans are much less likely than they would be on a correct track.
 
-    That is only a suspicion, because dead tags and a wrong map look the same. A :class:`Seeker` tells whether there is a better
+    That is only a suspicion, because dead tags and a wrong map look the same. The search tells whether there is a better
     pose.
     """
 
