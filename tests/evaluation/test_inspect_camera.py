@@ -58,7 +58,7 @@ def test_images_that_cannot_be_read(log):
     found = inspect(log)
     assert found.images.readable == 16
     (problem,) = found.problems
-    assert problem.startswith("24 of the 40 examined images cannot be read:  ")
+    assert problem.startswith("24 of the 40 examined images cannot be read: ")
     assert "is not an image" in problem
 
 
