@@ -37,7 +37,7 @@ class SimulatedTrial:
 
 @dataclass(frozen=True)
 class SimulatedTrialJob:
-    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]."""
+    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]; ``sensors``: those used, None for all of the rig."""
 
     kind: Kind
     simulation: SimulationSettings
@@ -45,6 +45,7 @@ class SimulatedTrialJob:
     estimator: str
     deadline: float
     settings: Mapping[str, Any] = field(default_factory=dict)
+    sensors: tuple[str, ...] | None = None
 
 
 def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
@@ -56,7 +57,7 @@ def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
 def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
     log = simulate(_lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
-    result = run(log, RunConfig(job.estimator, job.settings, prior="unknown", seed=seed))
+    result = run(log, RunConfig(job.estimator, job.settings, job.sensors, prior="unknown", seed=seed))
     first = float(log.streams["rfid"].t[0])
     good = is_right(result, log)
     claims = np.flatnonzero(np.array(result.status) == "localized")
@@ -76,7 +77,7 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     other = float(log.reference.t[np.argmax(away if away.any() else later)])
     before = cut(log, 0.0, BEFORE)
     carried = join(before, cut(log, other, other + after), gap=JUMP)
-    result = run(carried, RunConfig(job.estimator, job.settings, prior="reference", seed=seed))
+    result = run(carried, RunConfig(job.estimator, job.settings, job.sensors, prior="reference", seed=seed))
     stamps = carried.streams["rfid"].t
     first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
     good = is_right(result, carried)
