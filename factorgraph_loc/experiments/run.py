@@ -167,7 +167,7 @@ def run(
             *unstated,
             *unused(log, sensors),
             *prepared.warnings,
-            *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics)),
+            *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics, learnt)),
             *never_localized(log, sensors, loop.estimates, final),
             *partly_scored(log, final, config.max_gap),
             *with_pauses(log, ticks.skipped, config.tick_gap),

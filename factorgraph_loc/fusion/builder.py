@@ -181,16 +181,17 @@ class Builder:
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
                 continue
-            correction = seen.correct(*view.guess, {}, {}, seen.iterations or ITERATIONS_OF_GUESS)
-            if seen.is_judged and not sensor.judge(seen, correction, view):
+            here = view.on_pose(seen)
+            correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
+            if seen.is_judged and not sensor.judge(here, correction, view):
                 continue
-            evidence = partial(laplace_evidence, seen, *view.guess, correction)
+            evidence = partial(laplace_evidence, here, *view.guess, correction)
             self._waiting.append(seen)
             graph.pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
             graph.covariance = correction.covariance
             view.guess = graph.pose, graph.covariance
             self._backend.refine(graph.newest, view.guess)
-            self._search.keep(sensor, seen, odometry, evidence)
+            self._search.keep(sensor, here, odometry, evidence)
 
     def _add_keyframe(self, t: float, m: Measurement | None) -> None:
         graph = self._graph

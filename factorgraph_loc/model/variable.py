@@ -24,8 +24,12 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Those of ``names`` whose uncertainty is positive."""
-        sigmas = np.array([getattr(uncertainty, name, 0.0) for name in names])
+        """Those of ``names`` whose uncertainty is above zero."""
+        return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
+
+    @staticmethod
+    def among(names: Sequence[str], sigmas: Array) -> Estimated:
+        """Those of ``names`` (P,) whose ``sigmas`` (P,) are above zero."""
         indices = tuple(np.flatnonzero(sigmas).tolist())
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 

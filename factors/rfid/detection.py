@@ -9,6 +9,7 @@ unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -17,9 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
+from factors.rfid import adjustment
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.model import Packed, RfidModel
-from factors.rfid.tables import Array32, Tables, add_log_likelihood, add_mixed, make_tables
+from factors.rfid.tables import (
+    Array32,
+    Changes,
+    Tables,
+    add_log_likelihood,
+    add_mixed,
+    adjusted_logs,
+    levels,
+    make_tables,
+)
 from factors.se2 import Array
 
 
@@ -89,14 +100,41 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of an antenna model with a map of tags; ``packed``: the model for compiled code."""
+    """The likelihood of an antenna model of M detection models with a map of tags.
+
+    ``parameters`` (2 M,): how the models are adjusted (:mod:`factors.rfid.adjustment`); ``packed``: what compiled code takes.
+    """
 
     model: RfidModel
     tags: TagArray
     packed: Packed = field(init=False, repr=False)
+    parameters: Array = field(init=False, repr=False)
+    _unadjusted: RfidLikelihood = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "packed", self.model.packed())
+        object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models)))
+        object.__setattr__(self, "_unadjusted", self)
+
+    def adjusted(self, parameters: Array) -> RfidLikelihood:
+        """The same with other parameters (2 M,) of the detection models."""
+        out = copy.copy(self)
+        object.__setattr__(out, "packed", adjustment.adjusted(self._unadjusted.packed, parameters))
+        object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
+        return out
+
+    def joint_score(self, pose: Array, parameters: Array, looks: TagReadCounts) -> Score:
+        """Likelihood, gradient (1, 3 + 2 M) and information (1, 3 + 2 M, 3 + 2 M) at one pose (3,), by its body-frame perturbation
+        and the ``parameters`` (2 M,) of the detection models."""
+        size = 3 + len(parameters)
+        gradient, information = np.empty(size), np.empty((size, size))
+        arrays = (self.tags.points, self.tags.normals, looks.offsets)
+        counts = (looks.antennas, looks.rounds, looks.hits)
+        packed, pose = adjustment.adjusted(self._unadjusted.packed, parameters), np.asarray(pose, dtype=float)
+        tempering = self.model.tempering
+        told = adjustment.score(packed, pose, *arrays, *counts, looks.odds, tempering, gradient, information)
+        nll, expected, variance = (np.array([value]) for value in told)
+        return Score(nll, gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
@@ -119,34 +157,57 @@ class RfidLikelihood:
         rfid_kernels.silence(self.packed, pose, covariance, *tags, *where, *seen, looks.odds, tempering, out)
         return out
 
-    def log_likelihood(self, poses: Array, looks: TagReadCounts) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`), for particles."""
+    def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
+        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`): for particles.
+
+        ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
+        """
         poses = np.ascontiguousarray(poses, dtype=float)
-        certain, silent, which = self.by_silence(poses, looks)
+        certain, silent, which = self.by_silence(poses, looks, parameters)
         if len(which):
             add_mixed(silent, looks.odds[which], self.model.tempering, certain)
         return certain
 
-    def by_silence(self, poses: Array, looks: TagReadCounts) -> tuple[Array, Array32, NDArray[np.int64]]:
-        """The log-likelihood at poses (N, 3) in two parts: tempered (N,), of tags that are alive or were read; and untempered (U,
-        N), of the silence of each of U uncertain tags if it is alive, relative to a tag out of range, with the indices (U,) of
-        these tags in the map."""
+    def by_silence(
+        self, poses: Array, looks: TagReadCounts, parameters: Array | None = None
+    ) -> tuple[Array, Array32, NDArray[np.int64]]:
+        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,
+        of the silence of U tags that may be dead, each by itself if it is alive, above what it is out of reach, (U, N), with the
+        places (U,) of these tags in the map."""
+        if parameters is None and self.parameters.any():
+            parameters = np.broadcast_to(self.parameters, (len(poses), len(self.parameters)))
+        largest = 1.0 if parameters is None else float(np.exp(parameters[:, 0::2].max(initial=0.0)))
         out = np.zeros(len(poses))
-        which = np.flatnonzero((looks.odds > -np.inf) & ~looks.hits.any(axis=0) & self._near(poses, looks))
+        near = self._near(poses, looks, largest)
+        which = np.flatnonzero((looks.odds > -np.inf) & ~looks.hits.any(axis=0) & near)
         apart = np.full(len(looks.odds), -1, dtype=np.int64)
         apart[which] = np.arange(len(which))
         silent = np.zeros((len(which), len(poses)), dtype=np.float32)
         for i in range(len(looks.antennas)):
             at = poses if not looks.offsets[i].any() else se2.compose(poses, looks.offsets[i])
             tags = (self.tags.points, self.tags.normals, looks.hits[i], int(looks.rounds[i]))
-            add_log_likelihood(self.packed, self._tables, int(looks.antennas[i]), at, *tags, apart, out, silent)
+            antenna = int(looks.antennas[i])
+            changes = None if parameters is None else self._changes(parameters, antenna)
+            packed, tables = self._unadjusted.packed, self._unadjusted._tables
+            add_log_likelihood(packed, tables, antenna, at, *tags, apart, out, silent, changes)
         return self.model.tempering * out, silent, which
 
-    def _near(self, poses: Array, looks: TagReadCounts) -> NDArray[np.bool_]:
-        """The tags (T,) that may be in range of an antenna from any of the poses."""
-        packed = self.packed
+    def _changes(self, parameters: Array, antenna: int) -> Changes:
+        """What ``parameters`` (N, 2 M) make of the tables of an antenna."""
+        packed = self._unadjusted.packed
+        m = int(packed.which[antenna])
+        logs = self._unadjusted._adjusted_logs[m]
+        return Changes(np.exp(-parameters[:, 2 * m]), levels(parameters[:, 2 * m + 1]), logs)
+
+    @cached_property
+    def _adjusted_logs(self) -> list[Array32]:
+        return [adjusted_logs(self.packed, peak) for peak in self.packed.peak]
+
+    def _near(self, poses: Array, looks: TagReadCounts, largest: float) -> NDArray[np.bool_]:
+        """Which tags (T,) may be in reach of an antenna from any of the poses; ``largest``: factor of all ranges."""
+        packed = self._unadjusted.packed
         way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
-        reach = way + float(np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
+        reach = way + float(np.max(largest * packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
         low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
         return np.asarray(
             np.all((self.tags.points[:, :2] > low - reach) & (self.tags.points[:, :2] < high + reach), axis=1)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from factors.compressed import compressed
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.phase import PhaseLikelihood, PhaseReads, PhaseScore
@@ -17,11 +19,22 @@ TagScore = Score | RssiScore | PhaseScore
 
 @dataclass(frozen=True, eq=False)
 class RfidFactor:
-    """An RFID likelihood as a factor on one pose (3,), in compressed Fisher form: four residuals with the value, the gradient and
-    the expected curvature of the likelihood. ``seen``: read counts for :class:`RfidLikelihood`, reads for the other two."""
+    """A likelihood of what was read, on the one pose (3,) that looks or reads are placed around, in compressed Fisher form:
+    whatever their number there are four residuals, whose squares have the value, the gradient and the expected curvature of the
+    likelihood. ``seen``: looks for a :class:`RfidLikelihood`, reads for the other two.
+
+    ``estimated`` (P,): places, among the parameters of the detection models (:mod:`factors.rfid.adjustment`), of those that are a
+    second variable (P,) of looks; there are P residuals more then.
+    """
 
     likelihood: RfidLikelihood | RssiLikelihood | PhaseLikelihood
     seen: TagReadCounts | RssiReads | PhaseReads
+    estimated: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> int:
+        """How many residuals there are."""
+        return ROWS + len(self.estimated)
 
     @property
     def is_phase(self) -> bool:
@@ -31,6 +44,29 @@ class RfidFactor:
     def with_odds(self, odds: Array) -> RfidFactor:
         """The factor with other log-odds (T,) that each tag is dead; for read counts only."""
         return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, TagReadCounts) else self
+
+    def fixed(self, values: Array) -> RfidFactor:
+        """The same on the pose alone, with the ``values`` (P,) of what is estimated."""
+        if not isinstance(self.likelihood, RfidLikelihood):
+            return self
+        return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
+
+    def _parameters(self, values: Array) -> Array:
+        """All parameters (..., 2 M) of the detection models for ``values`` (..., P) of those that are estimated."""
+        assert isinstance(self.likelihood, RfidLikelihood)
+        out = np.zeros((*values.shape[:-1], len(self.likelihood.parameters)))
+        out[..., list(self.estimated)] = values
+        return out
+
+    def joint_score(self, values: Sequence[Array]) -> TagScore:
+        """Of one pose (3,) and what is estimated (P,): gradient (1, 3 + P) and information (1, 3 + P, 3 + P) by both."""
+        if not self.estimated:
+            return self.score(values[0])
+        assert isinstance(self.likelihood, RfidLikelihood)
+        assert isinstance(self.seen, TagReadCounts)
+        found = self.likelihood.joint_score(values[0], self._parameters(values[1]), self.seen)
+        kept = [0, 1, 2, *(3 + i for i in self.estimated)]
+        return found._replace(gradient=found.gradient[:, kept], information=found.information[:, kept][:, :, kept])
 
     def score(self, pose: Array) -> TagScore:
         """The score of one pose (3,); every field has a leading axis of length 1."""
@@ -43,11 +79,11 @@ class RfidFactor:
                 return phase.score(pose, reads)
         raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.seen).__name__}")
 
-    def log_likelihood(self, poses: Array) -> Array:
-        """The tempered log-likelihood (N,) of poses (N, 3)."""
+    def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
+        """The tempered log-likelihood (N,) of poses (N, 3), with ``values`` (N, P) of what is estimated at each."""
         match self.likelihood, self.seen:
             case RfidLikelihood() as detection, TagReadCounts() as looks:
-                return detection.log_likelihood(poses, looks)
+                return detection.log_likelihood(poses, looks, None if values is None else self._parameters(values))
             case RssiLikelihood() as strength, RssiReads() as reads:
                 return strength.log_likelihood(poses, reads)
             case PhaseLikelihood() as phase, PhaseReads() as reads:
@@ -55,11 +91,11 @@ class RfidFactor:
         raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.seen).__name__}")
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Residual (4,) and its Jacobian (4, 3)."""
-        score = self.score(values[0])
+        """Residual (4 + P,) and its Jacobians (4 + P, 3) by the pose and, of P > 0, (4 + P, P)."""
+        score = self.joint_score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
-        return residual, [jacobian]
+        return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
 
     def cost(self, values: Sequence[Array]) -> float:
         """The tempered negative log-likelihood."""
-        return float(self.score(values[0]).nll[0])
+        return float((self.fixed(values[1]) if self.estimated else self).score(values[0]).nll[0])

@@ -53,34 +53,44 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
 @numba.njit(cache=True, inline="always")
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
-) -> tuple[float, float, float, float]:
-    """Logit of a tag for an antenna at (x, y) with boresight (c, s), and its derivatives: by the tag's position along and across
-    the boresight, and by the antenna's heading. It is constant out of range."""
+) -> tuple[float, float, float, float, float]:
+    """Logit of one tag for an antenna at (x, y) that looks along (c, s), and its derivatives: by the tag's place along and across
+    the boresight, by the antenna's heading, and by the logarithm of the model's range. Beyond the reach it is constant."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
     if squared >= packed.reach[m] ** 2:
-        return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0
+        return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0, 0.0
     p, q = c * ex + s * ey, c * ey - s * ex
     nx, ny = c * normal[0] + s * normal[1], c * normal[1] - s * normal[0]
     distance = math.sqrt(squared + 1e-9)
     facing = -(nx * p + ny * q) / distance
-    value, by_p, by_q, _, by_c = seen(packed, antenna, p, q, point[2] - packed.antennas[antenna, 2], facing)
+    unit = 1.0 / packed.scale[m]
+    height = point[2] - packed.antennas[antenna, 2]
+    value, by_p, by_q, _, by_c = seen(packed, antenna, unit * p, unit * q, height, facing)
+    by_p, by_q = unit * by_p, unit * by_q
+    by_range = -(by_p * p + by_q * q)
     by_heading = by_p * q - by_q * p
     by_p -= by_c * (nx + facing * p / distance) / distance
     by_q -= by_c * (ny + facing * q / distance) / distance
-    return value, by_p, by_q, by_heading
+    return value, by_p, by_q, by_heading, by_range
 
 
 @numba.njit(cache=True, inline="always")
-def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Negative log-likelihood of ``hits`` in ``rounds``, its derivative by the logit, Fisher information on the logit, and mean and
-    variance of the negative log-likelihood."""
+def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
+    """Probability of a read at a logit, floor included, and its derivatives by the logit and by the logarithm of ``rate``."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
-    q = packed.false_read + packed.span * sigmoid
-    # without a floor probabilities may be 0 or 1, whose logarithms diverge
-    q = min(max(q, 1e-12), 1.0 - 1e-12)
-    by_z = packed.span * sigmoid * (1.0 - sigmoid)
+    by_rate = packed.span * rate * sigmoid
+    # a model without a floor may be certain, and certainty has no logarithm
+    q = min(max(packed.false_read + by_rate, 1e-12), 1.0 - 1e-12)
+    return q, by_rate * (1.0 - sigmoid), by_rate
+
+
+@numba.njit(cache=True, inline="always")
+def terms(packed: Packed, z: float, rate: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
+    """Negative log-likelihood of k hits in n rounds, its derivative by the logit, Fisher's information on the logit, and mean and
+    variance of the negative log-likelihood."""
+    q, by_z, _ = detection(packed, z, rate)
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q)) * by_z
@@ -91,9 +101,9 @@ def terms(packed: Packed, z: float, hits: int, rounds: int) -> tuple[float, floa
 
 
 @numba.njit(cache=True, inline="always")
-def _place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Rows (K, 8): position and boresight of each antenna in the world, then in the frame of the pose. Returns the largest distance
-    [m] from the pose that an antenna covers."""
+def place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
+    """Rows (K, 8) of looks: place and boresight of the antenna in the world, then in the frame of the pose. Returns how far from
+    the pose [m] the farthest antenna reaches."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]
@@ -124,14 +134,15 @@ def _alive(
     xx = xy = xa = yy = ya = aa = 0.0
     for k in range(len(antennas)):
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
-        z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, point, normal)
-        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of range and not read, the usual case
+        z, by_p, by_q, by_heading, _ = of_tag(packed, antennas[k], x, y, c, s, point, normal)
+        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
             e_sum, silent = e_sum + far[k, 0], silent + far[k, 0]
             mean_sum, spread_sum = mean_sum + far[k, 1], spread_sum + far[k, 2]
             continue
-        e, g, f, mean, spread = terms(packed, z, hits[k], rounds[k])
+        rate = packed.rate[packed.which[antennas[k]]]
+        e, g, f, mean, spread = terms(packed, z, rate, hits[k], rounds[k])
         e_sum += e
-        silent += e if hits[k] == 0 else terms(packed, z, 0, rounds[k])[0]
+        silent += e if hits[k] == 0 else terms(packed, z, rate, 0, rounds[k])[0]
         mean_sum += mean
         spread_sum += spread
         # the antenna moves, the tag does not
@@ -172,6 +183,20 @@ def _mixed(
     return nll, left / total, expected, max(second - expected * expected, 0.0) / tempering
 
 
+@numba.njit(cache=True, inline="always")
+def counted(
+    odds: float, heard: int, e: float, silent: float, mean: float, spread: float, none: float, tempering: float
+) -> tuple[float, float, float, float]:
+    """How much a tag counts, ``heard`` so often, that may be dead: the factor of its derivatives, and its tempered negative
+    log-likelihood with mean and variance. ``e``, ``mean`` and ``spread``: the same if it is alive; see :func:`_mixed`."""
+    if odds == -np.inf:
+        return tempering, tempering * e, tempering * mean, tempering * spread
+    nll, counts, mean, spread = _mixed(odds, silent, mean, spread, none, tempering)
+    if heard > 0:
+        return tempering, tempering * e, mean, spread
+    return tempering * counts, nll, mean, spread
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def score(
     packed: Packed,
@@ -199,7 +224,7 @@ def score(
     far = np.empty((looks, 3))
     far_e = far_mean = far_spread = 0.0
     for k in range(looks):
-        far[k, 0], _, _, far[k, 1], far[k, 2] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])
+        far[k, 0], _, _, far[k, 1], far[k, 2] = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, rounds[k])
         far_e, far_mean, far_spread = far_e + far[k, 0], far_mean + far[k, 1], far_spread + far[k, 2]
     at = np.empty((looks, 8))
     for n in range(len(poses)):
@@ -207,7 +232,7 @@ def score(
         e_sum = mean_sum = spread_sum = 0.0
         g_x = g_y = g_a = 0.0
         xx = xy = xa = yy = ya = aa = 0.0
-        farthest = _place_looks(packed, poses[n], offsets, antennas, at)
+        farthest = place_looks(packed, poses[n], offsets, antennas, at)
         beyond = 0
         for t in range(tags):
             dx, dy = points[t, 0] - poses[n, 0], points[t, 1] - poses[n, 1]
@@ -217,20 +242,10 @@ def score(
             tag_e, tag_silent, tag_mean, tag_spread, slope, curve = _alive(
                 packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far
             )
-            share = tempering
-            if odds[t] == -np.inf:
-                e_sum += tempering * tag_e
-                mean_sum += tempering * tag_mean
-                spread_sum += tempering * tag_spread
-            else:
-                mixed, counts, mean, spread = _mixed(odds[t], tag_silent, tag_mean, tag_spread, far_e, tempering)
-                mean_sum += mean
-                spread_sum += spread
-                if heard[t] > 0:
-                    e_sum += tempering * tag_e
-                else:
-                    e_sum += mixed
-                    share = tempering * counts
+            share, e, mean, spread = counted(
+                odds[t], heard[t], tag_e, tag_silent, tag_mean, tag_spread, far_e, tempering
+            )
+            e_sum, mean_sum, spread_sum = e_sum + e, mean_sum + mean, spread_sum + spread
             g_x, g_y, g_a = g_x + share * slope[0], g_y + share * slope[1], g_a + share * slope[2]
             xx, xy, xa = xx + share * curve[0], xy + share * curve[1], xa + share * curve[2]
             yy, ya, aa = yy + share * curve[3], ya + share * curve[4], aa + share * curve[5]
@@ -261,10 +276,10 @@ def silence(
 ) -> None:
     looks, tags = hits.shape
     at = np.empty((looks, 8))
-    farthest = _place_looks(packed, pose, offsets, antennas, at)
+    farthest = place_looks(packed, pose, offsets, antennas, at)
     far = np.empty(looks)
     for k in range(looks):
-        far[k] = terms(packed, NEGLIGIBLE_LOGIT, 0, rounds[k])[0]
+        far[k] = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, rounds[k])[0]
     g = np.empty(3)
     for t in range(tags):
         out[t] = 0.0
@@ -277,10 +292,10 @@ def silence(
                 total = -np.inf
                 break
             x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
-            z, by_p, by_q, by_heading = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
+            z, by_p, by_q, by_heading, _ = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
             if z == NEGLIGIBLE_LOGIT:
                 continue
-            e, by_z, _, _, _ = terms(packed, z, 0, rounds[k])
+            e, by_z, _, _, _ = terms(packed, z, packed.rate[packed.which[antennas[k]]], 0, rounds[k])
             total += e - far[k]
             by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
             g[0] += by_z * by_x
@@ -311,8 +326,8 @@ def by_tag(
     for k in range(len(antennas)):
         x, y, c, s, _, _ = placed(packed, antennas[k], pose, offsets[k])
         for t in range(len(points)):
-            z, by_p, by_q, _ = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
-            e, g, f, _, _ = terms(packed, z, hits[k, t], rounds[k])
+            z, by_p, by_q, _, _ = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
+            e, g, f, _, _ = terms(packed, z, packed.rate[packed.which[antennas[k]]], hits[k, t], rounds[k])
             nll[t] += e
             gx, gy = c * by_p - s * by_q, s * by_p + c * by_q
             gradient[t, 0] += g * gx
@@ -329,5 +344,5 @@ def probabilities(packed: Packed, antenna: int, poses: Array, points: Array, nor
     for n in range(len(poses)):
         x, y, c, s, _, _ = placed(packed, antenna, poses[n], none)
         for t in range(len(points)):
-            z, _, _, _ = of_tag(packed, antenna, x, y, c, s, points[t], normals[t])
-            out[n, t] = packed.false_read + packed.span / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
+            z = of_tag(packed, antenna, x, y, c, s, points[t], normals[t])[0]
+            out[n, t] = detection(packed, z, packed.rate[packed.which[antenna]])[0]

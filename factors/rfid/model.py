@@ -35,6 +35,10 @@ class DetectionModel(Protocol):
     def uses_facing(self) -> bool:
         """Whether the logit depends on the tag's facing."""
 
+    @property
+    def peak(self) -> float:
+        """The largest probability that it gives to a tag."""
+
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         """Kind, parameters, and knots (H, F, NX, NY) of a grid (empty for others)."""
 
@@ -57,6 +61,10 @@ class BeamModel:
     def uses_facing(self) -> bool:
         return False
 
+    @property
+    def peak(self) -> float:
+        return self.p0
+
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         # a probability of one has no logit
         return BEAM, (math.log(min(self.p0, ALMOST_ONE)), self.r_max, self.s_r, self.sigma_phi), np.empty((0, 0, 0, 0))
@@ -73,6 +81,13 @@ class LogisticModel:
     @property
     def uses_facing(self) -> bool:
         return any(value != 0.0 for value in self.coefficients[7:])
+
+    @property
+    def peak(self) -> float:
+        b = np.asarray(self.coefficients)
+        r, w, c = np.meshgrid(np.linspace(0.0, self.reach, 81), np.linspace(0.0, 2.0, 9), np.linspace(-1.0, 1.0, 9))
+        value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r)
+        return _probability(float(np.max(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))))
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         return LOGISTIC, tuple(self.coefficients), np.empty((0, 0, 0, 0))
@@ -105,6 +120,10 @@ class GridModel:
     def uses_facing(self) -> bool:
         return int(self.logits.shape[1]) > 1
 
+    @property
+    def peak(self) -> float:
+        return _probability(float(np.max(self.logits)))
+
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         step = self.heights[1] - self.heights[0] if len(self.heights) > 1 else 1.0
         return GRID, (self.x0, self.y0, self.cell, float(self.heights[0]), float(step)), self.logits
@@ -124,9 +143,10 @@ class Antenna:
 
 
 class Packed(NamedTuple):
-    """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch; ``which`` (A,): model
-    indices; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first index in ``knots``; ``reach``
-    (M,); ``span``: range of probabilities between the floors."""
+    """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
+    ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
+    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,): factors of each model's
+    ranges and probabilities (:mod:`factors.rfid.adjustment`); ``peak`` (M,): its largest probability."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -137,6 +157,9 @@ class Packed(NamedTuple):
     reach: Array
     false_read: float
     span: float
+    scale: Array
+    rate: Array
+    peak: Array
 
 
 @dataclass(frozen=True)
@@ -173,7 +196,14 @@ class RfidModel:
             np.array([model.reach for model in self.models]),
             self.false_read,
             1.0 - self.false_read - self.miss,
+            np.ones(len(self.models)),
+            np.ones(len(self.models)),
+            np.array([model.peak for model in self.models]),
         )
+
+
+def _probability(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-logit))
 
 
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.rfid.adjustment import rates
 from factors.rfid.kernels import FAST, seen
 from factors.rfid.model import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidModel, logistic_value
 from factors.se2 import Array
@@ -20,7 +21,8 @@ Array32 = NDArray[np.float32]
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
 STEP = 0.01  # of the logit, in the tables of logarithms
-LEVEL = 0.04  # m; tags within this height range share a table
+LEVEL = 0.04  # m: tags at the same height, to so much, share a table
+SHIFTS = np.linspace(-4.0, 4.0, 161)  # of a peak's logit, each with tables of logarithms of its own
 
 
 class Tables(NamedTuple):
@@ -36,6 +38,32 @@ class Tables(NamedTuple):
     facings: NDArray[np.int64]
     level: NDArray[np.int64]
     logs: Array
+
+
+class Changes(NamedTuple):
+    """How each of N poses adjusts the model of an antenna (:mod:`factors.rfid.adjustment`).
+
+    ``unit`` (N,): 1 / scale; ``level`` (N,): its place in ``logs`` (K, Z, 2), which are log q and log(1 - q) of the logits of
+    :class:`Tables`, for K shifts of the peak's logit.
+    """
+
+    unit: Array
+    level: NDArray[np.int32]
+    logs: Array32
+
+
+def levels(shift: Array) -> NDArray[np.int32]:
+    """Places (N,) of shifts among :data:`SHIFTS`."""
+    step = SHIFTS[1] - SHIFTS[0]
+    return np.asarray(np.clip(np.rint((shift - SHIFTS[0]) / step), 0, len(SHIFTS) - 1), dtype=np.int32)
+
+
+def adjusted_logs(packed: Packed, peak: float) -> Array32:
+    """Log q and log(1 - q), (K, Z, 2), for :data:`SHIFTS` of the logit of a model's ``peak``."""
+    z = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
+    q = packed.false_read + packed.span * rates(np.asarray(peak), SHIFTS)[:, None] / (1.0 + np.exp(-z))
+    q = np.clip(q, 1e-12, 1.0 - 1e-12)
+    return np.asarray(np.log(np.stack((q, 1.0 - q), axis=-1)), dtype=np.float32)
 
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
@@ -87,15 +115,18 @@ def add_log_likelihood(
     apart: NDArray[np.int64],
     out: Array,
     each: Array32,
+    changes: Changes | None = None,
 ) -> None:
-    """Add to ``out`` (N,) the untempered log-likelihood that an antenna at robot poses (N, 3) reads each tag at ``points`` (T, 3)
-    with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): row of ``each`` (U, N) to which a tag is added
-    instead, relative to a tag out of range; -1 for ``out``."""
+    """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
+    (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
+    added by itself, above what it is out of reach, -1 of tags that go to ``out``. ``changes``: of the model, by pose."""
     arrays = (points, normals, hits, rounds, apart)
+    if changes is None:
+        changes = Changes(np.ones(len(poses)), np.empty(0, np.int32), np.empty((0, 0, 2), np.float32))
     if packed.kinds[packed.which[antenna]] == LOGISTIC:
-        _add_direct(packed, antenna, poses, *arrays, tables.logs, out, each)
+        _add_direct(packed, antenna, poses, *arrays, tables.logs, changes, out, each)
     else:
-        _add_tabled(packed, antenna, poses, *arrays, tables, tables.level[antenna], out, each)
+        _add_tabled(packed, antenna, poses, *arrays, tables, tables.level[antenna], changes, out, each)
 
 
 @numba.njit(cache=True, fastmath=FAST)
@@ -154,14 +185,15 @@ def _add_tabled(
     apart: NDArray[np.int64],
     tables: Tables,
     level: NDArray[np.int64],
+    changes: Changes,
     out: Array,
     each: Array32,
 ) -> None:
     a = packed.antennas[antenna]
     ax, ay, ca, sa = a[0], a[1], a[3], a[4]
     logs = tables.logs
-    far = _out_of_reach(poses, points, packed.reach[packed.which[antenna]] + math.sqrt(ax * ax + ay * ay))
-    # position and direction of the antenna at each pose, in cells
+    far = _out_of_reach(poses, points, _reach(packed, antenna, changes))
+    # place and direction of the antenna at each pose, in cells
     x, y = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
     c, s = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
     inverse = 1.0 / CELL
@@ -170,7 +202,8 @@ def _add_tabled(
         ct, st = math.cos(poses[n, 2]), math.sin(poses[n, 2])
         x[n] = (poses[n, 0] - middle_x + ct * ax - st * ay) * inverse
         y[n] = (poses[n, 1] - middle_y + st * ax + ct * ay) * inverse
-        c[n], s[n] = ct * ca - st * sa, st * ca + ct * sa
+        unit = changes.unit[n]
+        c[n], s[n] = unit * (ct * ca - st * sa), unit * (st * ca + ct * sa)
     constant = 0.0
     # tags in the outer loop, because all poses access nearby cells for one tag
     certain = np.zeros(len(poses), np.float32)
@@ -191,9 +224,9 @@ def _add_tabled(
         begin = tables.start[k]
         table = tables.logits[begin : begin + layers * size * size]
         if layers > 1:
-            _add_facing(x, y, c, s, tx, ty, table, size, layers, normals[t], hits[t], rounds, logs, total)
+            _add_facing(x, y, c, s, tx, ty, table, size, layers, normals[t], hits[t], rounds, logs, changes, total)
             continue
-        if hits[t] == 0:
+        if len(changes.level) == 0 and hits[t] == 0:
             _add_missed(x, y, c, s, tx, ty, tables.missed[begin : begin + size * size], size, np.float32(rounds), total)
             continue
         ends = np.int32(size - 1)
@@ -202,10 +235,25 @@ def _add_tabled(
             ex, ey = tx - x[n], ty - y[n]
             i = min(max(np.int32(c[n] * ex + s[n] * ey + to_middle), np.int32(0)), ends)
             j = min(max(np.int32(c[n] * ey - s[n] * ex + to_middle), np.int32(0)), ends)
-            row = table[i * size + j]
-            total[n] += np.float32(hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1])
+            total[n] += np.float32(_read(table[i * size + j], hits[t], rounds, logs, changes, n))
     for n in range(len(poses)):
         out[n] += constant + certain[n]
+
+
+@numba.njit(cache=True)
+def _reach(packed: Packed, antenna: int, changes: Changes) -> float:
+    """How far an antenna reaches from the robot's middle at most."""
+    a = packed.antennas[antenna]
+    return float(packed.reach[packed.which[antenna]] / np.min(changes.unit) + math.sqrt(a[0] * a[0] + a[1] * a[1]))
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _read(row: int, hits: int, rounds: int, logs: Array, changes: Changes, n: int) -> float:
+    """Log-likelihood of hits at a place of the tables of logarithms, for pose n."""
+    if len(changes.level) == 0:
+        return float(hits * logs[row, 0] + (rounds - hits) * logs[row, 1])
+    level = changes.level[n]
+    return float(hits * changes.logs[level, row, 0] + (rounds - hits) * changes.logs[level, row, 1])
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -247,6 +295,7 @@ def _add_facing(
     hits: int,
     rounds: int,
     logs: Array,
+    changes: Changes,
     total: Array32,
 ) -> None:
     """Add a tag with facing, interpolated between two layers of its table."""
@@ -262,7 +311,7 @@ def _add_facing(
         place = (below * size + i) * size + j
         low, high = table[place], table[place + size * size]
         row = int(low + (f - below) * (np.float64(high) - low) + 0.5)
-        total[n] += np.float32(hits * logs[row, 0] + (rounds - hits) * logs[row, 1])
+        total[n] += np.float32(_read(row, hits, rounds, logs, changes, n))
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -276,6 +325,7 @@ def _add_direct(
     rounds: int,
     apart: NDArray[np.int64],
     logs: Array,
+    changes: Changes,
     out: Array,
     each: Array32,
 ) -> None:
@@ -291,8 +341,9 @@ def _add_direct(
         packed.antennas[antenna, 6],
     )
     none_hit, none_missed = logs[0, 0], logs[0, 1]
-    far = _out_of_reach(poses, points, packed.reach[m] + math.sqrt(ax * ax + ay * ay))
-    near = np.flatnonzero(~far)
+    near = np.flatnonzero(~_out_of_reach(poses, points, _reach(packed, antenna, changes)))
+    far = np.ones(len(points), np.bool_)
+    far[near] = False
     constant = 0.0
     for t in np.flatnonzero(far):
         constant += hits[t] * none_hit + (rounds - hits[t]) * none_missed
@@ -304,19 +355,20 @@ def _add_direct(
         for t in near:
             ex, ey = points[t, 0] - x, points[t, 1] - y
             distance2 = ex * ex + ey * ey
-            if distance2 >= reach2:
+            unit = changes.unit[n]
+            if unit * unit * distance2 >= reach2:
                 total += hits[t] * none_hit + (rounds - hits[t]) * none_missed
                 continue
             height = points[t, 2] - az
-            along, across = cosine * ex + sine * ey, cosine * ey - sine * ex
+            along, across = unit * (cosine * ex + sine * ey), unit * (cosine * ey - sine * ex)
             u, z = cp * along + sp * height, cp * height - sp * along
             r = math.sqrt(u * u + across * across + NEAR * NEAR)
             c = -(normals[t, 0] * ex + normals[t, 1] * ey) / math.sqrt(distance2 + 1e-9)
             w = 1.0 - u / r
             row = _index(logistic_value(b, r, w, z, c))
             if apart[t] >= 0:
-                each[apart[t], n] += np.float32(rounds * (logs[row, 1] - none_missed))
+                each[apart[t], n] += np.float32(_read(row, 0, rounds, logs, changes, n) - rounds * none_missed)
                 total += rounds * none_missed
             else:
-                total += hits[t] * logs[row, 0] + (rounds - hits[t]) * logs[row, 1]
+                total += _read(row, hits[t], rounds, logs, changes, n)
         out[n] += total

@@ -75,8 +75,8 @@ def _joint(
     for k in range(len(antennas)):
         a = antennas[k]
         x, y, c, s, _, _ = placed(packed, a, pose, offsets[k])
-        z, by_p, by_q, by_heading = of_tag(packed, a, x, y, c, s, point, normal)
-        e, g, f, _, _ = terms(packed, z, hits[k, tag], rounds[k])
+        z, by_p, by_q, by_heading, _ = of_tag(packed, a, x, y, c, s, point, normal)
+        e, g, f, _, _ = terms(packed, z, packed.rate[packed.which[a]], hits[k, tag], rounds[k])
         nll += e
         if f == 0.0 and g == 0.0:
             continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -13,14 +12,16 @@ from factors import positive, se2, se2_kernels
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
-from factors.rfid.factor import RfidFactor, TagScore
+from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Packed
 from factors.se2 import Array, Integers
 
 _Tags = tuple[Array, Array]  # points and normals
 _Seen = tuple[Array, Integers, Integers, Integers, Array]  # offsets, antennas, rounds, hits and odds
-CONVERGED = 0.1  # standard deviations; convergence limit of a step
-LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: maximum step
+CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
+NOTHING = np.zeros(0)
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
+LARGEST_CHANGE = 0.5  # of a parameter of a detection model
 ITERATIONS = 4
 NOTHING_TOLD = 1e-9  # added to an information matrix that may be singular
 TELLING = 1e-6  # minimum relevant eigenvalue of an information matrix
@@ -28,7 +29,8 @@ TELLING = 1e-6  # minimum relevant eigenvalue of an information matrix
 
 @dataclass(frozen=True)
 class TagUpdate:
-    """A pose (3,) with body-frame covariance (3, 3) after an RFID update.
+    """A pose (3,) and ``values`` (P,) of the detection models after looks at tags, with their ``covariance`` (3 + P, 3 + P), in the
+    body frame.
 
     ``nis``: normalised square of the prior score, with ``dof`` degrees of freedom; ``excess_nll`` and ``variance``: excess of the
     prior negative log-likelihood over its expected value, and its variance; ``evidence``: log-probability of the measurements, by
@@ -42,74 +44,68 @@ class TagUpdate:
     excess_nll: float
     variance: float
     evidence: float
+    values: Array
 
 
 def update(
     likelihood: RfidLikelihood, looks: TagReadCounts, pose: Array, covariance: Array, iterations: int = ITERATIONS
 ) -> TagUpdate:
-    """The most likely pose after reads and misses of tags; see :func:`updated`."""
-    return updated([RfidFactor(likelihood, looks)], pose, covariance, iterations)
+    """The most likely pose after looks at tags; see :func:`updated`."""
+    return updated(RfidFactor(likelihood, looks), pose, NOTHING, covariance, iterations)
 
 
-def updated(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int = ITERATIONS) -> TagUpdate:
-    """The most likely pose for a Gaussian prior, ``pose`` (3,) with body-frame ``covariance`` (3, 3), by Fisher scoring.
+def updated(
+    factor: RfidFactor, pose: Array, values: Array, covariance: Array, iterations: int = ITERATIONS
+) -> TagUpdate:
+    """The most likely pose and ``values`` (P,) of what the factor estimates, by Fisher scoring, under a Gaussian prior.
 
-    A step that does not lower the cost is halved. The innovation is that of the first factor.
+    ``pose`` (3,) and ``values`` with ``covariance`` (3 + P, 3 + P), in the body frame. A step that does not lower the cost is
+    halved.
     """
     pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
-    likelihood, looks = factors[0].likelihood, factors[0].seen
-    if len(factors) > 1 or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
-        return scored_update(factors, pose, covariance, iterations)
+    likelihood, looks = factor.likelihood, factor.seen
+    if factor.estimated or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
+        return scored_update(factor, pose, values, covariance, iterations)
     tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
     try:
-        return TagUpdate(*_updated(*arguments, pose, covariance, iterations))
-    except np.linalg.LinAlgError:  # singular by rounding
-        return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations))
+        return TagUpdate(*_updated(*arguments, pose, covariance, iterations), values)
+    except np.linalg.LinAlgError:  # rounding made it singular
+        return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations), values)
 
 
-def scored_update(factors: Sequence[RfidFactor], pose: Array, covariance: Array, iterations: int) -> TagUpdate:
-    """:func:`updated` by factors of any kind and number."""
+def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Array, iterations: int) -> TagUpdate:
+    """:func:`updated` by a factor of any kind."""
     prior_information: Array = positive.inverse(covariance)
     sigmas = np.sqrt(np.diag(covariance))
-    scores = [factor.score(pose) for factor in factors]
-    first = scores[0]
-    # the scatter of a single scan's score does not depend on the tempering, which accounts for correlation between scans
-    tempering = factors[0].likelihood.model.tempering
+    largest = np.concatenate((LARGEST_STEP, np.full(len(values), LARGEST_CHANGE)))
+    first = factor.joint_score([pose, values])
+    # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
+    tempering = factor.likelihood.model.tempering
     nis, dof = _innovation(first.gradient[0], first.information[0], covariance, tempering)
     surprise = variance = 0.0
     if isinstance(first, Score):
         surprise, variance = float(first.nll[0] - first.expected[0]), float(first.variance[0])
-    cost, gradient, information = _total(scores)
-    best, moved = pose, np.zeros(3)
+    here, cost = first, float(first.nll[0])
+    best, changed, moved = pose, values, np.zeros(len(covariance))
     for _ in range(iterations):
-        step = _scoring_step(prior_information, information, gradient, moved)
+        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, largest)
         if np.all(np.abs(step) < CONVERGED * sigmas):
-            best = se2.compose(best, se2.exp(step))
+            best, changed = se2.compose(best, se2.exp(step[:3])), changed + step[3:]
             break
         for _ in range(4):
-            tried = se2.compose(best, se2.exp(step))
-            nll, tried_gradient, tried_information = _total([factor.score(tried) for factor in factors])
-            error = se2.log(se2.between(pose, tried))
-            tried_cost = nll + 0.5 * float(error @ prior_information @ error)
+            tried, tried_values = se2.compose(best, se2.exp(step[:3])), changed + step[3:]
+            there = factor.joint_score([tried, tried_values])
+            error = np.concatenate((se2.log(se2.between(pose, tried)), tried_values - values))
+            tried_cost = float(there.nll[0]) + 0.5 * float(error @ prior_information @ error)
             if tried_cost <= cost:
                 break
             step = step / 2.0
         else:
             break
-        best, cost, moved = tried, tried_cost, error
-        gradient, information = tried_gradient, tried_information
-    posterior, log_ratio = _posterior(prior_information, information)
-    return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost)
-
-
-def _total(scores: Sequence[TagScore]) -> tuple[float, Array, Array]:
-    first, *others = scores
-    nll, gradient, information = float(first.nll[0]), first.gradient[0], first.information[0]
-    for score in others:
-        nll += float(score.nll[0])
-        gradient, information = gradient + score.gradient[0], information + score.information[0]
-    return nll, gradient, information
+        best, changed, cost, moved, here = tried, tried_values, tried_cost, error, there
+    posterior, log_ratio = _posterior(prior_information, here.information[0])
+    return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, changed)
 
 
 @numba.njit(cache=True)
@@ -123,7 +119,7 @@ def _updated(
     surprise, variance, cost = here.nll[0] - here.expected[0], here.variance[0], here.nll[0]
     best, moved = pose.copy(), np.zeros(3)
     for _ in range(iterations):
-        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved)
+        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, LARGEST_STEP)
         small = True
         for i in range(3):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
@@ -176,16 +172,16 @@ def _apart(pose: Array, other: Array) -> Array:
 
 
 @numba.njit(cache=True)
-def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
-    """The step (3,) of Fisher scoring at a displacement ``moved`` (3,) from the prior, limited to the maximum step."""
+def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array, largest: Array) -> Array:
+    """The step (D,) of Fisher scoring from where the state has ``moved`` (D,) to, shortened to the ``largest`` (D,) allowed."""
     step = -np.linalg.solve(prior_information + information, gradient + prior_information @ moved)
-    step *= min(1.0, np.min(LARGEST_STEP / np.maximum(np.abs(step), 1e-12)))
+    step *= min(1.0, np.min(largest / np.maximum(np.abs(step), 1e-12)))
     return np.asarray(step)
 
 
 @numba.njit(cache=True)
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """Covariance (3, 3) after an update, and the log ratio of its determinant to the prior's."""
+    """Covariance (D, D) after an update, and the log of its determinant's ratio to that before."""
     posterior = np.asarray(np.linalg.inv(prior_information + information))
     return posterior, float(np.linalg.slogdet(posterior)[1] + np.linalg.slogdet(prior_information)[1])
 
@@ -193,10 +189,12 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 @numba.njit(cache=True)
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
-    spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(3)
-    if covariance[0, 0] + covariance[1, 1] > FAR:  # one direction dominates so much that the others would be lost
+    spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(len(gradient))
+    if (
+        covariance[0, 0] + covariance[1, 1] > FAR
+    ):  # of one direction so much more than of the others that these would be lost
         units = np.sqrt(np.diag(spread))
         gradient = gradient / units
-        spread = spread / units.reshape(3, 1) / units + ROUNDING * np.eye(3)
+        spread = spread / units.reshape(len(units), 1) / units + ROUNDING * np.eye(len(units))
     nis = float(gradient @ np.linalg.solve(spread, gradient))
     return nis, int(np.sum(np.linalg.eigvalsh(information) > TELLING)) if nis > 0.0 else 0

@@ -19,6 +19,7 @@ from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL,
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagReadCounts
@@ -29,8 +30,8 @@ SENSORS = ("odometry", "rfid")
 
 
 def without_constants(log: Log, seed: int) -> Log:
-    """The log with new odometry from its reference, and a rig that knows of no constant errors: it has only the white noise of
-    :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`."""
+    """The log with new odometry from its reference, and a rig that knows of no constant errors, of wheels or antennas: it has only
+    the white noise of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one to make odometry from")
     end = float(log.reference.t[-1])
@@ -44,9 +45,18 @@ def without_constants(log: Log, seed: int) -> Log:
     odometry = log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty()})
     return replace(
         log,
-        rig=log.rig.model_copy(update={"odometry": odometry}),
+        rig=log.rig.model_copy(update={"odometry": odometry, "rfid": exact(log.rig.of(RfidSettings))}),
         streams={**log.streams, "odometry": IncrementStream(t, *np.ascontiguousarray(rows.T))},
     )
+
+
+def exact(settings: RfidSettings) -> RfidSettings:
+    """The same with detection models that are known exactly."""
+    models = {
+        name: m.model_copy(update={"prior": PriorSettings(range_scale=0.0, read_rate=0.0)})
+        for name, m in settings.models.items()
+    }
+    return settings.model_copy(update={"models": models})
 
 
 def optimal_filter(log: Log) -> Trajectory:
@@ -72,7 +82,7 @@ def optimal_filter(log: Log) -> Trajectory:
             grid.predict(motion.relative(before, state))
             before = state
             mean, covariance = grid.moments()
-            tags.miss(m.t, looks, mean, se2.world_to_body(mean, covariance))
+            tags.miss(m.t, looks, mean, se2.world_to_body(mean, covariance), likelihood)
             grid.update(partial(_log_likelihood, likelihood, looks))
             mean, covariance = grid.moments()
             t.append(m.t)

@@ -127,9 +127,9 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
         hits = rng.binomial(2, shares).astype(np.int64)
         looks = TagReadCounts(np.tile(offset, (3, 1)), np.arange(3), np.full(3, 2), hits)
         start, covariance = se2.compose(pose, se2.exp(scale * rng.standard_normal(3))), spread(rng, 3, scale)
-        factors = [RfidFactor(likelihood, looks)]
-        found = rfid_update.updated(factors, start, covariance, iterations)
-        expected = rfid_update.scored_update(factors, start, covariance, iterations)
+        factor = RfidFactor(likelihood, looks)
+        found = rfid_update.updated(factor, start, np.zeros(0), covariance, iterations)
+        expected = rfid_update.scored_update(factor, start, np.zeros(0), covariance, iterations)
         sigmas = np.sqrt(np.diag(expected.covariance))
         close(found.pose, expected.pose, sigmas)
         close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.usage import Use
@@ -22,8 +23,8 @@ def mappable(log: Log) -> str | None:
     return "points" if "camera" in log.streams and log.rig.find(CameraSettings) is not None else None
 
 
-def doubts(use: Use, _: Diagnostics) -> Iterator[str]:
-    """A warning if the estimator needs map points and the map has none."""
+def doubts(use: Use, _diagnostics: Diagnostics, _learnt: Learnt) -> Iterator[str]:
+    """A map without points that the camera could find, where the estimator needs them."""
     used = [name for name in NAMES if name in use.sensors]
     points = use.log.world.points
     if not used or "camera" not in use.modalities:

@@ -11,6 +11,7 @@ import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.variable import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
@@ -20,8 +21,8 @@ from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
-from factors.rfid.detection import TagReadCounts, together
-from factors.rfid.factor import ROWS, RfidFactor
+from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
+from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
 
@@ -30,7 +31,8 @@ NO_RESIDUAL = np.empty((0, 1))
 
 @dataclass(frozen=True)
 class TagObservation:
-    """A likelihood of the pose from RFID. ``found``: number of reads."""
+    """A likelihood of what was read, of the pose and of those parameters of the detection models that are estimated, which are
+    the one block of ``blocks``. ``found``: how many reads."""
 
     t: float
     factor: RfidFactor
@@ -61,7 +63,7 @@ class TagObservation:
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        return (Term(self.factor, (), ROWS),)
+        return (Term(self.factor, self.blocks, self.factor.rows),)
 
     def correct(
         self,
@@ -71,22 +73,28 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """The most likely pose, by Fisher scoring; other components are corrected by their correlation."""
-        own = np.ascontiguousarray(covariance[:3, :3])
-        found = rfid_update.updated([self.factor], pose, own, iterations)
-        delta, after = se2.log(se2.between(pose, found.pose)), found.covariance
-        if len(covariance) > 3:
-            gain = positive.solve(own, covariance[:3]).T
+        """The most likely pose and parameters, by Fisher scoring; what else is in the state follows by correlation."""
+        at = [0, 1, 2, *(i for name in self.blocks for i in range(columns[name].start, columns[name].stop))]
+        before = np.concatenate([rfid_update.NOTHING, *(values[name] for name in self.blocks)])
+        own = np.ascontiguousarray(covariance[np.ix_(at, at)])
+        found = rfid_update.updated(self.factor, pose, before, own, iterations)
+        delta = np.concatenate((se2.log(se2.between(pose, found.pose)), found.values - before))
+        after = found.covariance
+        if len(covariance) > len(at):
+            gain = positive.solve(own, covariance[at]).T
             after = covariance - gain @ (own - found.covariance) @ gain.T
             delta = gain @ delta
         told = found.excess_nll, found.variance, found.evidence
         return Correction(delta, after, NO_RESIDUAL, found.nis, found.dof, *told)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
-        return self.factor.log_likelihood(poses)
+        return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        return self
+        """The same with the detection models as they are estimated to be; how exactly is left out."""
+        if not self.blocks:
+            return self
+        return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())
 
 
 class TagSensor(Sensor):
@@ -103,7 +111,9 @@ class TagSensor(Sensor):
     gathers = True
     evidence_every = 0.0
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
+    def __init__(self, setup: Setup, diagnostics: Diagnostics, constants: Estimated = NOTHING) -> None:
+        self.constants = constants
+        self._blocks = (self.modality,) if constants.names else ()
         self.tags = KnownTags(setup, diagnostics)
         self.bounds = extent(setup.world, self.tags.map.tags) if self.tags.likelihood is not None else None
         self._diagnostics = diagnostics
@@ -133,8 +143,8 @@ class TagSensor(Sensor):
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, looks: TagReadCounts) -> TagObservation:
         assert self.tags.likelihood is not None
-        factor = RfidFactor(self.tags.likelihood, moved)
-        return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas))
+        factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
+        return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas), self._blocks)
 
     def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
         looks, t = observation.factor.seen, observation.t
@@ -147,7 +157,9 @@ class TagSensor(Sensor):
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
         if view.localized and self.suspicious_since is None:
-            self.tags.miss(t, looks, view.pose, view.covariance)
+            values = [value for name in observation.blocks if (value := view.value(name)) is not None]
+            factor = observation.factor.fixed(values[0]) if values else observation.factor
+            self.tags.miss(t, looks, view.pose, view.covariance, cast(RfidLikelihood, factor.likelihood))
         return True
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
@@ -162,7 +174,10 @@ class TagSensor(Sensor):
 
     def evidence(self, m: RfidScan) -> TagObservation | None:
         looks = self.tags.looks(m, count=False)
-        return None if looks is None or self.tags.likelihood is None else self._detection(m, looks, looks)
+        if looks is None or self.tags.likelihood is None:
+            return None
+        found = self._detection(m, looks, looks)  # with the models of the rig
+        return replace(found, factor=replace(found.factor, estimated=()), blocks=())
 
     @property
     def suspicious_since(self) -> float | None:
@@ -180,8 +195,8 @@ class TagSensor(Sensor):
         looks = [seen for o in observations if isinstance(seen := o.factor.seen, TagReadCounts)]
         factors = [o.factor for o in observations if not isinstance(o.factor.seen, TagReadCounts)]
         if looks and self.tags.likelihood is not None:
-            factors.append(RfidFactor(self.tags.likelihood, together(looks)))
-        return [Term(factor, (), ROWS) for factor in factors]
+            factors.append(RfidFactor(self.tags.likelihood, together(looks), self.constants.indices))
+        return [Term(factor, self._blocks if factor.estimated else (), factor.rows) for factor in factors]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """The factor with the tag states as known at the end instead of at each scan."""
@@ -198,6 +213,8 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """The sensor of a run, or None if it is not used."""
-    sensor = TagSensor(binding.setup, binding.diagnostics)
+    """The sensor of a run; None where it is not used."""
+    settings = binding.setup.rig.rfid
+    constants = NOTHING if settings is None or binding.calibration == "none" else settings.estimated()
+    sensor = TagSensor(binding.setup, binding.diagnostics, constants)
     return sensor if sensor.tags.likelihood is not None else None

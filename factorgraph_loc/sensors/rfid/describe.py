@@ -1,13 +1,22 @@
 """Descriptions of what a run can do with RFID tags."""
 
+import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.usage import Use
+from factorgraph_loc.text import quoted
+from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
 
 SHOWN = 5  # names in a warning
+CLEARLY = 3.0  # standard deviations
+DIFFERENT = 0.1  # of a range or of a probability: less is nothing to warn of
 
 
 def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
@@ -20,8 +29,9 @@ def mappable(log: Log) -> str | None:
     return "tags" if "rfid" in log.streams else None
 
 
-def doubts(use: Use, diagnostics: Diagnostics) -> Iterator[str]:
-    """Warnings that an estimator does not use RFID, that no tag is read, or that tags are believed dead."""
+def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
+    """That an estimator takes no tags, that none is read, which are believed dead at the end, the surest first, and how the
+    antennas differ from the rig's models."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # obvious from its name
         yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
@@ -39,6 +49,22 @@ def doubts(use: Use, diagnostics: Diagnostics) -> Iterator[str]:
             f"{log.name}: {len(found)} of {len(tags)} tags of the map are believed dead, as they were not read from where "
             f"they should have been: {names}{more}"
         )
+    yield from (f"{log.name}: {line}" for line in _differences(log.rig.of(RfidSettings), learnt))
+
+
+def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
+    """What was learnt of the antennas' models and is clearly not what the rig says."""
+    for name, model in settings.models.items():
+        peak = min(model.model().peak, MOST_CERTAIN)
+        for prefix, of in (("rfid.", "the antennas"), (f"rfid.{name}.", f"the antennas of model {quoted(name)}")):
+            ranges, rate = (learnt.values.get(prefix + parameter, (0.0, 0.0)) for parameter in PARAMETERS)
+            factor = math.exp(ranges[0])
+            if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > DIFFERENT:
+                more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
+                yield f"{of} reach {more} than the rig says"
+            found = peak * float(rates(np.asarray(peak), np.asarray(rate[0])))
+            if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > DIFFERENT:
+                yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
 
 
 def _percent(probability: float) -> str:

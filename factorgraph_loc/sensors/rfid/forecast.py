@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.sensors.forecast import Array32, Places
 from factors.rfid.detection import RfidLikelihood
-from factors.rfid.kernels import FAST, of_tag, placed
-from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed
+from factors.rfid.kernels import FAST, detection, of_tag, placed
+from factors.rfid.model import Packed
 from factors.se2 import Array
 
 CELL = 0.15  # m, of the tables
@@ -101,9 +101,8 @@ def _fill(packed: Packed, heights: Array, half: int, out: Array) -> None:
                     point[0] = (i - half) * CELL
                     for j in range(size):
                         point[1] = (j - half) * CELL
-                        z, _, _, _ = of_tag(packed, a, x, y, c, s, point, normal)
-                        sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
-                        out[k, f, i, j, a] = packed.false_read + packed.span * sigmoid
+                        z = of_tag(packed, a, x, y, c, s, point, normal)[0]
+                        out[k, f, i, j, a] = detection(packed, z, packed.rate[packed.which[a]])[0]
 
 
 @numba.njit(cache=True)

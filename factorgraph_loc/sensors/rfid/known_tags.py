@@ -72,12 +72,11 @@ class KnownTags:
         self._tell()
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds)
 
-    def miss(self, t: float, looks: TagReadCounts, pose: Array, covariance: Array) -> None:
-        """Update the states of tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted
-        pose of the read counts."""
-        if self.likelihood is not None:
-            self.states.miss(t, self.likelihood.silence(pose, covariance, looks))
-            self._tell()
+    def miss(self, t: float, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> None:
+        """Learn of the tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): that of the looks, as
+        it was predicted before them. ``likelihood``: with the detection models as they are estimated to be."""
+        self.states.miss(t, likelihood.silence(pose, covariance, looks))
+        self._tell()
 
     def forget(self, since: float) -> None:
         """Undo the updates by misses since ``since``."""

@@ -15,9 +15,11 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from factorgraph_loc.files.models import Coordinate, FileModel, inside
 from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.variable import Estimated
 from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
 from factorgraph_loc.text import listed, quoted
 from factors import se2
+from factors.rfid.adjustment import PARAMETERS
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
 from factors.rfid.phase import PhaseModel
 from factors.rfid.strength import RssiModel
@@ -29,10 +31,20 @@ Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
+class PriorSettings(FileModel):
+    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.adjustment`): ``range_scale`` of the
+    logarithm of a factor of its range, ``read_rate`` of the logit of its largest probability. What is above zero is learnt on the
+    way by every estimator that uses tags."""
+
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
+    read_rate: Annotated[float, Field(ge=0.0, le=3.0, description="of a logit")] = 1.0
+
+
 class BeamSettings(FileModel):
-    """See :class:`factors.rfid.model.BeamModel`."""
+    """See :class:`factors.rfid.model.BeamModel`; ``prior``: how well it is known."""
 
     kind: Literal["beam"] = "beam"
+    prior: PriorSettings = Field(default_factory=PriorSettings)
     p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
     r_max: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 4.5
     s_r: Annotated[float, Field(ge=1e-3, le=10.0, description="m")] = 0.3
@@ -46,6 +58,7 @@ class LogisticSettings(FileModel):
     """See :class:`factors.rfid.model.LogisticModel`; ``coefficients`` in the order of ``factors.rfid.model.FEATURES``."""
 
     kind: Literal["logistic"] = "logistic"
+    prior: PriorSettings = Field(default_factory=PriorSettings)
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=11, max_length=11)]
 
     def model(self) -> DetectionModel:
@@ -56,6 +69,7 @@ class GridSettings(FileModel):
     """A learnt detection grid: the name of an ``.npz`` in the folder of the rig's file."""
 
     kind: Literal["grid"] = "grid"
+    prior: PriorSettings = Field(default_factory=PriorSettings)
     file: str
     _folder: Path = PrivateAttr(default=Path())
 
@@ -190,6 +204,13 @@ class RfidSettings(SensorSettings):
         for model in self.models.values():
             if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
                 write_grid(model.model(), folder / model.file)
+
+    def estimated(self) -> Estimated:
+        """The parameters of the models of the antennas that are not known exactly, among those of all models."""
+        used = {antenna.model for antenna in self.all_antennas().values()}
+        names = [name if len(used) == 1 else f"{model}.{name}" for model in self.models for name in PARAMETERS]
+        sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in PARAMETERS]
+        return Estimated.among(names, np.array(sigmas))
 
     def model(self) -> RfidModel:
         """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""

@@ -25,9 +25,9 @@ ESTIMATORS = ["smoother", "batch", "particle_filter", "switching"]
 
 
 @cache
-def office() -> tuple[Log, frozenset[str]]:
+def office(seed: int = 2) -> tuple[Log, frozenset[str]]:
     """A minute with 30 % of the tags dead, and which these are."""
-    log = simulate(preset("office", {"drive": {"duration": 60.0}, "faults": {"dead": 0.3}}), 2)
+    log = simulate(preset("office", {"drive": {"duration": 60.0}, "faults": {"dead": 0.3}}), seed)
     return log, frozenset(log.metadata["dead"].split(", "))
 
 
@@ -38,21 +38,26 @@ def without(log: Log, tags: frozenset[str]) -> Log:
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
 def test_hardly_worse_than_who_is_told(estimator: str) -> None:
-    """After half a minute; one log, so that the bound is wide. All that are named are dead, and most of the dead are named."""
-    log, dead = office()
-    assert log.reference is not None
-    config = RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {})
-    result, told = run(log, config), run(without(log, dead), config)
-    late = result.t > 30.0
-    errors = [
-        np.sqrt(np.mean(np.sum((r.poses - log.reference.at(r.t, max_gap=0.2))[late, :2] ** 2, axis=1)))
-        for r in (result, told)
-    ]
-    assert errors[0] < 1.25 * errors[1] + 0.01
-    named = set(result.diagnostics.dead_tags)
-    assert named <= dead
-    assert len(named) >= 8  # of 12, some of which the robot hardly passes
-    assert score(result, log)["dead_tags.total"] == len(named)
+    """After half a minute, three logs pooled. All that are named are dead, and most of the dead are named."""
+    errors: list[list[float]] = []
+    for seed in (2, 3, 4):
+        log, dead = office(seed)
+        assert log.reference is not None
+        config = RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {})
+        result, told = run(log, config), run(without(log, dead), config)
+        late = result.t > 30.0
+        errors.append(
+            [
+                np.mean(np.sum((r.poses - log.reference.at(r.t, max_gap=0.2))[late, :2] ** 2, axis=1))
+                for r in (result, told)
+            ]
+        )
+        named = set(result.diagnostics.dead_tags)
+        assert named <= dead
+        assert len(named) >= 8  # of 12, some of which the robot hardly passes
+        assert score(result, log)["dead_tags.total"] == len(named)
+    found, best = np.sqrt(np.mean(errors, axis=0))
+    assert found < 1.15 * best
     assert any(f"{len(named)} of 40 tags of the map are believed dead" in w for w in result.warnings)
 
 

@@ -27,6 +27,7 @@ from factorgraph_loc.sensors.rfid.settings import (
     GridSettings,
     LogisticSettings,
     PhaseSettings,
+    PriorSettings,
     RfidSettings,
     SurveySettings,
 )
@@ -34,6 +35,7 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel
 
 DEFAULT = "default"
+CALIBRATED = PriorSettings(range_scale=0.03, read_rate=0.2)  # what differs between the days of one installation
 
 
 @dataclass(frozen=True)
@@ -211,14 +213,17 @@ def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings 
             r_max=round(model.r_max, 3),
             s_r=round(model.s_r, 3),
             sigma_phi=round(model.sigma_phi, 3),
+            prior=CALIBRATED,
         )
     if isinstance(model, LogisticModel):
         b = [round(value, 4) for value in model.coefficients]
-        return LogisticSettings(coefficients=(b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8], b[9], b[10]))
+        return LogisticSettings(
+            coefficients=(b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8], b[9], b[10]), prior=CALIBRATED
+        )
     assert isinstance(model, GridModel)
     file = f"{grids.name}.{_safe(name)}.npz"
     write_grid(model, grids.with_name(file))
-    return GridSettings(file=file).placed(grids.parent)
+    return GridSettings(file=file, prior=CALIBRATED).placed(grids.parent)
 
 
 def _safe(name: str) -> str:

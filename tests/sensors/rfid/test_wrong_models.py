@@ -1,0 +1,77 @@
+"""Antennas that are not as the rig says: each estimator learns their range and read probability on the way."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.simulation import preset, simulate
+
+ESTIMATORS = ("ekf", "smoother", "particle_filter")
+EXACT = PriorSettings(range_scale=0.0, read_rate=0.0)
+
+
+@cache
+def office() -> Log:
+    return simulate(preset("office", {"drive": {"duration": 90.0}}), 5)
+
+
+def told(log: Log, prior: PriorSettings | None = None, **changes: float) -> Log:
+    """The log with a rig whose antennas have other parameters than those that made its reads."""
+    settings = log.rig.of(RfidSettings)
+    model = settings.models["default"].model_copy(update=changes)
+    if prior is not None:
+        model = model.model_copy(update={"prior": prior})
+    rfid = settings.model_copy(update={"models": {"default": model}})
+    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+
+
+def outcome(log: Log, estimator: str):
+    result = run(log, RunConfig(estimator, {"particles": 2000} if estimator == "particle_filter" else {}))
+    return result, score(result, log)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_range_that_is_too_long_is_found(estimator):
+    log = office()
+    model = log.rig.of(RfidSettings).models["default"]
+    assert isinstance(model, BeamSettings)
+    _, best = outcome(told(log, EXACT), estimator)
+    result, found = outcome(told(log, r_max=1.2 * model.r_max), estimator)
+    _, misled = outcome(told(log, EXACT, r_max=1.2 * model.r_max), estimator)
+    assert found["causal.position_rmse"] < 1.25 * best["causal.position_rmse"]
+    assert found["causal.anees"] < 6.0
+    assert misled["causal.position_rmse"] > 1.3 * best["causal.position_rmse"]
+    value, sigma = result.learnt.values["rfid.range_scale"]
+    # the edge of the reads keeps its width, which is not in proportion
+    assert value == pytest.approx(-np.log(1.2), abs=0.03)
+    assert 0.0 < sigma < 0.02
+    assert any(re.search("reach 1[4-8] % less far", line) for line in result.warnings), result.warnings
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_read_probability_that_is_too_low_is_found(estimator):
+    result, found = outcome(told(office(), p0=0.5), estimator)
+    assert found["causal.anees"] < 6.0
+    value, sigma = result.learnt.values["rfid.read_rate"]
+    assert abs(value - np.log(9.0)) < 5.0 * sigma + 0.1
+    assert any("of the tags next to them, where the rig says 50 %" in line for line in result.warnings)
+
+
+def test_what_is_known_exactly_is_not_learnt():
+    result, _ = outcome(told(office(), EXACT), "smoother")
+    assert not [name for name in result.learnt.values if name.startswith("rfid")]
+    result = run(office(), RunConfig("smoother", {"self_calibration": False}))
+    assert not result.learnt.values
+
+
+def test_nothing_is_said_of_antennas_that_are_as_the_rig_says():
+    result, _ = outcome(office(), "smoother")
+    assert set(result.learnt.values) >= {"rfid.range_scale", "rfid.read_rate"}
+    assert not [line for line in result.warnings if "the rig says" in line]
