@@ -89,7 +89,8 @@ def test_known_start(log):
     final = np.linalg.norm(result.final.poses[:, :2] - log.reference.at(result.final.t)[:, :2], axis=1)
     assert np.sqrt(np.mean(final**2)) < 0.12
     assert events(result) == []
-    assert set(result.learnt.values) == {"scale_distance", "scale_rotation", "heading_drift"}
+    constants = {"scale_distance", "scale_rotation", "heading_drift", "rfid.range_scale", "rfid.read_rate"}
+    assert set(result.learnt.values) == constants
     assert len(result.diagnostics.nis["rfid"]) > 50
 
 
