@@ -7,6 +7,7 @@ __all__ = [
     "DetectionModel",
     "GridModel",
     "LogisticModel",
+    "adjustment",
     "detection",
     "factor",
     "kernels",
